@@ -1,0 +1,43 @@
+# Two commands do all the set-up: `make sortie` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SCENARIO ?= scenarios/library/track_target.yaml
+
+.PHONY: help sortie test quick check format bench clean
+
+help: ## show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@# torch first and alone: its pin picks the CPU build, and nothing later may widen it
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+sortie: $(STAMP) ## fly the main scenario and print its outcome (SCENARIO=... for another)
+	$(BIN)/sortie fly $(SCENARIO)
+
+test: $(STAMP) ## run the whole test suite
+	$(BIN)/python -m pytest
+
+quick: $(STAMP) ## run the tests that take seconds
+	$(BIN)/python -m pytest -m 'not slow' -x
+
+check: $(STAMP) ## lint, types, tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+format: $(STAMP) ## format and fix what can be fixed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP) ## run the benchmarks
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+clean: ## remove runs and caches, keep .venv
+	rm -rf runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info

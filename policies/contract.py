@@ -1,0 +1,178 @@
+"""Descriptors in, directives out: the types that every policy sees, and nothing else.
+
+A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (ages are
+attached to the view), no I/O and no payloads. Frames: positions ENU, orientation quaternion x, y, z, w
+of FLU in ENU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+COVERAGE_CELLS = 16
+"""The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
+
+
+class Representation(IntEnum):
+    """The fidelity ladder, lowest rung first."""
+
+    NONE = 0
+    TRACKS = 1
+    DETECTIONS = 2
+    FEATURES = 3
+    RAW = 4
+
+
+class TaskPhase(IntEnum):
+    """What a drone is doing, as its descriptor says it."""
+
+    TRANSIT = 0
+    SEARCH = 1
+    TRACK = 2
+    RETURN = 3
+    LANDING = 4
+
+
+class Coverage(IntEnum):
+    """How well a cell of the coverage grid is seen (two bits)."""
+
+    UNSEEN = 0
+    POOR = 1
+    WELL = 2
+    NOVEL = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A disc on the ground, ENU, metres."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """One drone's context, as it stands in the paper's schema (180 B as CDR at N = 5)."""
+
+    stamp_ns: int
+    """Publisher's clock, ns since the sortie's begin."""
+    agent_id: int
+    position_m: tuple[float, float, float]
+    orientation_xyzw: tuple[float, float, float, float]
+    velocity_mps: tuple[float, float, float]
+    footprint_radius_m: float
+    battery_soc: float
+    cpu_headroom: float
+    gpu_headroom: float
+    peer_goodput_mbps: tuple[float, ...]
+    """To every other drone of the roster by ascending id, as measured by this drone; 0 where unmeasured."""
+    coverage_grid: bytes
+    """64 B, four cells a byte, lowest bits first, row by row from south-west."""
+    novelty_flags: int
+    task_phase: TaskPhase
+    region: Disc | None
+    """Region of responsibility; on the wire f32[4] x, y, radius, 1 (all zero: none)."""
+    priority_target_ids: tuple[int, ...] = ()
+
+    def goodput_to(self, peer: int) -> float:
+        """Goodput to `peer`, Mb/s, as this drone measured it (0 if it is not on the roster)."""
+        slot = peer - (peer > self.agent_id)
+        return self.peer_goodput_mbps[slot] if peer != self.agent_id and slot < len(self.peer_goodput_mbps) else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class FleetView:
+    """What a policy reads: the latest descriptor of every drone heard so far, however stale.
+
+    `descriptors` and `age_s` have the same keys; both hold the ego.
+    """
+
+    ego: int
+    period_s: float
+    descriptors: Mapping[int, Descriptor]
+    age_s: Mapping[int, float]
+
+    @property
+    def me(self) -> Descriptor | None:
+        """The ego's own descriptor; None in an empty view."""
+        return self.descriptors.get(self.ego)
+
+    @property
+    def peers(self) -> tuple[int, ...]:
+        """Ids of the other drones heard, ascending."""
+        return tuple(sorted(i for i in self.descriptors if i != self.ego))
+
+
+@dataclass(frozen=True, slots=True)
+class Directive:
+    """One policy decision for one outgoing link (36 B on the wire)."""
+
+    source: int
+    destination: int
+    representation: Representation = Representation.NONE
+    rho: float = 0.0
+    """Budget: at most this fraction of all feature cells, 0 … 1."""
+    roi: Disc | None = None
+    """Only cells, boxes or tracks inside; None is everywhere."""
+    rate_hz: float = 0.0
+    deadline_s: float = 0.1
+    fusion_weight: float = 1.0
+    """Trust × freshness that the receiver gives this link's payloads, 0 … 1."""
+    duty_percent: int = 100
+    """Share of frames in which the source runs perception at all, 0 … 100."""
+    reason: str = field(default="", compare=False)
+    """Why, in words; for the record, not on the wire, no part of equality."""
+
+
+class Policy(Protocol):
+    """Any callable of this shape is a policy."""
+
+    def __call__(self, view: FleetView, /) -> Sequence[Directive]: ...
+
+
+class PolicyError(ValueError):
+    """A policy broke its contract; the message names the directive, the field and the bound."""
+
+
+MAX_RATE_HZ = 30.0
+MAX_DEADLINE_S = 10.0
+
+
+def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
+    """Hold a policy's output to the contract, once, where it enters the fleet.
+
+    Raises:
+        PolicyError: naming the directive and the bound it breaks.
+    """
+    seen: set[int] = set()
+    for d in directives:
+        if not isinstance(d, Directive):
+            raise PolicyError(f"a policy returns Directive, got {type(d).__name__}")
+        where = f"directive {d.source}→{d.destination}"
+        if d.source != view.ego:
+            raise PolicyError(f"{where}: source is {d.source}, must be the ego {view.ego}")
+        if d.destination == view.ego or d.destination not in view.descriptors:
+            raise PolicyError(f"{where}: destination {d.destination} is not a peer in the view {list(view.peers)}")
+        if d.destination in seen:
+            raise PolicyError(f"{where}: second directive for the same link")
+        seen.add(d.destination)
+        for name, low, high in _BOUNDS:
+            value = getattr(d, name)
+            if not low <= value <= high:  # also catches NaN
+                raise PolicyError(f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}]")
+        if d.roi is not None and not d.roi.radius_m > 0:
+            raise PolicyError(f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0")
+
+
+_BOUNDS = (
+    ("representation", 0, 4),
+    ("rho", 0.0, 1.0),
+    ("rate_hz", 0.0, MAX_RATE_HZ),
+    ("deadline_s", 0.0, MAX_DEADLINE_S),
+    ("fusion_weight", 0.0, 1.0),
+    ("duty_percent", 0, 100),
+)

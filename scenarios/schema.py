@@ -1,0 +1,293 @@
+"""What is to be flown: every scenario field, its unit in its name, its bounds and its default.
+
+The descriptions below are the reference (`sortie list schema` exports them as JSON Schema).
+Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward, y left, z up).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+PointM = tuple[Annotated[float, Field(ge=-5000, le=5000)], Annotated[float, Field(ge=-5000, le=5000)]]
+Soc = Annotated[float, Field(gt=0, le=1)]
+DroneId = Annotated[int, Field(ge=0, le=254)]
+PhaseName = Literal["transit", "search", "track", "return"]
+
+
+class Section(BaseModel):
+    """A frozen section of a scenario; unknown keys and non-finite numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+# --- fleet ---------------------------------------------------------------------------------------
+
+
+class Formation(Section):
+    shape: Literal["cross", "line", "wedge", "grid", "circle"] = Field("cross", description="Slots around the moving reference point.")
+    spacing_m: float = Field(20.0, gt=0, le=500, description="Distance between neighbouring slots (arc length for circle).")
+    altitude_m: float = Field(60.0, ge=10, le=400, description="Height of the formation above the ground.")
+
+
+class Route(Section):
+    waypoints_m: tuple[PointM, ...] = Field(((0.0, 0.0),), min_length=1, max_length=1000, description="Ground track of the reference point, ENU (x, y); one point hovers.")
+    speed_mps: float = Field(5.0, gt=0, le=30, description="Ground speed along the route.")
+    turn_time_s: float = Field(4.0, gt=0, le=60, description="Time over which a corner is rounded.")
+
+
+class Motion(Section):
+    wind_mps: tuple[float, float] = Field((2.0, 1.0), description="Mean wind, the velocity of the air, ENU (x, y).")
+    gust_sigma_mps: float = Field(0.8, ge=0, le=15, description="Standard deviation of each gust component.")
+    gust_time_s: float = Field(3.0, gt=0, le=120, description="Correlation time of gusts.")
+    pose_jitter_m: float = Field(0.4, ge=0, le=20, description="Standard deviation of each drone's true offset from its slot, per axis.")
+    pose_jitter_time_s: float = Field(2.5, gt=0, le=120, description="Correlation time of the offset.")
+    pose_error_m: float = Field(0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis.")
+    heading_error_deg: float = Field(0.5, ge=0, le=45, description="Standard deviation of the heading estimate's error.")
+
+
+class Battery(Section):
+    capacity_wh: float = Field(130.0, gt=0, le=5000, description="Energy of a full pack at rest (open circuit).")
+    cells: int = Field(4, ge=1, le=24, description="LiPo cells in series.")
+    initial_soc: Soc = Field(0.95, description="State of charge at take-off.")
+    cell_resistance_mohm: float = Field(13.0, ge=0, le=500, description="Internal resistance of one cell with its wiring.")
+    drivetrain_efficiency: float = Field(0.8, gt=0, le=1, description="Rotor power over electric power.")
+    avionics_w: float = Field(8.0, ge=0, le=500, description="Flight controller, sensors, cameras.")
+    compute_idle_w: float = Field(10.0, ge=0, le=200, description="Companion computer at rest.")
+    compute_active_w: float = Field(40.0, ge=0, le=200, description="Companion computer while it runs perception, above idle excluded: the whole draw.")
+    radio_idle_w: float = Field(2.0, ge=0, le=50, description="Radio while it listens.")
+    radio_tx_w: float = Field(6.0, ge=0, le=50, description="Radio while it sends, the whole draw.")
+    landing_soc: float = Field(0.1, ge=0, lt=1, description="The drone lands when its charge reaches this.")
+
+
+class DroneOverride(Section):
+    drone: DroneId = Field(description="Whose battery differs.")
+    initial_soc: Soc | None = Field(None, description="As fleet.battery.initial_soc.")
+    capacity_wh: float | None = Field(None, gt=0, le=5000, description="As fleet.battery.capacity_wh.")
+    cell_resistance_mohm: float | None = Field(None, ge=0, le=500, description="As fleet.battery.cell_resistance_mohm.")
+
+
+class Fleet(Section):
+    drones: int = Field(5, ge=1, le=200, description="Number of drones; ids are 0 … drones − 1.")
+    formation: Formation = Formation()
+    route: Route = Route()
+    motion: Motion = Motion()
+    battery: Battery = Battery()
+    overrides: tuple[DroneOverride, ...] = Field((), description="Drones whose battery differs from fleet.battery.")
+
+
+# --- mission -------------------------------------------------------------------------------------
+
+
+class Target(Section):
+    waypoints_m: tuple[PointM, ...] = Field(min_length=1, max_length=1000, description="Path of the target car, ENU (x, y).")
+    speed_mps: float = Field(5.0, gt=0, le=40, description="Speed of the target car.")
+
+
+class Region(Section):
+    radius_m: float = Field(32.0, gt=0, le=2000, description="Radius of the mission disc.")
+    centre_m: PointM | None = Field(None, description="Its centre, ENU (x, y); left out, the disc follows the target.")
+
+
+class Phase(Section):
+    at_s: float = Field(0.0, ge=0, description="When the phase begins.")
+    phase: PhaseName = Field("search", description="What the fleet is doing.")
+    region: Region | None = Field(None, description="Region of responsibility during the phase.")
+
+
+class Mission(Section):
+    phases: tuple[Phase, ...] = Field((Phase(),), min_length=1, max_length=100, description="Phases in order of time; the first begins at 0.")
+    target: Target | None = Field(None, description="The car to track.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Mission:
+        times = [p.at_s for p in self.phases]
+        if times[0] != 0:
+            raise ValueError(f"the first phase begins at {times[0]:g} s, must begin at 0")
+        if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+            raise ValueError(f"phases begin at {times}, must be in increasing order")
+        if self.target is None and any(p.region is not None and p.region.centre_m is None for p in self.phases):
+            raise ValueError("a region without centre_m follows the target, but mission.target is missing")
+        return self
+
+
+# --- radio ---------------------------------------------------------------------------------------
+
+
+class Radio(Section):
+    carrier_ghz: float = Field(5.2, ge=0.4, le=7.2, description="Carrier frequency.")
+    bandwidth_mhz: Literal[20, 40, 80] = Field(80, description="Channel width, 802.11ax, one spatial stream.")
+    tx_power_dbm: float = Field(20.0, ge=-20, le=36, description="Transmit power, antenna gains included.")
+    noise_figure_db: float = Field(7.0, ge=0, le=30, description="Receiver noise figure.")
+    path_loss_exponent: float = Field(2.1, ge=1.5, le=6, description="Log-distance exponent beyond 1 m.")
+    shadowing_sigma_db: float = Field(3.5, ge=0, le=20, description="Standard deviation of shadowing.")
+    shadowing_time_s: float = Field(4.5, gt=0, le=600, description="Correlation time of shadowing (4.5 s is 0.8 at 1 s).")
+    rician_k_db: float = Field(12.0, ge=-10, le=40, description="Rician factor of small-scale fading.")
+    group_rate_mbps: float = Field(6.0, ge=1, le=54, description="Basic rate of group-addressed frames (descriptors).")
+    retry_limit: int = Field(7, ge=0, le=32, description="MAC retries of a unicast frame.")
+    max_ampdu_frames: int = Field(64, ge=1, le=256, description="Frames aggregated into one A-MPDU.")
+    fragment_bytes: int = Field(1344, ge=64, le=65000, description="DDS fragment payload.")
+    heartbeat_s: float = Field(0.02, gt=0, le=10, description="Heartbeat period of the reliable writer.")
+    nack_delay_s: float = Field(0.005, ge=0, le=10, description="The reader's delay before it asks for a repair.")
+
+
+# --- context plane -------------------------------------------------------------------------------
+
+
+class Context(Section):
+    rate_hz: float = Field(10.0, gt=0, le=10, description="Descriptors a second and drone, at most 10 (the plane's bound); also the frame rate.")
+    degraded_after_periods: float = Field(3.0, gt=0, le=100, description="A descriptor older than this marks the link degraded.")
+    detached_after_periods: float = Field(10.0, gt=0, le=1000, description="A descriptor older than this marks the peer detached.")
+    authentication: bool = Field(True, description="HMAC-SHA256 and a replay counter on every descriptor (28 B).")
+
+
+# --- perception ----------------------------------------------------------------------------------
+
+
+class Scene(Section):
+    seed: int = Field(7, ge=0, description="Layout of the town; separate from the sortie's seed.")
+    block_m: float = Field(80.0, ge=40, le=400, description="Distance between parallel roads.")
+    building_density: float = Field(0.6, ge=0, le=1, description="Fraction of building lots that are built on.")
+    building_height_m: float = Field(10.0, ge=3, le=25, description="Mean height of buildings.")
+    tree_density: float = Field(0.5, ge=0, le=1, description="Fraction of tree spots along roads that hold a tree.")
+    parked_density: float = Field(0.35, ge=0, le=1, description="Fraction of kerb spots with a parked car.")
+    moving_cars_per_km: float = Field(10.0, ge=0, le=100, description="Moving cars per kilometre of lane.")
+    moving_speed_mps: float = Field(8.0, gt=0, le=40, description="Mean speed of moving cars.")
+
+
+class Perception(Section):
+    detector: Literal["torch", "none"] = Field("torch", description="The detector; none flies the traffic alone.")
+    weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights.")
+    sample_rate_hz: float = Field(2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz.")
+    compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
+    fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
+    max_age_s: float = Field(0.5, gt=0, le=60, description="Received payloads older than this are not fused.")
+    score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
+    cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
+    unsent_cells: Literal["masked", "zero"] = Field("masked", description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).")
+    scene: Scene = Scene()
+
+
+# --- policy, events, expectations ----------------------------------------------------------------
+
+
+class Policy(Section):
+    name: str = Field("worked", min_length=1, description="A registered policy, or path/to/file.py:function.")
+    params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
+    dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
+
+
+class _Event(Section):
+    at_s: float = Field(ge=0, description="When it begins.")
+
+
+class LinkDrop(_Event):
+    kind: Literal["link_drop"]
+    drone: DroneId = Field(description="Whose links fade.")
+    peer: DroneId | None = Field(None, description="The other end; left out, every link of the drone.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    loss_db: float = Field(30.0, gt=0, le=200, description="Extra loss, both directions.")
+
+
+class Jam(_Event):
+    kind: Literal["jam"]
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    position_m: tuple[float, float, float] = Field(description="The jammer, ENU.")
+    power_dbm: float = Field(20.0, ge=-50, le=60, description="Its power in the channel.")
+
+
+class DroneLost(_Event):
+    kind: Literal["drone_lost"]
+    drone: DroneId = Field(description="Who falls silent and leaves.")
+
+
+class BatteryFault(_Event):
+    kind: Literal["battery_fault"]
+    drone: DroneId = Field(description="Whose battery fails.")
+    lost_fraction: float = Field(gt=0, le=1, description="Fraction of the remaining energy that is gone at once.")
+
+
+class ClockSkew(_Event):
+    kind: Literal["clock_skew"]
+    drone: DroneId = Field(description="Whose clock is off.")
+    skew_s: float = Field(ge=-3600, le=3600, description="Added to its stamps; negative makes its descriptors look old.")
+
+
+class Spoof(_Event):
+    kind: Literal["spoof"]
+    drone: DroneId = Field(description="Whose descriptors are imitated.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    attack: Literal["forged", "replayed", "malformed", "oversized"] = Field("forged", description="What is put on the air.")
+    rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
+
+
+Event = Annotated[LinkDrop | Jam | DroneLost | BatteryFault | ClockSkew | Spoof, Field(discriminator="kind")]
+
+
+class Expectation(Section):
+    metric: str = Field(min_length=1, description="A dotted field of outcome.json, for example ap50.mission.")
+    at_least: float | None = Field(None, description="Lower bound, inclusive.")
+    at_most: float | None = Field(None, description="Upper bound, inclusive.")
+    equals: float | str | bool | None = Field(None, description="The exact value.")
+    because: str = Field("", description="Why it is expected; shown when it fails.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Expectation:
+        if self.at_least is None and self.at_most is None and self.equals is None:
+            raise ValueError("one of at_least, at_most, equals is needed")
+        return self
+
+
+class Scenario(Section):
+    """One sortie: who flies, why, over which air, seeing what, by which policy."""
+
+    name: str = Field(pattern=r"^[a-z0-9_]+$", max_length=64, description="Short name, as in the file's name.")
+    description: str = Field("", max_length=2000, description="One paragraph for people.")
+    seed: int = Field(1, ge=0, lt=2**63, description="Every random draw follows from it.")
+    duration_s: float = Field(120.0, gt=0, le=7200, description="Length of the sortie; the end is exclusive.")
+    fleet: Fleet = Fleet()
+    mission: Mission = Mission()
+    radio: Radio = Radio()
+    context: Context = Context()
+    perception: Perception = Perception()
+    policy: Policy = Policy()
+    events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
+    expect: tuple[Expectation, ...] = Field((), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Scenario:
+        n = self.fleet.drones
+        for i, override in enumerate(self.fleet.overrides):
+            if override.drone >= n:
+                raise ValueError(f"fleet.overrides.{i}.drone is {override.drone}, must be below fleet.drones = {n}")
+        for i, event in enumerate(self.events):
+            for end in ("drone", "peer"):
+                who = getattr(event, end, None)
+                if who is not None and who >= n:
+                    raise ValueError(f"events.{i}.{end} is {who}, must be below fleet.drones = {n}")
+            if event.at_s >= self.duration_s:
+                raise ValueError(f"events.{i}.at_s is {event.at_s:g}, must be below duration_s = {self.duration_s:g}")
+            until_s = getattr(event, "until_s", None)
+            if until_s is not None and until_s <= event.at_s:
+                raise ValueError(f"events.{i}.until_s is {until_s:g}, must be above at_s = {event.at_s:g}")
+        if self.context.detached_after_periods <= self.context.degraded_after_periods:
+            raise ValueError("context.detached_after_periods must be above context.degraded_after_periods")
+        return self
+
+    @property
+    def frame_s(self) -> float:
+        """Length of a frame, the descriptor period, s."""
+        return 1.0 / self.context.rate_hz
+
+    @property
+    def frames(self) -> int:
+        """Frames that begin before the end (end exclusive)."""
+        import math
+
+        return math.ceil(round(self.duration_s * self.context.rate_hz, 9))
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of a scenario, for editors."""
+    return Scenario.model_json_schema()
