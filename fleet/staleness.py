@@ -1,0 +1,58 @@
+"""The staleness rules of the plane: age may only reduce what a link carries.
+
+A descriptor older than 3 periods degrades the link to its peer, one older than 10 detaches the peer
+(the paper's second rule). Pure functions; the reduction passes damping at once because it is a reduction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntEnum
+
+from policies.contract import Directive, Representation
+
+DEGRADED_RATE_HZ = 2.0
+"""A degraded link carries detections at most this often, as the worked policy's lowest rung does."""
+
+_ROUNDING_PERIODS = 1e-6  # an age of exactly three periods, computed in floats, is not older than three periods
+
+
+class LinkHealth(IntEnum):
+    """How far the context about a peer can be relied on."""
+
+    FRESH = 0
+    DEGRADED = 1
+    DETACHED = 2
+
+
+def health(
+    age_s: float | None, period_s: float, degraded_after_periods: float, detached_after_periods: float
+) -> LinkHealth:
+    """Health of the link to a peer whose latest descriptor is `age_s` old (None: never heard)."""
+    if age_s is None:
+        return LinkHealth.DETACHED
+    periods = age_s / period_s - _ROUNDING_PERIODS
+    if periods > detached_after_periods:
+        return LinkHealth.DETACHED
+    return LinkHealth.DEGRADED if periods > degraded_after_periods else LinkHealth.FRESH
+
+
+def cap_by_age(directive: Directive, link: LinkHealth, age_s: float | None) -> Directive:
+    """The directive as far as the age of the peer's descriptor allows it."""
+    if link == LinkHealth.FRESH:
+        return directive
+    age = "never heard" if age_s is None else f"descriptor {age_s:.2f} s old"
+    if link == LinkHealth.DETACHED:
+        return Directive(
+            directive.source, directive.destination, duty_percent=directive.duty_percent, reason=f"detached: {age}"
+        )
+    if directive.representation <= Representation.DETECTIONS and directive.rate_hz <= DEGRADED_RATE_HZ:
+        return directive
+    features = directive.representation > Representation.DETECTIONS
+    return replace(
+        directive,
+        representation=min(directive.representation, Representation.DETECTIONS),
+        rho=0.0 if features else directive.rho,
+        rate_hz=min(directive.rate_hz, DEGRADED_RATE_HZ),
+        reason=f"degraded: {age}",
+    )

@@ -1,0 +1,56 @@
+"""Fixed policies to compare with: everyone, the best, worst or random k peers, and silence.
+
+`rho` is the paper's budget: what one drone sends, summed over its links, as a fraction of full sharing.
+k peers share it evenly, so policies with different k send the same bytes (up to a full map per link).
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from policies.contract import Directive, FleetView, Representation
+from policies.geometry import peers_by_overlap
+
+RATE_HZ = 10.0
+RESHUFFLE_S = 10
+"""random-k draws new peers this often: longer than any sensible dwell time, so that the links come up."""
+
+
+def _share_with(view: FleetView, chosen: Sequence[int], rho: float, why: str) -> list[Directive]:
+    per_link = min(1.0, rho * len(view.peers) / len(chosen)) if chosen else 0.0
+    return [
+        Directive(view.ego, p, Representation.FEATURES, per_link, None, RATE_HZ, reason=why)
+        if p in chosen
+        else Directive(view.ego, p, reason=f"fixed: not {why.removeprefix('fixed: ')}")
+        for p in view.peers
+    ]
+
+
+def everyone(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    """Features to every peer (all-4 at N = 5), whatever the context."""
+    return _share_with(view, view.peers, rho, "fixed: every peer")
+
+
+def best_k(view: FleetView, *, k: int = 2, rho: float = 1.0) -> list[Directive]:
+    """Features to the k peers whose footprints overlap most with the ego's."""
+    return _share_with(view, peers_by_overlap(view)[:k], rho, f"fixed: {k} most overlapping")
+
+
+def worst_k(view: FleetView, *, k: int = 2, rho: float = 1.0) -> list[Directive]:
+    """Features to the k peers whose footprints overlap least with the ego's."""
+    return _share_with(view, peers_by_overlap(view)[::-1][:k], rho, f"fixed: {k} least overlapping")
+
+
+def random_k(view: FleetView, *, k: int = 2, rho: float = 1.0, salt: int = 0) -> list[Directive]:
+    """Features to k peers drawn anew every `RESHUFFLE_S`; a pure function of the ego's stamp, id and the salt."""
+    me = view.me
+    epoch = 0 if me is None else me.stamp_ns // (RESHUFFLE_S * 1_000_000_000)
+    draw = random.Random(f"{salt}/{view.ego}/{epoch}")  # noqa: S311 - a lottery, not a secret
+    peers = list(view.peers)
+    return _share_with(view, draw.sample(peers, min(k, len(peers))), rho, f"fixed: {k} random")
+
+
+def silence(view: FleetView) -> list[Directive]:
+    """Nothing to anyone: five single drones."""
+    return [Directive(view.ego, p, reason="fixed: silence") for p in view.peers]

@@ -1,0 +1,85 @@
+"""Damping between a policy and the gate: reductions at once, upgrades after a dwell time, repeats for free.
+
+A pure function over one link's state. An upgrade is made once it has been asked for without a break for the
+dwell time, so that a small or passing change of context does not switch the link; the number of upgrades in
+t seconds is at most 1 + t / dwell (average dwell time, FACTS §5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from policies.contract import Directive, Disc, Representation
+
+EPSILON_S = 1e-9
+"""Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkState:
+    """What the gate enforces on a link, and since when more is being asked for (None: it is not)."""
+
+    enforced: Directive
+    asking_since_s: float | None = None
+
+
+def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) -> LinkState:
+    """The link's next state.
+
+    Args:
+        state: its present state.
+        proposed: what the policy, capped by the staleness rules, asks for now.
+        now_s: the drone's clock.
+        dwell_s: how long an upgrade must be asked for.
+
+    Returns:
+        `state` itself where nothing changes (a repeated directive restarts no timer), otherwise a new one whose
+        directive is `proposed`, or the lower of both in every part while an upgrade waits.
+    """
+    current = state.enforced
+    if proposed == current:
+        return state if state.asking_since_s is None else LinkState(current)
+    lower = _lower_of(current, proposed)
+    if lower == proposed:
+        return LinkState(proposed)
+    since_s = now_s if state.asking_since_s is None else state.asking_since_s
+    if now_s - since_s >= dwell_s - EPSILON_S:
+        return LinkState(proposed)
+    if lower == current and since_s == state.asking_since_s:
+        return state
+    # The reason in force stays while only an upgrade waits; a reduction brings its own.
+    return LinkState(current if lower == current else lower, since_s)
+
+
+def _lower_of(current: Directive, proposed: Directive) -> Directive:
+    """The directive that is nowhere above either: what may be enforced at once."""
+    if current.representation == Representation.NONE:
+        return current  # nothing flows, so there is nothing to lower
+    if proposed.representation < current.representation:
+        rho, roi = proposed.rho, proposed.roi  # the budget of another rung does not bound this one
+    else:
+        rho, roi = min(current.rho, proposed.rho), _lower_roi(current.roi, proposed.roi)
+    reduced = replace(
+        proposed,
+        representation=min(current.representation, proposed.representation),
+        rho=rho,
+        roi=roi,
+        rate_hz=min(current.rate_hz, proposed.rate_hz),
+        fusion_weight=min(current.fusion_weight, proposed.fusion_weight),
+        duty_percent=min(current.duty_percent, proposed.duty_percent),
+    )
+    if reduced == current:
+        return current
+    # A disc that moved while an upgrade waits is not that upgrade's doing: its reason would mislead.
+    return replace(reduced, reason=current.reason) if _level(reduced) == _level(current) else reduced
+
+
+def _level(d: Directive) -> tuple[float, ...]:
+    return (d.representation, d.rho, d.roi is None, d.rate_hz, d.duty_percent, d.fusion_weight)
+
+
+def _lower_roi(current: Disc | None, proposed: Disc | None) -> Disc | None:
+    if current is None or proposed is None:
+        return proposed if current is None else current
+    # A disc that moves with its target is no switch; one that grows is.
+    return replace(proposed, radius_m=min(current.radius_m, proposed.radius_m))

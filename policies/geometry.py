@@ -1,0 +1,43 @@
+"""Plane geometry that policies share: overlaps of footprints, from descriptor fields alone."""
+
+from __future__ import annotations
+
+import math
+
+from policies.contract import Descriptor, FleetView
+
+OVERLAP_STEP = 0.1
+"""Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""
+
+
+def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> float:
+    """Area shared by two discs over the area of the smaller one, 0 … 1.
+
+    Source: the lens formula (Weisstein, "Circle-Circle Intersection").
+    """
+    small, large = sorted((radius_a_m, radius_b_m))
+    if small <= 0 or distance_m >= small + large:
+        return 0.0
+    if distance_m <= large - small:
+        return 1.0
+    d = distance_m
+    # Rounding can push the cosines past ±1 when the circles barely touch.
+    alpha = math.acos(max(-1.0, min(1.0, (d * d + small * small - large * large) / (2 * d * small))))
+    beta = math.acos(max(-1.0, min(1.0, (d * d + large * large - small * small) / (2 * d * large))))
+    lens = small * small * (alpha - math.sin(2 * alpha) / 2) + large * large * (beta - math.sin(2 * beta) / 2)
+    return min(1.0, max(0.0, lens / (math.pi * small * small)))
+
+
+def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
+    """Overlap of two drones' nadir footprints, 0 … 1, of the smaller footprint."""
+    distance_m = math.hypot(a.position_m[0] - b.position_m[0], a.position_m[1] - b.position_m[1])
+    return circle_overlap(distance_m, a.footprint_radius_m, b.footprint_radius_m)
+
+
+def peers_by_overlap(view: FleetView) -> list[int]:
+    """Peers by falling footprint overlap with the ego, in steps of `OVERLAP_STEP`; ties by ascending id."""
+    me = view.me
+    if me is None:
+        return []
+    ranked = [(-round(footprint_overlap(me, view.descriptors[p]) / OVERLAP_STEP), p) for p in view.peers]
+    return [p for _, p in sorted(ranked)]

@@ -1,0 +1,52 @@
+"""The paper's worked policy: its decision table (Table III) as one pure function."""
+
+from __future__ import annotations
+
+from policies.contract import Directive, FleetView, Representation, TaskPhase
+from policies.geometry import peers_by_overlap
+
+HIGH_BATTERY = 0.60
+LOW_BATTERY = 0.30
+FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
+MIN_GOODPUT_MBPS = 5.0
+TOP_PEERS = 2
+
+
+def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    """Battery picks representation and rate, the link may lower both, the phase the ROI, overlap the peers.
+
+    Args:
+        view: the fleet's latest descriptors.
+        rho: budget of the features rung as a fraction of all cells (the paper's table has full features).
+
+    Returns:
+        One directive per peer in the view.
+    """
+    me = view.me
+    if me is None:
+        return []
+    if me.battery_soc >= HIGH_BATTERY:
+        rung, rate_hz, why = Representation.FEATURES, FULL_RATE_HZ, "battery ≥ 60 %"
+    elif me.battery_soc >= LOW_BATTERY:
+        rung, rate_hz, why = Representation.FEATURES, HALF_RATE_HZ, "battery < 60 %"
+    else:
+        rung, rate_hz, why = Representation.DETECTIONS, SLOW_RATE_HZ, "battery < 30 %"
+    roi = me.region if me.task_phase == TaskPhase.TRACK else None
+    if roi is not None:
+        why += f", track: ROI {roi.radius_m:.0f} m"
+    chosen = peers_by_overlap(view)[:TOP_PEERS]
+    directives = []
+    for peer in view.peers:
+        if peer not in chosen:
+            directives.append(Directive(view.ego, peer, reason=f"not among the {TOP_PEERS} most overlapping peers"))
+            continue
+        link_rung, link_rate_hz, link_why = rung, rate_hz, why
+        if me.goodput_to(peer) < MIN_GOODPUT_MBPS:
+            link_rung = min(rung, Representation.DETECTIONS)
+            link_rate_hz = min(rate_hz, SLOW_RATE_HZ)
+            link_why = f"goodput {me.goodput_to(peer):.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+        features = link_rung == Representation.FEATURES
+        directives.append(
+            Directive(view.ego, peer, link_rung, rho if features else 0.0, roi, link_rate_hz, reason=link_why)
+        )
+    return directives
