@@ -1,0 +1,255 @@
+"""One drone's part in the plane: publish, read the fleet, decide, gate, send; and hold what arrives.
+
+An agent sees its own state through `Senses`, the air through `Modem`, and other drones only through what it
+heard: it holds no other drone and no world. One SimPy process a drone, one wake-up a frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import simpy
+
+from fleet.auth import Sealer
+from fleet.coverage import NOVEL_FLAG, TARGET_FLAG, CoverageMap, footprint_radius_m
+from fleet.gate import Gate, Payload, make_payload
+from fleet.staleness import LinkHealth, cap_by_age, health
+from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from perception.types import Capture
+from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives
+from policies.damping import LinkState, damp
+
+COVERAGE_PERIOD_S = 1.0
+"""The coverage grid is renewed this often: at 5 m/s a drone crosses a 12.8 m cell in 2.6 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Platform:
+    """What a drone knows about its own body, fractions 0 … 1."""
+
+    soc: float
+    cpu_headroom: float
+    gpu_headroom: float
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a drone is to do now."""
+
+    phase: TaskPhase
+    region: Disc | None
+    target_ids: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneRules:
+    """The plane's periods, the same for every drone."""
+
+    period_s: float
+    frames: int
+    degraded_after_periods: float
+    detached_after_periods: float
+    dwell_s: float
+    compute_delay_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One payload as it arrived: what it shows, and of when."""
+
+    capture: Capture
+    payload: Payload
+    t_done_s: float
+
+
+class Senses(Protocol):
+    """A drone's own sensors and mission computer."""
+
+    def capture(self, frame: int) -> Capture: ...
+    def velocity_mps(self, frame: int) -> tuple[float, float, float]: ...
+    def platform(self) -> Platform: ...
+    def task(self, t_s: float) -> Task: ...
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int: ...
+
+
+class Modem(Protocol):
+    """A drone's end of the air."""
+
+    def broadcast(self, datagram: bytes) -> None: ...
+    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None: ...
+    def goodput_mbps(self) -> tuple[float, ...]: ...
+
+
+class AgentLog(Protocol):
+    """Where an agent's acts are written down."""
+
+    def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None: ...
+    def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth) -> None: ...
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None: ...
+
+
+class Agent:
+    """A drone from take-off until it lands, is lost, or the sortie ends."""
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        drone: int,
+        *,
+        rules: PlaneRules,
+        policy: Policy,
+        senses: Senses,
+        modem: Modem,
+        log: AgentLog,
+        sealer: Sealer | None,
+        phase_s: float,
+    ) -> None:
+        """Args: `phase_s` is when in each frame this drone acts; `sealer` None publishes unauthenticated."""
+        self.env = env
+        self.drone = drone
+        self.policy = policy  # may be replaced while the sortie flies
+        self.clock_skew_s = 0.0
+        self.airborne = True
+        self.sensed = False  # whether perception ran in the current frame
+        self.latest: Capture | None = None
+        self.held: dict[int, Received] = {}
+        self._rules = rules
+        self._senses = senses
+        self._modem = modem
+        self._log = log
+        self._sealer = sealer
+        self._phase_s = phase_s
+        self._coverage = CoverageMap()
+        self._grid, self._novel, self._grid_at_s = b"", False, -1e9
+        self._known: dict[int, Descriptor] = {}
+        self._heard_at_s: dict[int, float] = {}
+        self._links: dict[int, LinkState] = {}
+        self.gate = Gate()
+
+    def start(self) -> None:
+        """Begin the drone's process; call once."""
+        self.env.process(self._fly())
+
+    def stop(self) -> None:
+        """The drone leaves the plane for good."""
+        self.airborne = False
+
+    def hear(self, descriptor: Descriptor) -> None:
+        """A peer's descriptor, already checked, replaces the one held (keep-last-1)."""
+        if self.airborne and descriptor.agent_id != self.drone:
+            self._known[descriptor.agent_id] = descriptor
+            self._heard_at_s[descriptor.agent_id] = self.env.now
+
+    def receive(self, received: Received) -> None:
+        """A peer's payload arrived; the freshest capture is kept, late ones do not replace newer ones."""
+        peer = received.capture.drone
+        held = self.held.get(peer)
+        if self.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
+            self.held[peer] = received
+
+    def _fly(self) -> Generator[simpy.Event, Any, None]:
+        env, rules = self.env, self._rules
+        for frame in range(rules.frames):
+            yield env.timeout(max(0.0, frame * rules.period_s + self._phase_s - env.now))
+            if not self.airborne:
+                return
+            self._tick(frame)
+
+    def _tick(self, frame: int) -> None:
+        capture = self._senses.capture(frame)
+        self._known[self.drone] = self._publish(frame, capture)
+        self._decide()
+        duty = self.gate.duty_percent
+        self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
+        if self.sensed:
+            self.latest = capture
+            done = self.env.timeout(self._rules.compute_delay_s)
+            done.callbacks.append(lambda _event: self._send(capture))  # type: ignore[union-attr]
+
+    # --- the context plane ---------------------------------------------------------------------
+
+    def _publish(self, frame: int, capture: Capture) -> Descriptor:
+        """Publish this frame's descriptor; returns it as every peer reads it, rounded by the wire."""
+        now_s = self.env.now
+        x_m, y_m, z_m = capture.est_position_m
+        radius_m = footprint_radius_m(z_m)
+        if now_s - self._grid_at_s >= COVERAGE_PERIOD_S:
+            self._grid, self._novel = self._coverage.look(x_m, y_m, radius_m)
+            self._grid_at_s = now_s
+        platform, task = self._senses.platform(), self._senses.task(now_s)
+        descriptor = Descriptor(
+            # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
+            stamp_ns=round((capture.t_s + self.clock_skew_s) * 1e9),
+            agent_id=self.drone,
+            position_m=capture.est_position_m,
+            orientation_xyzw=capture.orientation_xyzw,
+            velocity_mps=self._senses.velocity_mps(frame),
+            footprint_radius_m=radius_m,
+            battery_soc=platform.soc,
+            cpu_headroom=platform.cpu_headroom,
+            gpu_headroom=platform.gpu_headroom,
+            peer_goodput_mbps=self._modem.goodput_mbps(),
+            coverage_grid=self._grid,
+            novelty_flags=NOVEL_FLAG * self._novel + TARGET_FLAG * bool(task.target_ids),
+            task_phase=task.phase,
+            region=task.region,
+            priority_target_ids=task.target_ids,
+        )
+        payload = encode_descriptor(descriptor)
+        datagram = payload if self._sealer is None else self._sealer.seal(payload)
+        self._modem.broadcast(datagram)
+        self._log.descriptor(now_s, descriptor, len(datagram))
+        return decode_descriptor(payload)
+
+    def _age_s(self, peer: int) -> float:
+        """Age of a descriptor by this drone's clock, and never less than the time since it came in."""
+        now_s = self.env.now
+        by_stamp_s = now_s + self.clock_skew_s - self._known[peer].stamp_ns * 1e-9
+        return max(by_stamp_s, now_s - self._heard_at_s.get(peer, now_s))
+
+    def _decide(self) -> None:
+        rules, now_s = self._rules, self.env.now
+        ages_s = {i: self._age_s(i) for i in sorted(self._known)}
+        view = FleetView(self.drone, rules.period_s, {i: self._known[i] for i in ages_s}, ages_s)
+        begin_ns = time.perf_counter_ns()
+        directives = self.policy(view)
+        elapsed_ns = time.perf_counter_ns() - begin_ns
+        check_directives(directives, view)
+        self._log.decision(now_s, self.drone, elapsed_ns, [a for i, a in ages_s.items() if i != self.drone])
+        by_peer = {d.destination: d for d in directives}
+        for peer in ages_s:
+            if peer != self.drone:
+                asked = by_peer.get(peer) or Directive(self.drone, peer, reason="the policy gave no directive")
+                self._enforce(asked, ages_s[peer], now_s)
+
+    def _enforce(self, asked: Directive, age_s: float, now_s: float) -> None:
+        """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
+        rules, peer = self._rules, asked.destination
+        link = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
+        capped = cap_by_age(asked, link, age_s)
+        before = self._links.get(peer) or LinkState(Directive(self.drone, peer))
+        after = damp(before, capped, now_s, rules.dwell_s)
+        if after is before:
+            return
+        self._links[peer] = after
+        if after.enforced != before.enforced:
+            on_the_wire = decode_directive(encode_directive(after.enforced))
+            enforced = replace(on_the_wire, reason=after.enforced.reason)
+            self.gate.enforce(enforced)
+            self._log.directive(now_s, asked, enforced, link)
+
+    # --- the data plane ------------------------------------------------------------------------
+
+    def _send(self, capture: Capture) -> None:
+        if not self.airborne:
+            return
+        x_m, y_m, _ = capture.est_position_m
+        for directive in self.gate.due(self.env.now):
+            payload = make_payload(
+                directive, x_m, y_m, capture.est_yaw_rad, lambda roi: self._senses.count_boxes(capture, roi)
+            )
+            if payload is not None:
+                self._modem.send(directive.destination, payload, capture, directive.deadline_s)

@@ -1,0 +1,66 @@
+"""What a drone says about what it sees: footprint and coverage grid, from geometry alone (no content).
+
+The grid is 16 × 16 cells of 12.8 m, north-aligned and snapped to the world's 12.8 m lattice, so that two drones'
+grids can be compared cell by cell. It covers the ±102.4 m that the perception covers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from policies.contract import COVERAGE_CELLS, Coverage
+
+CELL_M = 12.8
+HALF_FIELD_OF_VIEW_DEG = 35.0
+"""Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
+RANGE_M = 102.4
+NOVEL_FLAG, TARGET_FLAG = 1, 2
+
+
+def footprint_radius_m(height_m: float) -> float:
+    """Radius of the nadir footprint at a height above ground."""
+    return max(0.0, height_m) * math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
+
+
+def pack_grid(states: np.ndarray) -> bytes:
+    """16 × 16 coverage states (rows from south, columns from west) to 64 B, lowest bits first."""
+    quads = states.astype(np.uint8).reshape(-1, 4)
+    return bytes((quads << np.array([0, 2, 4, 6], np.uint8)).sum(axis=1, dtype=np.uint8))
+
+
+def unpack_grid(grid: bytes) -> np.ndarray:
+    """The inverse of `pack_grid`: uint8 [16, 16]."""
+    packed = np.frombuffer(grid, np.uint8)[:, None]
+    return ((packed >> np.array([0, 2, 4, 6], np.uint8)) & 3).reshape(COVERAGE_CELLS, COVERAGE_CELLS)
+
+
+class CoverageMap:
+    """One drone's coverage statement and its memory of what it has seen well."""
+
+    def __init__(self) -> None:
+        self._seen_well: set[tuple[int, int]] = set()
+
+    def look(self, x_m: float, y_m: float, radius_m: float) -> tuple[bytes, bool]:
+        """The grid from here, and whether any cell is seen well for the first time.
+
+        Args:
+            x_m, y_m: where the drone believes it is, ENU.
+            radius_m: its footprint radius.
+        """
+        half = COVERAGE_CELLS // 2
+        ix = math.floor(x_m / CELL_M) - half + np.arange(COVERAGE_CELLS)
+        iy = math.floor(y_m / CELL_M) - half + np.arange(COVERAGE_CELLS)
+        distance_m = np.hypot((ix + 0.5) * CELL_M - x_m, ((iy + 0.5) * CELL_M - y_m)[:, None])
+        states = np.full(distance_m.shape, Coverage.UNSEEN, np.uint8)
+        states[distance_m <= RANGE_M] = Coverage.POOR
+        rows, columns = np.nonzero(distance_m <= radius_m)
+        novel = False
+        for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
+            key = (int(ix[c]), int(iy[r]))
+            new = key not in self._seen_well
+            self._seen_well.add(key)
+            states[r, c] = Coverage.NOVEL if new else Coverage.WELL
+            novel |= new
+        return pack_grid(states), novel

@@ -1,0 +1,119 @@
+"""The gate: the only place that sees both a directive and a payload.
+
+It turns a directive into a payload of an exact size, at the directive's rate. Sizes: feature cells × 160 B and
+their index (perception.budget), boxes × 24 B, tracks × 20 B, raw images as rendered sizes of UAV3D's cameras;
+each payload carries a header with capture stamp and pose, and the directive it obeys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perception import budget
+from policies.contract import Directive, Disc, Representation
+
+HEADER_BYTES = 40
+"""Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
+DIRECTIVE_BYTES = 36
+"""The directive rides along, so that the receiver knows rung, ROI and fusion weight."""
+RAW_BYTES = 5 * 800 * 450 * 3
+"""Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
+MAX_TRACKS = 12
+
+_EPSILON_S = 1e-6
+
+CountBoxes = Callable[[Disc | None], int]
+"""How many boxes the drone's own detector reports in a region right now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """What goes on the air for one link and frame; the content is named, not carried."""
+
+    representation: Representation
+    rho: float
+    roi: Disc | None
+    fusion_weight: float
+    cells: int
+    boxes: int
+    index_bytes: int
+    size_bytes: int
+
+    @property
+    def reliable(self) -> bool:
+        """Compact payloads go reliably, high-rate ones best effort (the paper's QoS mapping)."""
+        return self.representation in (Representation.TRACKS, Representation.DETECTIONS)
+
+
+def make_payload(
+    directive: Directive, est_x_m: float, est_y_m: float, est_yaw_rad: float, count_boxes: CountBoxes
+) -> Payload | None:
+    """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent."""
+    rung = directive.representation
+    cells = boxes = index_bytes = 0
+    if rung == Representation.NONE:
+        return None
+    if rung == Representation.FEATURES:
+        roi = directive.roi
+        disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
+        cells = budget.cells_sent(directive.rho, disc, est_x_m, est_y_m, est_yaw_rad)
+        if cells == 0:
+            return None
+        index_bytes = budget.index_bytes(cells)
+        content = budget.payload_bytes(cells) + index_bytes
+    elif rung == Representation.RAW:
+        content = RAW_BYTES
+    else:
+        boxes = count_boxes(directive.roi)
+        if rung == Representation.TRACKS:
+            boxes = min(boxes, MAX_TRACKS)
+            content = boxes * budget.TRACK_BYTES
+        else:
+            content = boxes * budget.DETECTION_BYTES
+    return Payload(
+        rung,
+        directive.rho,
+        directive.roi,
+        directive.fusion_weight,
+        cells,
+        boxes,
+        index_bytes,
+        HEADER_BYTES + DIRECTIVE_BYTES + content,
+    )
+
+
+class Gate:
+    """One drone's gate: the directive in force on each link, and when the link last sent."""
+
+    def __init__(self) -> None:
+        self._directives: dict[int, Directive] = {}
+        self._last_slot_s: dict[int, float] = {}
+
+    def enforce(self, directive: Directive) -> None:
+        """Put a directive in force. Repeating one changes nothing: timers run from the last send, not from here."""
+        self._directives[directive.destination] = directive
+
+    def in_force(self, peer: int) -> Directive | None:
+        """The directive of a link, None before the first."""
+        return self._directives.get(peer)
+
+    @property
+    def duty_percent(self) -> int:
+        """The duty cycle asked for: the highest over the links, 100 where there is no link."""
+        return max((d.duty_percent for d in self._directives.values()), default=100)
+
+    def due(self, now_s: float) -> list[Directive]:
+        """Directives of the links that may send now, by ascending peer; marks them as sent."""
+        ready = []
+        for peer in sorted(self._directives):
+            directive = self._directives[peer]
+            if directive.representation == Representation.NONE or directive.rate_hz <= 0:
+                continue
+            slot_s = self._last_slot_s.get(peer, -1e9) + 1.0 / directive.rate_hz
+            if now_s < slot_s - _EPSILON_S:
+                continue
+            # Slots advance by the period, so that 3 Hz on a 10 Hz clock is 3 Hz in the mean; a late slot starts anew.
+            self._last_slot_s[peer] = slot_s if now_s - slot_s < 1.0 / directive.rate_hz else now_s
+            ready.append(directive)
+        return ready
