@@ -44,7 +44,8 @@ def swap_attitude(quaternion_xyzw: npt.ArrayLike) -> Array:
     """
     q = np.asarray(quaternion_xyzw, dtype=float)
     swapped = _NED_FROM_ENU * Rotation.from_quat(q.reshape(-1, 4)) * _FLU_FROM_FRD
-    return swapped.as_quat(canonical=True).reshape(q.shape)
+    out: Array = swapped.as_quat(canonical=True).reshape(q.shape)
+    return out
 
 
 def to_wxyz(quaternion_xyzw: npt.ArrayLike) -> Array:
@@ -60,7 +61,8 @@ def to_xyzw(quaternion_wxyz: npt.ArrayLike) -> Array:
 def yaw_rad(quaternion_xyzw: npt.ArrayLike) -> Array:
     """Yaw [...] of FLU-in-ENU attitudes [..., 4]: direction of the body's x axis on the ground, (−π, π]."""
     x, y, z, w = np.moveaxis(np.asarray(quaternion_xyzw, dtype=float), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw: Array = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return yaw
 
 
 def compass_deg(yaw: npt.ArrayLike) -> Array:

@@ -86,8 +86,8 @@ def attitude(thrust_mps2: Array, heading_rad: Array) -> Array:
         raise MotionError("attitude is not determined: the thrust points along the heading")
     y_b /= norm
     matrix = np.stack([np.cross(y_b, z_b), y_b, z_b], axis=-1)
-    quaternion = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat()
-    return quaternion.reshape(*thrust_mps2.shape[:-1], 4)
+    quaternion: Array = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat().reshape(*thrust_mps2.shape[:-1], 4)
+    return quaternion
 
 
 def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0) -> Motion:
@@ -107,7 +107,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     """
     n, config = fleet.drones, fleet.motion
     frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
-    time_s = np.arange(frames) * frame_s
+    time_s: Array = np.arange(frames, dtype=np.float64) * frame_s
     path = frame_path(
         fleet.route.waypoints_m, fleet.route.speed_mps, fleet.route.turn_time_s, fleet.formation.spacing_m, time_s
     )

@@ -38,7 +38,7 @@ def gauss_markov(normals: Array, sigma: float, time_s: float, step_s: float) -> 
     """
     driven = normals * (sigma * math.sqrt(-math.expm1(-2 * step_s / time_s)))
     driven[0] = sigma * normals[0]
-    return lfilter([1.0], [1.0, -math.exp(-step_s / time_s)], driven, axis=0)
+    return _lag(driven, math.exp(-step_s / time_s))
 
 
 def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[Array, Array, Array]:
@@ -71,7 +71,8 @@ def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[
 
 
 def _lag(driven: Array, decay: float) -> Array:
-    return lfilter([1.0], [1.0, -decay], driven, axis=0)
+    lagged: Array = lfilter([1.0], [1.0, -decay], driven, axis=0)
+    return lagged
 
 
 def _lag_covariance(d: float) -> Array:
@@ -84,4 +85,5 @@ def _lag_covariance(d: float) -> Array:
     m = i + j + 1
     factorial = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
     share = np.ones_like(m, dtype=float) if math.isinf(d) else gammainc(m, 2 * d)
-    return factorial[m - 1] / (factorial[i] * factorial[j]) * 0.5**m * share
+    covariance: Array = factorial[m - 1] / (factorial[i] * factorial[j]) * 0.5**m * share
+    return covariance
