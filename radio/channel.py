@@ -1,0 +1,215 @@
+"""Positions to signal-to-noise ratios: path loss, shadowing, fading, noise and jammers.
+
+Random numbers come from one stream per drone and purpose; the stream of drone h draws for its links
+to the drones of *lower* id, so that each link has numbers of its own and one more drone changes none
+of the others', with N streams and not N².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp, log10, pi, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
+from scenarios.schema import Radio
+from scenarios.streams import stream
+
+FloatArray = NDArray[np.float64]
+Jammer = tuple[Sequence[float], float]
+"""Position ENU in metres and power in the channel in dBm."""
+
+_LIGHT_MPS = 299_792_458.0
+_BLOCK_NUMBERS = 1 << 18
+
+
+def free_space_loss_db(distance_m: ArrayLike, carrier_ghz: float) -> FloatArray:
+    """Friis: 20 log10(4π d f / c), dB."""
+    return np.asarray(20.0 * np.log10(4.0 * pi * np.asarray(distance_m, dtype=float) * carrier_ghz * 1e9 / _LIGHT_MPS))
+
+
+def path_loss_db(distance_m: ArrayLike, carrier_ghz: float, exponent: float) -> FloatArray:
+    """Log-distance loss: free space at 1 m, then 10 · exponent · log10(d); nearer than 1 m counts as 1 m."""
+    d = np.maximum(np.asarray(distance_m, dtype=float), 1.0)
+    return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) + 10.0 * exponent * np.log10(d))
+
+
+def noise_dbm(bandwidth_mhz: float, noise_figure_db: float) -> float:
+    """Thermal noise at 290 K and the receiver's figure: −174 + 10 log10 B + NF, dBm."""
+    return -174.0 + 10.0 * log10(bandwidth_mhz * 1e6) + noise_figure_db
+
+
+def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
+    """Power gain of mean 1 from two standard normals: a fixed path of K/(K + 1) and a scattered one of 1/(K + 1)."""
+    k = 10.0 ** (k_db / 10.0)
+    scatter = sqrt(0.5 / (k + 1.0))
+    return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
+
+
+class Channel:
+    """The SNR of every link, frame by frame.
+
+    `snr_db[i, j]` is the mean (over small-scale fading) SNR at receiver j of sender i in the whole channel,
+    NaN on the diagonal. `group_reach_bytes[i, j]` is the longest group-addressed frame of i that j receives
+    in this frame, its fade and its luck drawn; NaN on the diagonal, so that no drone hears itself.
+
+    Args:
+        config: the scenario's radio section.
+        n_drones: ids are 0 … n_drones − 1.
+        seed, replication: as in `scenarios.streams.stream`.
+        frame_s: time between two calls of `advance`.
+    """
+
+    def __init__(self, config: Radio, n_drones: int, seed: int, replication: int, frame_s: float) -> None:
+        if n_drones < 1:
+            raise ValueError(f"n_drones is {n_drones}, must be at least 1")
+        if not frame_s > 0:
+            raise ValueError(f"frame_s is {frame_s!r}, must be > 0")
+        self.config = config
+        self.n = n_drones
+        self.frame = -1
+        self.snr_db: FloatArray = np.full((n_drones, n_drones), np.nan)
+        self.fade_db: FloatArray = np.zeros((n_drones, n_drones))
+        self.group_reach_bytes: FloatArray = np.full((n_drones, n_drones), np.nan)
+        self.shadow_db: FloatArray = np.zeros((n_drones, n_drones))
+        self.noise_dbm = noise_dbm(config.bandwidth_mhz, config.noise_figure_db)
+        # group frames go out in the primary 20 MHz with the whole power, so over less noise
+        self._group_gain_db = 10.0 * log10(config.bandwidth_mhz / 20.0)
+        mcs = group_mcs(config.group_rate_mbps)
+        self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
+        self._keep = exp(-frame_s / config.shadowing_time_s)
+        self._renew = sqrt(1.0 - self._keep**2)
+        ids = range(n_drones)
+        self._shadow_streams = [stream(seed, replication, h, "shadowing") for h in ids]
+        self._fade_streams = [stream(seed, replication, h, "fading") for h in ids]
+        self._luck_streams = [stream(seed, replication, h, "group loss") for h in ids]
+        self._block = max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
+        self._shadow_z: FloatArray
+        self._fades: FloatArray
+        self._luck: FloatArray
+
+    def advance(
+        self, positions_m: ArrayLike, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()
+    ) -> FloatArray:
+        """Move on by one frame.
+
+        Args:
+            positions_m: [N, 3], ENU.
+            extra_loss_db: [N, N], sender by receiver, added to the path loss; None is none.
+            jammers: position (ENU, m) and power (dBm) of each; what a receiver gets of it adds to its noise.
+
+        Returns:
+            `snr_db`, [N, N]: a new array each frame.
+
+        Raises:
+            ValueError: if a shape is wrong or a position is not finite.
+        """
+        p = np.asarray(positions_m, dtype=float)
+        if p.shape != (self.n, 3):
+            raise ValueError(f"positions_m has shape {p.shape}, must be ({self.n}, 3)")
+        if not np.isfinite(p).all():
+            raise ValueError("positions_m holds a value that is not finite")
+        self.frame += 1
+        row = self.frame % self._block
+        if row == 0:
+            self._refill()
+        z = self._shadow_z[row]
+        self.shadow_db = (
+            self.config.shadowing_sigma_db * z
+            if self.frame == 0
+            else self._keep * self.shadow_db + self._renew * self.config.shadowing_sigma_db * z
+        )
+        c = self.config
+        delta = p[:, None, :] - p[None, :, :]
+        distance = np.sqrt(np.einsum("ijk,ijk->ij", delta, delta))
+        snr = c.tx_power_dbm - self.noise_dbm - path_loss_db(distance, c.carrier_ghz, c.path_loss_exponent)
+        snr += self.shadow_db
+        if extra_loss_db is not None:
+            extra = np.asarray(extra_loss_db, dtype=float)
+            if extra.shape != snr.shape:
+                raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {snr.shape}")
+            snr -= extra
+        if jammers:
+            snr -= self._noise_rise_db(p, jammers)
+        self.fade_db = self._fades[row]
+        self.group_reach_bytes = self._reach(snr + self.fade_db, self._luck[row])
+        snr.flat[:: self.n + 1] = np.nan
+        self.snr_db = snr
+        return snr
+
+    def reach_again(self, sender: int, times: int) -> FloatArray:
+        """`group_reach_bytes[sender]` for a further frame of the same sender within the frame: same fade, new luck.
+
+        The luck is the frame's own shifted by multiples of the golden ratio, modulo 1.
+        """
+        luck = (self._luck[self.frame % self._block, sender] + times * 0.6180339887498949) % 1.0
+        faded_db = self.snr_db[sender] + self.fade_db[sender]
+        faded_db[sender] = 0.0
+        return self._reach(faded_db, luck, sender)
+
+    def _reach(self, faded_db: FloatArray, luck: FloatArray, sender: int | None = None) -> FloatArray:
+        # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
+        margin = faded_db + (self._group_gain_db - self._group_s50_db)
+        minus_log_s = np.logaddexp(0.0, -self._group_slope * margin)
+        reach = -REFERENCE_BYTES * np.log1p(-luck) / np.maximum(minus_log_s, 1e-300)
+        if sender is None:
+            reach.flat[:: self.n + 1] = np.nan
+        else:
+            reach[sender] = np.nan
+        return np.asarray(reach)
+
+    def _noise_rise_db(self, positions_m: FloatArray, jammers: Sequence[Jammer]) -> FloatArray:
+        """[N]: how far the jammers lift each receiver's noise."""
+        c = self.config
+        total_mw = np.full(self.n, 10.0 ** (self.noise_dbm / 10.0))
+        for where, power_dbm in jammers:
+            d = np.sqrt(((positions_m - np.asarray(where, dtype=float)) ** 2).sum(axis=1))
+            total_mw += 10.0 ** ((power_dbm - path_loss_db(d, c.carrier_ghz, c.path_loss_exponent)) / 10.0)
+        return np.asarray(10.0 * np.log10(total_mw) - self.noise_dbm)
+
+    def _refill(self) -> None:
+        b, n = self._block, self.n
+        self._shadow_z = np.zeros((b, n, n))
+        x, y = np.zeros((b, n, n)), np.zeros((b, n, n))
+        self._luck = np.zeros((b, n, n))
+        for h in range(1, n):
+            z = self._shadow_streams[h].standard_normal((b, h))
+            self._shadow_z[:, h, :h] = z
+            self._shadow_z[:, :h, h] = z
+            self._scatter(x, h, f := self._fade_streams[h].standard_normal((b, 2, 2, h)), 0)
+            self._scatter(y, h, f, 1)
+            self._scatter(self._luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
+        self._fades = 10.0 * np.log10(np.maximum(rician_gain(x, y, self.config.rician_k_db), 1e-12))
+
+    @staticmethod
+    def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:
+        into[:, h, :h] = drawn[:, part, 0]  # h sends
+        into[:, :h, h] = drawn[:, part, 1]  # h receives
+
+
+class SampleLuck:
+    """Uniform draws for unicast samples, keyed per ordered link and taken by the link's own sample number.
+
+    Each sample gets `ROUNDS` numbers whether it needs them or not, so that what one sample needed (its repair
+    rounds) never moves the next one's.
+    """
+
+    ROUNDS = 4
+    _BLOCK = 64
+
+    def __init__(self, seed: int, replication: int) -> None:
+        self._key = (seed, replication)
+        self._links: dict[tuple[int, int], tuple[np.random.Generator, list[list[float]]]] = {}
+
+    def next(self, sender: int, receiver: int) -> list[float]:
+        """The numbers of the link's next sample."""
+        link = (sender, receiver)
+        known = self._links.get(link)
+        if known is None:
+            known = self._links[link] = (stream(*self._key, link, "fragment loss"), [])
+        generator, ready = known
+        if not ready:
+            ready.extend(generator.random((self._BLOCK, self.ROUNDS)).tolist()[::-1])
+        return ready.pop()

@@ -1,0 +1,41 @@
+"""What a sender knows of its links: goodput from what was acknowledged while its samples were in service.
+
+**A measurement.** While a sample is in service the sender sees its frames acknowledged. Per exchange there
+are fixed costs (preamble, backoff, block ack) that would make a 150 B sample look slow on the best link, so
+acknowledged data are counted as *the time they would have taken alone* × *the payload rate of full A-MPDUs*
+at the MCS in use, retries included. Divided by the time in service (which holds contention, other senders'
+turns and context frames) that is a rate in Mb/s. For a sample of many full A-MPDUs it equals acknowledged
+payload bits over time in service.
+
+**The estimate** of a link falls to a lower measurement at once and rises to a higher one by `RISE` of the gap.
+A sample that expires or is replaced half-way counts with what was acknowledged so far. One that never came to
+be served was held up by its own sender's queue, and the rate at which that queue moved bounds the estimate.
+A link never measured reports 0.
+"""
+
+from __future__ import annotations
+
+RISE = 0.3
+
+
+class Goodput:
+    """The estimates of every ordered link, Mb/s."""
+
+    def __init__(self, n_drones: int) -> None:
+        self._mbps: list[list[float | None]] = [[None] * n_drones for _ in range(n_drones)]
+
+    def measured(self, sender: int, receiver: int, mbps: float) -> None:
+        """A measurement: down at once, up by `RISE` of the gap; the first one is taken as it is."""
+        row = self._mbps[sender]
+        known = row[receiver]
+        row[receiver] = mbps if known is None or mbps <= known else known + RISE * (mbps - known)
+
+    def bounded(self, sender: int, receiver: int, mbps: float) -> None:
+        """A link cannot be said to be better than this now; an unmeasured link stays unmeasured."""
+        known = self._mbps[sender][receiver]
+        if known is not None and mbps < known:
+            self._mbps[sender][receiver] = mbps
+
+    def read(self, sender: int) -> list[float]:
+        """The estimates to all drones (0 where unmeasured, and to itself)."""
+        return [0.0 if v is None else v for v in self._mbps[sender]]

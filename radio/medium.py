@@ -1,0 +1,381 @@
+"""The shared medium on the SimPy clock: who may use the air, and when a sample is through.
+
+Two classes of traffic.
+
+**Data** is a fluid. Each sender has a first-in-first-out queue; while n senders are backlogged each is given
+1/n of the channel's time, and of that its own exchanges, its idle slots and its part of the collisions are
+paid (Bianchi's model for n). So a sample with exchanges X needs n · X.channel_s(n) seconds while n stays.
+
+**Context** (group-addressed frames) goes first. A frame that finds data on the air waits for the rest of that
+exchange (uniform), then all waiting context frames count down backoff slots; the lowest counter sends, equal
+ones collide, the others freeze. Data stand still from the countdown to the end of the last waiting frame.
+
+Events: one timer for the data (next completion or deadline, never per fragment) and one for the frame on the
+air. A timer that turns out to be early because others joined is set anew; it never polls.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from enum import Enum
+from heapq import heappop, heappush
+from math import inf, nan
+
+import simpy
+
+from radio.airtime import Exchanges
+from radio.contention import DIFS_S, SIFS_S, SLOT_S, contention
+
+AIFS_CONTEXT_S = SIFS_S + 2 * SLOT_S
+CW_CONTEXT = 15
+_EPS_S = 1e-10
+
+
+class End(Enum):
+    """How a job left the medium."""
+
+    SERVED = "served"
+    DEADLINE_QUEUED = "deadline_queued"
+    DEADLINE_IN_SERVICE = "deadline_in_service"
+
+
+class Job:
+    """One sample's claim on the air; subclassed by what knows the sample.
+
+    `remaining` runs from 1 to 0 while it is served. `granted_s` is the channel time that it was given
+    (shares of contention included), `served_alone_s` the time that its acknowledged part would have taken alone.
+    """
+
+    __slots__ = (
+        "alone_s",
+        "clean_s",
+        "collided_s",
+        "count",
+        "deadline_s",
+        "granted_s",
+        "live",
+        "number",
+        "ppdu_s",
+        "remaining",
+        "sender",
+        "t_start_s",
+    )
+
+    def __init__(self, number: int, sender: int, deadline_s: float) -> None:
+        self.number = number
+        self.sender = sender
+        self.deadline_s = deadline_s
+        self.remaining = 1.0
+        self.granted_s = 0.0
+        self.t_start_s = nan
+        self.live = True
+        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = 0.0
+
+    def demand(self, exchanges: Exchanges, tries: float = 1.0) -> None:
+        """Set what the whole job asks of the medium, each frame sent `tries` times; `remaining` stays."""
+        self.count = count = exchanges.count * tries
+        self.ppdu_s = ppdu_s = exchanges.ppdu_s * tries
+        self.clean_s = clean_s = exchanges.clean_s * tries
+        self.collided_s = ppdu_s + count * DIFS_S
+        self.alone_s = clean_s + count * _IDLE_ALONE_S
+
+
+_IDLE_ALONE_S = contention(1).idle_s
+
+
+class GroupFrame:
+    """One group-addressed frame."""
+
+    __slots__ = ("airtime_s", "fire_s", "sender", "slots")
+
+    def __init__(self, sender: int, airtime_s: float, slots: int) -> None:
+        self.sender = sender
+        self.airtime_s = airtime_s
+        self.slots = slots
+        self.fire_s = inf
+
+
+class Medium:
+    """One channel that everybody hears.
+
+    Args:
+        env: the clock.
+        n_drones: senders are 0 … n_drones − 1.
+        on_begin: called when a job comes to the head of its queue; must call `job.demand`.
+        on_end: called once a job is through or its deadline has passed, after the medium has moved on.
+        on_group_end: called at a context frame's end with the frame and whether it collided.
+    """
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        n_drones: int,
+        on_begin: Callable[[Job], None],
+        on_end: Callable[[Job, End], None],
+        on_group_end: Callable[[GroupFrame, bool], None],
+    ) -> None:
+        self._env = env
+        self._on_begin, self._on_end, self._on_group_end = on_begin, on_end, on_group_end
+        self._queues: list[deque[Job]] = [deque() for _ in range(n_drones)]
+        self._heads: dict[int, Job] = {}
+        self._deadlines: list[tuple[float, int, int, Job]] = []
+        self._pushes = 0
+        table = [contention(max(1, k)) for k in range(n_drones + 1)]
+        self._idle_s = [c.idle_s for c in table]
+        self._collisions = [c.collisions for c in table]
+        self._sends = [c.sends_per_success for c in table]
+        self._last_s = env.now
+        self._begin_s = env.now
+        self._due_s = inf
+        self._timer: simpy.Event | None = None
+        self._waiting: list[GroupFrame] = []
+        self._context_from_s = inf
+        self._context_until_s = -inf
+        self._context_fire_s = inf
+        self._context_timer: simpy.Event | None = None
+        self.transmit_s = [0.0] * n_drones
+        """Seconds each drone has transmitted: data with retries and collisions, and context frames."""
+        self.data_busy_s = 0.0
+        self.context_busy_s = 0.0
+
+    # --- data ------------------------------------------------------------------------------------
+
+    def submit(self, job: Job) -> None:
+        """Queue a job behind its sender's others."""
+        self._pushes += 1
+        heappush(self._deadlines, (job.deadline_s, job.number, self._pushes, job))
+        queue = self._queues[job.sender]
+        queue.append(job)
+        if len(queue) == 1:
+            self.sync()
+            self._serve(job)
+            self._arm()
+        elif job.deadline_s < self._due_s:
+            self._set_timer(max(job.deadline_s, self._env.now))
+
+    def replace(self, old: Job, new: Job) -> None:
+        """Drop `old` (queued or in service) for `new`.
+
+        A queued job's place is kept. One in service is cut short and the new one goes to the tail, so that
+        the sender's other samples are not starved by a link that is slower than its samples come.
+        """
+        if self._heads.get(old.sender) is old:
+            self.withdraw(old)
+            self.submit(new)
+            return
+        old.live = False
+        queue = self._queues[old.sender]
+        queue[queue.index(old)] = new
+        self._pushes += 1
+        heappush(self._deadlines, (new.deadline_s, new.number, self._pushes, new))
+        if new.deadline_s < self._due_s:
+            self._set_timer(max(new.deadline_s, self._env.now))
+
+    def withdraw(self, job: Job) -> None:
+        """Take a job out without a word; the next in its queue begins."""
+        self.sync()
+        self._remove(job)
+        self._arm()
+
+    def retune(self) -> None:
+        """Let every job in service set its demand anew (the links have changed)."""
+        if self._heads:
+            self.sync()
+            for job in self._heads.values():
+                self._on_begin(job)
+            self._arm()
+
+    def in_service(self, sender: int) -> Job | None:
+        """The job at the head of a sender's queue."""
+        return self._heads.get(sender)
+
+    def queued(self, sender: int) -> Iterable[Job]:
+        """A sender's jobs, the one in service first."""
+        return self._queues[sender]
+
+    def _serve(self, job: Job) -> None:
+        self._heads[job.sender] = job
+        job.t_start_s = self._env.now
+        self._on_begin(job)
+
+    def _remove(self, job: Job) -> None:
+        job.live = False
+        queue = self._queues[job.sender]
+        if queue[0] is job:
+            queue.popleft()
+            if queue:
+                self._serve(queue[0])
+            else:
+                del self._heads[job.sender]
+        else:
+            queue.remove(job)
+
+    def sync(self) -> None:
+        """Bring every account up to now."""
+        now = self._env.now
+        dt = now - self._last_s
+        if dt <= 0.0:
+            return
+        blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
+        if blocked > 0.0:
+            self.context_busy_s += blocked
+            dt -= blocked
+        self._last_s = now
+        n = len(self._heads)
+        if n == 0 or dt <= 0.0:
+            return
+        self.data_busy_s += dt
+        share = dt / n
+        idle, collisions, sends = self._idle_s[n], self._collisions[n], self._sends[n]
+        for sender, job in self._heads.items():
+            need = job.clean_s + job.count * idle + collisions * job.collided_s
+            left = job.remaining
+            done = share / need if need * left > share else left
+            job.remaining = left - done
+            job.granted_s += share
+            self.transmit_s[sender] += done * job.ppdu_s * sends
+
+    def _arm(self) -> None:
+        """Set the timer to the earliest thing that can happen."""
+        deadlines = self._deadlines
+        while deadlines and not deadlines[0][3].live:
+            heappop(deadlines)
+        now = self._env.now
+        n = len(self._heads)
+        soonest = inf
+        if n:
+            idle, collisions = self._idle_s[n], self._collisions[n]
+            for job in self._heads.values():
+                need = job.remaining * (job.clean_s + job.count * idle + collisions * job.collided_s)
+                if need < soonest:
+                    soonest = need
+            soonest *= n
+            if now + soonest > self._context_from_s:
+                soonest += self._context_until_s - max(now, self._context_from_s)
+        due = now + soonest
+        if deadlines and deadlines[0][0] < due:
+            due = max(deadlines[0][0], now)
+        if due < self._due_s:
+            self._set_timer(due)
+
+    def _set_timer(self, due_s: float) -> None:
+        self._due_s = due_s
+        timer = self._env.timeout(due_s - self._env.now)
+        timer.callbacks.append(self._on_timer)
+        self._timer = timer
+
+    def _on_timer(self, event: simpy.Event) -> None:
+        if event is not self._timer:
+            return  # an earlier time was set meanwhile
+        self._due_s = inf
+        self.sync()
+        now = self._env.now
+        ended: list[tuple[Job, End]] = []
+        n = len(self._heads)
+        if n:
+            idle, collisions = self._idle_s[n], self._collisions[n]
+            for job in tuple(self._heads.values()):
+                if n * job.remaining * (job.clean_s + job.count * idle + collisions * job.collided_s) <= _EPS_S:
+                    job.remaining = 0.0
+                    ended.append((job, End.SERVED))
+            ended.sort(key=_by_number)
+            for job, _ in ended:
+                self._remove(job)
+        deadlines = self._deadlines
+        while deadlines and (not deadlines[0][3].live or deadlines[0][0] <= now + _EPS_S):
+            job = heappop(deadlines)[3]
+            if job.live:
+                served = self._heads.get(job.sender) is job and job.t_start_s < now
+                self._remove(job)
+                ended.append((job, End.DEADLINE_IN_SERVICE if served else End.DEADLINE_QUEUED))
+        self._arm()
+        for job, how in ended:
+            self._on_end(job, how)
+
+    # --- context ---------------------------------------------------------------------------------
+
+    def announce(self, frame: GroupFrame, residual: float) -> None:
+        """Contend for the air with a context frame.
+
+        Args:
+            frame: its `slots` drawn, 0 … CW_CONTEXT.
+            residual: uniform in [0, 1): how much of a running data exchange is still to come.
+        """
+        self.sync()
+        now = self._env.now
+        waiting = self._waiting
+        if not waiting:
+            self._context_from_s = now + residual * self._mean_exchange_s()
+        waiting.append(frame)
+        if now >= self._context_fire_s:
+            return  # heard the frame that is on the air; counts down after it
+        frame.fire_s = max(now, self._context_from_s) + AIFS_CONTEXT_S + frame.slots * SLOT_S
+        self._plan_context()
+
+    def drop_context(self, sender: int) -> None:
+        """Forget a drone's waiting context frames; one that is on the air ends."""
+        now = self._env.now
+        self.sync()
+        kept = [
+            f
+            for f in self._waiting
+            if f.sender != sender or (self._context_fire_s <= now and f.fire_s <= self._context_fire_s + SLOT_S / 2)
+        ]
+        if len(kept) == len(self._waiting):
+            return
+        self._waiting = kept
+        if now < self._context_fire_s:
+            self._plan_context()
+            self._arm()
+
+    def _mean_exchange_s(self) -> float:
+        jobs = [j for j in self._heads.values() if j.count > 0.0]
+        return sum(j.ppdu_s / j.count for j in jobs) / len(jobs) if jobs else 0.0
+
+    def _plan_context(self) -> None:
+        waiting = self._waiting
+        if not waiting:
+            self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
+            self._context_timer = None
+            return
+        fire = min(f.fire_s for f in waiting)
+        until = fire + max(f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2)
+        self._context_fire_s = fire
+        if until != self._context_until_s or self._context_timer is None:
+            self._context_until_s = until
+            timer = self._env.timeout(until - self._env.now)
+            timer.callbacks.append(self._on_context_timer)
+            self._context_timer = timer
+
+    def _on_context_timer(self, event: simpy.Event) -> None:
+        if event is not self._context_timer:
+            return
+        self._context_timer = None
+        self.sync()
+        now, fire = self._env.now, self._context_fire_s
+        sent = [f for f in self._waiting if f.fire_s <= fire + SLOT_S / 2]
+        self._waiting = [f for f in self._waiting if f.fire_s > fire + SLOT_S / 2]
+        for f in self._waiting:
+            if f.fire_s < inf:  # it had counted down to the moment the winner sent
+                f.slots = max(1, round((f.fire_s - fire) / SLOT_S))
+            f.fire_s = now + AIFS_CONTEXT_S + f.slots * SLOT_S
+        if self._waiting:
+            self._context_from_s = now
+        self._plan_context()
+        for f in sent:
+            self.transmit_s[f.sender] += f.airtime_s
+            self._on_group_end(f, len(sent) > 1)
+
+    # --- accounts --------------------------------------------------------------------------------
+
+    @property
+    def utilisation(self) -> float:
+        """Fraction of the time so far in which the channel was claimed, contention included."""
+        self.sync()
+        elapsed = self._env.now - self._begin_s
+        return (self.data_busy_s + self.context_busy_s) / elapsed if elapsed > 0 else 0.0
+
+
+def _by_number(ended: tuple[Job, End]) -> int:
+    return ended[0].number

@@ -1,0 +1,136 @@
+"""802.11ax rates, packet error rates and the rate that an ideal sender picks.
+
+One spatial stream. The packet error rate (PER) of a 1458 B LDPC frame over white noise is a logistic
+in dB, 1 / (1 + e^{a (SNR − s50)}), fitted per MCS (error ≤ 0.036); a frame of L bytes fails with
+1 − (1 − PER)^{L/1458}. On a fading link the *mean* PER is the average of that over the Rician power gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import exp, expm1, log1p
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import ncx2
+
+FloatArray = NDArray[np.float64]
+
+RATES_MBPS: dict[int, tuple[float, ...]] = {
+    20: (8.6, 17.2, 25.8, 34.4, 51.5, 68.8, 77.4, 86.0, 103.2, 114.7, 129.0, 143.4),
+    40: (17.2, 34.4, 51.6, 68.8, 103.0, 137.6, 154.8, 172.0, 206.4, 229.4, 258.0, 286.8),
+    80: (36.0, 72.1, 108.1, 144.1, 216.2, 288.2, 324.3, 360.3, 432.4, 480.4, 540.4, 600.5),
+}
+"""Data rate by channel width (MHz) and MCS 0 … 11, 0.8 µs guard interval (IEEE 802.11ax)."""
+
+S50_DB = (-0.94, 2.07, 4.56, 7.55, 10.61, 14.78, 16.15, 17.66, 21.29, 23.10, 26.39, 28.45)
+SLOPE_PER_DB = (9.3, 9.1, 10.1, 7.8, 9.1, 7.9, 7.9, 7.4, 7.0, 6.8, 6.4, 5.8)
+REFERENCE_BYTES = 1458
+NO_LINK_PER = 0.9
+"""Above this mean PER at MCS 0 there is no link."""
+
+_STEP_DB = 0.05
+_LOW_DB, _HIGH_DB = -20.0, 60.0
+_FADE_LOW_DB, _FADE_HIGH_DB = -40.0, 15.0
+
+LEGACY_RATES_MBPS = (6.0, 12.0, 18.0, 24.0, 36.0, 48.0, 54.0)
+"""802.11a rates whose modulation and code rate are those of HE MCS 0 … 6 (9 Mb/s has no such twin)."""
+
+
+def per(snr_db: float, mcs: int, length_bytes: float = REFERENCE_BYTES) -> float:
+    """PER of one frame at a fixed SNR (no fading), 0 … 1."""
+    x = SLOPE_PER_DB[mcs] * (snr_db - S50_DB[mcs])
+    # log of the success probability of the reference frame, −log(1 + e^{−x}), without overflow
+    log_success = -log1p(exp(-x)) if x > 0 else x - log1p(exp(x))
+    return -expm1(log_success * length_bytes / REFERENCE_BYTES)
+
+
+def rescale(per_at: float, ratio: float) -> float:
+    """PER of a frame `ratio` times as long: 1 − (1 − PER)^ratio."""
+    return 1.0 if per_at >= 1.0 else -expm1(ratio * log1p(-per_at))
+
+
+def fading_weights(k_db: float) -> tuple[FloatArray, FloatArray]:
+    """The Rician power gain in dB, cut into bins.
+
+    Args:
+        k_db: Rician factor, dB; the mean gain is 1 (0 dB).
+
+    Returns:
+        Bin centres (dB, step 0.05) and their probabilities, which sum to 1; both of shape [bins].
+    """
+    k = 10.0 ** (k_db / 10.0)
+    centres = np.arange(_FADE_LOW_DB, _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
+    edges = 10.0 ** (np.append(centres - _STEP_DB / 2, centres[-1] + _STEP_DB / 2) / 10.0)
+    cdf = ncx2.cdf(edges * 2.0 * (k + 1.0), 2, 2.0 * k)
+    cdf[0], cdf[-1] = 0.0, 1.0
+    return centres, np.diff(cdf)
+
+
+@dataclass(frozen=True, slots=True)
+class RateTable:
+    """What an ideal rate control does at each mean SNR; lists over a 0.05 dB grid, for fast look-up."""
+
+    bandwidth_mhz: int
+    frame_bytes: int
+    mcs: tuple[int, ...]
+    """The best MCS, −1 where there is no link."""
+    rate_mbps: tuple[float, ...]
+    mean_per: tuple[float, ...]
+    """Mean PER of a frame of `frame_bytes` at that MCS; 1 where there is no link."""
+    all_per: tuple[tuple[float, ...], ...]
+    """Mean PER of each MCS."""
+
+    def index(self, mean_snr_db: float) -> int:
+        """Where a mean SNR (dB) stands on the grid; beyond its ends, the end."""
+        i = int((mean_snr_db - _LOW_DB) / _STEP_DB + 0.5) if mean_snr_db > _LOW_DB else 0
+        return i if i < len(self.mcs) else len(self.mcs) - 1
+
+    def at(self, mean_snr_db: float) -> tuple[int, float, float]:
+        """(MCS, rate in Mb/s, mean PER) at a mean SNR in dB; MCS −1 is no link."""
+        i = self.index(mean_snr_db)
+        return self.mcs[i], self.rate_mbps[i], self.mean_per[i]
+
+
+@lru_cache(maxsize=32)
+def rate_table(bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYTES) -> RateTable:
+    """Build the table of one channel: mean PER by quadrature, then the MCS of highest rate × (1 − mean PER).
+
+    Args:
+        bandwidth_mhz: 20, 40 or 80.
+        k_db: Rician factor of the fading.
+        frame_bytes: length of the frames that rate control has in mind.
+    """
+    _, weights = fading_weights(k_db)
+    grid = np.arange(_LOW_DB, _HIGH_DB + _STEP_DB / 2, _STEP_DB)
+    wide = np.arange(_LOW_DB + _FADE_LOW_DB, _HIGH_DB + _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
+    s50, slope = np.array(S50_DB)[:, None], np.array(SLOPE_PER_DB)[:, None]
+    log_success = -np.logaddexp(0.0, -slope * (wide - s50))
+    awgn = -np.expm1(log_success * (frame_bytes / REFERENCE_BYTES))
+    # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities
+    mean = np.stack([np.correlate(row, weights, mode="valid") for row in awgn])[:, : len(grid)].clip(0.0, 1.0)
+    rates = np.array(RATES_MBPS[bandwidth_mhz])
+    best = (rates[:, None] * (1.0 - mean)).argmax(axis=0)
+    dead = mean[0] > NO_LINK_PER
+    columns = np.arange(len(grid))
+    return RateTable(
+        bandwidth_mhz,
+        frame_bytes,
+        tuple(np.where(dead, -1, best).tolist()),
+        tuple(np.where(dead, 0.0, rates[best]).tolist()),
+        tuple(np.where(dead, 1.0, mean[best, columns]).tolist()),
+        tuple(tuple(row) for row in mean.tolist()),
+    )
+
+
+def choose_mcs(
+    mean_snr_db: float, bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYTES
+) -> tuple[int, float, float]:
+    """(MCS, rate in Mb/s, mean PER) of the ideal rate control; MCS −1 when even MCS 0 fails (mean PER > 0.9)."""
+    return rate_table(bandwidth_mhz, k_db, frame_bytes).at(mean_snr_db)
+
+
+def group_mcs(rate_mbps: float) -> int:
+    """The MCS whose PER curve stands for a legacy basic rate (same modulation and code rate, or the next above)."""
+    return next((i for i, r in enumerate(LEGACY_RATES_MBPS) if r >= rate_mbps - 1e-9), len(LEGACY_RATES_MBPS) - 1)

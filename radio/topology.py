@@ -1,0 +1,79 @@
+"""The fleet as a graph of usable links: who is connected, who is cut off, where the bottleneck is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def link_graph(quality: ArrayLike, threshold: float) -> Any:
+    """Directed graph of the links whose quality is at least `threshold`.
+
+    Args:
+        quality: [N, N], sender by receiver: goodput in Mb/s or SNR in dB; the diagonal and NaN are no links.
+        threshold: the bound, in the unit of `quality`.
+
+    Returns:
+        A networkx.DiGraph of the nodes 0 … N − 1, edges with attribute `quality`.
+
+    Raises:
+        ValueError: if `quality` is not square.
+    """
+    matrix = np.asarray(quality, dtype=float)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ValueError(f"quality has shape {matrix.shape}, must be square")
+    graph = nx.DiGraph()
+    graph.add_nodes_from(range(len(matrix)))
+    usable = matrix >= threshold
+    np.fill_diagonal(usable, False)
+    graph.add_edges_from(
+        (int(i), int(j), {"quality": float(matrix[i, j])}) for i, j in zip(*np.nonzero(usable), strict=True)
+    )
+    return graph
+
+
+def is_connected(graph: Any) -> bool:
+    """Whether every drone reaches every other, over several hops if need be."""
+    return len(graph) <= 1 or bool(nx.is_strongly_connected(graph))
+
+
+def cut_drones(graph: Any) -> list[int]:
+    """Drones outside the largest strongly connected group (of equals, that with the lowest id), ascending."""
+    groups = sorted(nx.strongly_connected_components(graph), key=lambda g: (-len(g), min(g)))
+    return sorted(set(graph) - groups[0]) if groups else []
+
+
+def bottleneck(graph: Any, path: Sequence[int]) -> tuple[int, int, float]:
+    """The weakest link (sender, receiver, quality) of a path of at least two drones.
+
+    Raises:
+        ValueError: if the path has no link.
+    """
+    if len(path) < 2:
+        raise ValueError(f"path is {list(path)}, must have at least two drones")
+    links = ((a, b, float(graph.edges[a, b]["quality"])) for a, b in pairwise(path))
+    return min(links, key=lambda link: link[2])
+
+
+def widest_path(graph: Any, source: int, target: int) -> list[int]:
+    """The path whose weakest link is strongest; fewest hops among equals; empty if there is none."""
+    strengths = sorted({quality for _, _, quality in graph.edges(data="quality")}, reverse=True)
+    low, high = 0, len(strengths)  # the strongest threshold at which a path is left, by bisection
+    while low < high:
+        middle = (low + high) // 2
+        if nx.has_path(_at_least(graph, strengths[middle]), source, target):
+            high = middle
+        else:
+            low = middle + 1
+    if low == len(strengths):
+        return []
+    return [int(i) for i in nx.shortest_path(_at_least(graph, strengths[low]), source, target)]
+
+
+def _at_least(graph: Any, quality: float) -> Any:
+    return nx.subgraph_view(graph, filter_edge=lambda a, b: graph.edges[a, b]["quality"] >= quality)

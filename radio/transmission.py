@@ -1,0 +1,83 @@
+"""One sample's fate: the row of the record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import exp, log1p
+
+from scipy.stats import binom
+
+
+class Status(StrEnum):
+    """What became of a sample."""
+
+    DELIVERED = "delivered"
+    LOST = "lost"
+    EXPIRED = "expired"
+    IN_FLIGHT = "in_flight"
+
+
+@dataclass(frozen=True, slots=True)
+class Transmission:
+    """A unicast sample from its writing to its end.
+
+    | field | meaning |
+    |---|---|
+    | number | running number of `Air.send` |
+    | kind | the caller's word for what it is; samples of one sender, receiver and kind replace one another |
+    | payload_bytes | what was handed over |
+    | wire_bytes | bytes of the 802.11 frames put on the air, MAC retries not counted, repairs counted |
+    | t_sent_s, deadline_s | when it was written and by when it must be through, on the clock |
+    | t_start_s | when it first came to be served; NaN if never |
+    | t_done_s | when its fate was settled; NaN while in flight |
+    | reason | '' if delivered or in flight; else fragment_lost, no_link, sender_gone, receiver_gone (lost); deadline_queued, deadline_in_service, replaced (expired) |
+    | fragments, fragments_lost | DDS fragments, and how often one was lost in all passes |
+    | repairs | repair rounds |
+    | mcs, snr_db | of its latest service, or −1 and the mean SNR at its sending |
+    | airtime_s | channel time it was given, contention and retries included |
+    """
+
+    number: int
+    sender: int
+    receiver: int
+    kind: str
+    payload_bytes: int
+    wire_bytes: int
+    t_sent_s: float
+    deadline_s: float
+    t_start_s: float
+    t_done_s: float
+    status: Status
+    reason: str
+    fragments: int
+    fragments_lost: int
+    repairs: int
+    mcs: int
+    snr_db: float
+    airtime_s: float
+
+
+def losses(u: float, count: int, q: float) -> int:
+    """Binomial(count, q) from one uniform number by inversion: the smallest k with P(X ≤ k) > u.
+
+    Walks up from the likely end, because q is tiny or the sample is lost anyhow.
+    """
+    if q <= 0.0:
+        return 0
+    if q >= 1.0:
+        return count
+    none = exp(count * log1p(-q))
+    if u < none:
+        return 0
+    if none < 1e-200:  # far from both ends; rare
+        return int(binom.ppf(u, count, q))
+    k, term, total = 0, none, none
+    odds = q / (1.0 - q)
+    while total <= u and k < count:
+        k += 1
+        term *= (count - k + 1) / k * odds
+        total += term
+        if term < 1e-18 and k > count * q:
+            break
+    return k
