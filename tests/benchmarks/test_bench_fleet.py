@@ -1,0 +1,77 @@
+"""What the fleet's hot path costs; `make bench` prints it, `make test` only runs it once. No timed assertions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fleet.auth import Inbox, Sealer, open_datagram
+from fleet.battery import FleetBatteries
+from fleet.motion import fly
+from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from scenarios.schema import Battery, Fleet, Route
+
+KEY = bytes(range(32))
+DESCRIPTOR = Descriptor(
+    stamp_ns=61_300_000_001,
+    agent_id=3,
+    position_m=(-12.5, 20.25, 60.0),
+    orientation_xyzw=(0.5, 0.5, 0.5, 0.5),
+    velocity_mps=(5.0, -0.5, 0.125),
+    footprint_radius_m=42.0,
+    battery_soc=0.75,
+    cpu_headroom=0.5,
+    gpu_headroom=0.25,
+    peer_goodput_mbps=(80.0, 0.0, 12.5, 3.0),
+    coverage_grid=bytes(range(64)),
+    novelty_flags=5,
+    task_phase=TaskPhase.TRACK,
+    region=Disc(10.0, -20.0, 32.0),
+)
+DIRECTIVE = Directive(1, 4, Representation.FEATURES, 0.25, Disc(10.0, -20.0, 32.0), 5.0)
+ROUTE = Route(waypoints_m=((0, 0), (200, 0), (200, 150), (0, 150)))
+
+
+def test_encode_descriptor(benchmark: Any) -> None:
+    assert len(benchmark(encode_descriptor, DESCRIPTOR)) == 180
+
+
+def test_decode_descriptor(benchmark: Any) -> None:
+    assert benchmark(decode_descriptor, encode_descriptor(DESCRIPTOR)) == DESCRIPTOR
+
+
+def test_encode_directive(benchmark: Any) -> None:
+    assert len(benchmark(encode_directive, DIRECTIVE)) == 36
+
+
+def test_decode_directive(benchmark: Any) -> None:
+    assert benchmark(decode_directive, encode_directive(DIRECTIVE)).rho == 0.25
+
+
+def test_seal(benchmark: Any) -> None:
+    assert len(benchmark(Sealer(KEY, 1).seal, encode_descriptor(DESCRIPTOR))) == 208
+
+
+def test_open_sealed_once_a_broadcast(benchmark: Any) -> None:
+    data = Sealer(KEY, 1).seal(encode_descriptor(DESCRIPTOR))
+    assert benchmark(open_datagram, data, {1: KEY}).descriptor == DESCRIPTOR
+
+
+def test_accept_once_a_receiver(benchmark: Any) -> None:
+    opened = open_datagram(Sealer(KEY, 1).seal(encode_descriptor(DESCRIPTOR)), {1: KEY})
+    benchmark(Inbox().accept, opened)
+
+
+@pytest.mark.parametrize("drones", [5, 100])
+def test_motion_of_1200_frames(benchmark: Any, drones: int) -> None:
+    motion = benchmark(fly, Fleet(drones=drones, route=ROUTE), 120.0, 0.1, 1)
+    assert motion.position_m.shape == (1200, drones, 3)
+
+
+@pytest.mark.parametrize("drones", [5, 100])
+def test_battery_step(benchmark: Any, drones: int) -> None:
+    batteries = FleetBatteries(Battery(capacity_wh=5000), (), drones)
+    benchmark(batteries.step, 1e-4, [168.5] * drones, [0.5] * drones, [0.1] * drones)
+    assert not any(batteries.landed)

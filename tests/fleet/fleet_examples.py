@@ -1,0 +1,90 @@
+"""Descriptors and directives to test with: one of each by hand, and any that are valid (hypothesis)."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+
+DESCRIPTOR = Descriptor(
+    stamp_ns=61_300_000_001,
+    agent_id=3,
+    position_m=(-12.5, 20.25, 60.0),
+    orientation_xyzw=(0.5, -0.5, 0.5, 0.5),
+    velocity_mps=(5.0, -0.5, 0.125),
+    footprint_radius_m=42.0,
+    battery_soc=0.75,
+    cpu_headroom=0.5,
+    gpu_headroom=0.25,
+    peer_goodput_mbps=(80.0, 0.0, 12.5, 3.0),
+    coverage_grid=bytes(range(64)),
+    novelty_flags=5,
+    task_phase=TaskPhase.TRACK,
+    region=Disc(10.0, -20.0, 32.0),
+)
+DIRECTIVE = Directive(
+    source=1,
+    destination=4,
+    representation=Representation.FEATURES,
+    rho=0.25,
+    roi=Disc(10.0, -20.0, 32.0),
+    rate_hz=5.0,
+    deadline_s=0.125,
+    fusion_weight=0.5,
+    duty_percent=60,
+)
+
+
+def _float32(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, width=32)
+
+
+def _vectors(n: int, bound: float = 2.0**20) -> st.SearchStrategy[tuple[float, ...]]:
+    return st.tuples(*[_float32(-bound, bound)] * n)
+
+
+def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
+    a = np.asarray(q)
+    return tuple(np.float32(a / np.linalg.norm(a)).tolist())
+
+
+ids = st.integers(0, 254)
+shares = _float32(0, 1)
+discs = st.builds(Disc, _float32(-5000, 5000), _float32(-5000, 5000), _float32(2.0**-10, 4096))
+descriptors = st.builds(
+    Descriptor,
+    stamp_ns=st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1),
+    agent_id=ids,
+    position_m=_vectors(3),
+    orientation_xyzw=_vectors(4, 1.0).filter(lambda q: np.linalg.norm(q) > 0.1).map(_unit),
+    velocity_mps=_vectors(3),
+    footprint_radius_m=_float32(0, 4096),
+    battery_soc=shares,
+    cpu_headroom=shares,
+    gpu_headroom=shares,
+    peer_goodput_mbps=st.lists(_float32(0, 4096), max_size=20).map(tuple),
+    coverage_grid=st.binary(min_size=64, max_size=64),
+    novelty_flags=st.integers(0, 255),
+    task_phase=st.sampled_from(TaskPhase),
+    region=st.none() | discs,
+    priority_target_ids=st.lists(st.integers(0, 65535), max_size=20).map(tuple),
+)
+directives = (
+    st.tuples(ids, ids)
+    .filter(lambda link: link[0] != link[1])
+    .flatmap(
+        lambda link: st.builds(
+            Directive,
+            source=st.just(link[0]),
+            destination=st.just(link[1]),
+            representation=st.sampled_from(Representation),
+            rho=shares,
+            roi=st.none() | discs,
+            rate_hz=_float32(0, 30),
+            deadline_s=_float32(0, 10),
+            fusion_weight=shares,
+            duty_percent=st.integers(0, 100),
+        )
+    )
+)
