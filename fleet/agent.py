@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import simpy
 
-from fleet.auth import Sealer
+from fleet.auth import Inbox, Sealer
 from fleet.coverage import NOVEL_FLAG, TARGET_FLAG, CoverageMap, footprint_radius_m
 from fleet.gate import Gate, Payload, make_payload
 from fleet.staleness import LinkHealth, cap_by_age, health
@@ -71,7 +71,7 @@ class Senses(Protocol):
     def capture(self, frame: int) -> Capture: ...
     def velocity_mps(self, frame: int) -> tuple[float, float, float]: ...
     def platform(self) -> Platform: ...
-    def task(self, t_s: float) -> Task: ...
+    def task(self) -> Task: ...
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int: ...
 
 
@@ -87,7 +87,7 @@ class AgentLog(Protocol):
     """Where an agent's acts are written down."""
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None: ...
-    def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth) -> None: ...
+    def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None: ...
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None: ...
 
 
@@ -116,6 +116,7 @@ class Agent:
         self.sensed = False  # whether perception ran in the current frame
         self.latest: Capture | None = None
         self.held: dict[int, Received] = {}
+        self.inbox = Inbox()
         self._rules = rules
         self._senses = senses
         self._modem = modem
@@ -179,7 +180,7 @@ class Agent:
         if now_s - self._grid_at_s >= COVERAGE_PERIOD_S:
             self._grid, self._novel = self._coverage.look(x_m, y_m, radius_m)
             self._grid_at_s = now_s
-        platform, task = self._senses.platform(), self._senses.task(now_s)
+        platform, task = self._senses.platform(), self._senses.task()
         descriptor = Descriptor(
             # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
             stamp_ns=round((capture.t_s + self.clock_skew_s) * 1e9),
@@ -236,10 +237,9 @@ class Agent:
             return
         self._links[peer] = after
         if after.enforced != before.enforced:
-            on_the_wire = decode_directive(encode_directive(after.enforced))
-            enforced = replace(on_the_wire, reason=after.enforced.reason)
+            enforced = decode_directive(encode_directive(after.enforced))
             self.gate.enforce(enforced)
-            self._log.directive(now_s, asked, enforced, link)
+            self._log.directive(now_s, asked, enforced, link, after.enforced.reason)
 
     # --- the data plane ------------------------------------------------------------------------
 

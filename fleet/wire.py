@@ -134,6 +134,7 @@ def encode_descriptor(d: Descriptor) -> bytes:
         raise ValueError(f"descriptor of agent {d.agent_id} does not fit its wire types: {error}") from None
 
 
+@lru_cache(maxsize=256)  # a broadcast is the same bytes for its sender and everyone who hears it
 def decode_descriptor(data: bytes) -> Descriptor:
     """Parse and check a descriptor.
 

@@ -160,6 +160,16 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
         if d.destination in seen:
             raise PolicyError(f"{where}: second directive for the same link")
         seen.add(d.destination)
+        if (
+            0 <= d.representation <= 4
+            and 0 <= d.rho <= 1
+            and 0 <= d.rate_hz <= MAX_RATE_HZ
+            and 0 <= d.deadline_s <= MAX_DEADLINE_S
+            and 0 <= d.fusion_weight <= 1
+            and 0 <= d.duty_percent <= 100
+            and (d.roi is None or d.roi.radius_m > 0)
+        ):
+            continue
         for name, low, high in _BOUNDS:
             value = getattr(d, name)
             if not low <= value <= high:  # also catches NaN

@@ -7,6 +7,7 @@ t seconds is at most 1 + t / dwell (average dwell time, FACTS §5).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from policies.contract import Directive, Disc, Representation
@@ -39,6 +40,8 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
     current = state.enforced
     if proposed == current:
         return state if state.asking_since_s is None else LinkState(current)
+    if state.asking_since_s is None and _level(proposed) == _level(current):
+        return LinkState(proposed)  # a disc that follows its target, a deadline: no step on the ladder
     lower = _lower_of(current, proposed)
     if lower == proposed:
         return LinkState(proposed)
@@ -75,7 +78,8 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
 
 
 def _level(d: Directive) -> tuple[float, ...]:
-    return (d.representation, d.rho, d.roi is None, d.rate_hz, d.duty_percent, d.fusion_weight)
+    radius_m = math.inf if d.roi is None else d.roi.radius_m
+    return (d.representation, d.rho, radius_m, d.rate_hz, d.duty_percent, d.fusion_weight)
 
 
 def _lower_roi(current: Disc | None, proposed: Disc | None) -> Disc | None:

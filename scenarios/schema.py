@@ -6,14 +6,24 @@ Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward,
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 PointM = tuple[Annotated[float, Field(ge=-5000, le=5000)], Annotated[float, Field(ge=-5000, le=5000)]]
 Soc = Annotated[float, Field(gt=0, le=1)]
 DroneId = Annotated[int, Field(ge=0, le=254)]
 PhaseName = Literal["transit", "search", "track", "return"]
+
+
+def _inconsistent(at: tuple[str | int, ...], value: str, bound: str) -> PydanticCustomError:
+    """An error between fields: `at` is the offending field's path below the section that checks it."""
+    path = "".join(f"{part}." for part in at)[:-1] + ": " * bool(at)
+    context = {"path": path, "value": value, "bound": bound, "at": at}
+    return PydanticCustomError("inconsistent", "{path}{value}, must be {bound}", context)
 
 
 class Section(BaseModel):
@@ -26,36 +36,60 @@ class Section(BaseModel):
 
 
 class Formation(Section):
-    shape: Literal["cross", "line", "wedge", "grid", "circle"] = Field("cross", description="Slots around the moving reference point.")
-    spacing_m: float = Field(20.0, gt=0, le=500, description="Distance between neighbouring slots (arc length for circle).")
+    shape: Literal["cross", "line", "wedge", "grid", "circle"] = Field(
+        "cross", description="Slots around the moving reference point."
+    )
+    spacing_m: float = Field(
+        20.0, gt=0, le=500, description="Distance between neighbouring slots (arc length for circle)."
+    )
     altitude_m: float = Field(60.0, ge=10, le=400, description="Height of the formation above the ground.")
 
 
 class Route(Section):
-    waypoints_m: tuple[PointM, ...] = Field(((0.0, 0.0),), min_length=1, max_length=1000, description="Ground track of the reference point, ENU (x, y); one point hovers.")
+    waypoints_m: tuple[PointM, ...] = Field(
+        ((0.0, 0.0),),
+        min_length=1,
+        max_length=1000,
+        description="Ground track of the reference point, ENU (x, y); one point hovers.",
+    )
     speed_mps: float = Field(5.0, gt=0, le=30, description="Ground speed along the route.")
     turn_time_s: float = Field(4.0, gt=0, le=60, description="Time over which a corner is rounded.")
 
 
 class Motion(Section):
-    wind_mps: tuple[float, float] = Field((2.0, 1.0), description="Mean wind, the velocity of the air, ENU (x, y).")
+    wind_mps: tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]] = Field(
+        (2.0, 1.0), description="Mean wind, the velocity of the air, ENU (x, y)."
+    )
     gust_sigma_mps: float = Field(0.8, ge=0, le=15, description="Standard deviation of each gust component.")
     gust_time_s: float = Field(3.0, gt=0, le=120, description="Correlation time of gusts.")
-    pose_jitter_m: float = Field(0.4, ge=0, le=20, description="Standard deviation of each drone's true offset from its slot, per axis.")
+    pose_jitter_m: float = Field(
+        0.4, ge=0, le=20, description="Standard deviation of each drone's true offset from its slot, per axis."
+    )
     pose_jitter_time_s: float = Field(2.5, gt=0, le=120, description="Correlation time of the offset.")
-    pose_error_m: float = Field(0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis.")
-    heading_error_deg: float = Field(0.5, ge=0, le=45, description="Standard deviation of the heading estimate's error.")
+    pose_error_m: float = Field(
+        0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis."
+    )
+    heading_error_deg: float = Field(
+        0.5, ge=0, le=45, description="Standard deviation of the heading estimate's error."
+    )
 
 
 class Battery(Section):
     capacity_wh: float = Field(130.0, gt=0, le=5000, description="Energy of a full pack at rest (open circuit).")
     cells: int = Field(4, ge=1, le=24, description="LiPo cells in series.")
     initial_soc: Soc = Field(0.95, description="State of charge at take-off.")
-    cell_resistance_mohm: float = Field(13.0, ge=0, le=500, description="Internal resistance of one cell with its wiring.")
+    cell_resistance_mohm: float = Field(
+        13.0, ge=0, le=500, description="Internal resistance of one cell with its wiring."
+    )
     drivetrain_efficiency: float = Field(0.8, gt=0, le=1, description="Rotor power over electric power.")
     avionics_w: float = Field(8.0, ge=0, le=500, description="Flight controller, sensors, cameras.")
     compute_idle_w: float = Field(10.0, ge=0, le=200, description="Companion computer at rest.")
-    compute_active_w: float = Field(40.0, ge=0, le=200, description="Companion computer while it runs perception, above idle excluded: the whole draw.")
+    compute_active_w: float = Field(
+        40.0,
+        ge=0,
+        le=200,
+        description="Companion computer while it runs perception, the whole draw.",
+    )
     radio_idle_w: float = Field(2.0, ge=0, le=50, description="Radio while it listens.")
     radio_tx_w: float = Field(6.0, ge=0, le=50, description="Radio while it sends, the whole draw.")
     landing_soc: float = Field(0.1, ge=0, lt=1, description="The drone lands when its charge reaches this.")
@@ -76,12 +110,26 @@ class Fleet(Section):
     battery: Battery = Battery()
     overrides: tuple[DroneOverride, ...] = Field((), description="Drones whose battery differs from fleet.battery.")
 
+    @model_validator(mode="after")
+    def _overrides_fit(self) -> Fleet:
+        seen: set[int] = set()
+        for i, override in enumerate(self.overrides):
+            at = ("overrides", i, "drone")
+            if override.drone >= self.drones:
+                raise _inconsistent(at, f"{override.drone}", f"below fleet.drones = {self.drones}")
+            if override.drone in seen:
+                raise _inconsistent(at, f"{override.drone}", "named once, it has an override above")
+            seen.add(override.drone)
+        return self
+
 
 # --- mission -------------------------------------------------------------------------------------
 
 
 class Target(Section):
-    waypoints_m: tuple[PointM, ...] = Field(min_length=1, max_length=1000, description="Path of the target car, ENU (x, y).")
+    waypoints_m: tuple[PointM, ...] = Field(
+        min_length=1, max_length=1000, description="Path of the target car, ENU (x, y)."
+    )
     speed_mps: float = Field(5.0, gt=0, le=40, description="Speed of the target car.")
 
 
@@ -97,18 +145,24 @@ class Phase(Section):
 
 
 class Mission(Section):
-    phases: tuple[Phase, ...] = Field((Phase(),), min_length=1, max_length=100, description="Phases in order of time; the first begins at 0.")
+    phases: tuple[Phase, ...] = Field(
+        (Phase(),), min_length=1, max_length=100, description="Phases in order of time; the first begins at 0."
+    )
     target: Target | None = Field(None, description="The car to track.")
 
     @model_validator(mode="after")
     def _ordered(self) -> Mission:
-        times = [p.at_s for p in self.phases]
-        if times[0] != 0:
-            raise ValueError(f"the first phase begins at {times[0]:g} s, must begin at 0")
-        if any(b <= a for a, b in zip(times, times[1:], strict=False)):
-            raise ValueError(f"phases begin at {times}, must be in increasing order")
-        if self.target is None and any(p.region is not None and p.region.centre_m is None for p in self.phases):
-            raise ValueError("a region without centre_m follows the target, but mission.target is missing")
+        first = self.phases[0].at_s
+        if first != 0:
+            raise _inconsistent(("phases", 0, "at_s"), f"{first:g}", "0, the first phase begins the sortie")
+        for i, (before, after) in enumerate(pairwise(self.phases), start=1):
+            if after.at_s <= before.at_s:
+                bound = f"above {before.at_s:g}, when the phase before begins"
+                raise _inconsistent(("phases", i, "at_s"), f"{after.at_s:g}", bound)
+        for i, phase in enumerate(self.phases):
+            if phase.region is not None and phase.region.centre_m is None and self.target is None:
+                bound = "given where there is no mission.target to follow"
+                raise _inconsistent(("phases", i, "region", "centre_m"), "missing", bound)
         return self
 
 
@@ -122,7 +176,9 @@ class Radio(Section):
     noise_figure_db: float = Field(7.0, ge=0, le=30, description="Receiver noise figure.")
     path_loss_exponent: float = Field(2.1, ge=1.5, le=6, description="Log-distance exponent beyond 1 m.")
     shadowing_sigma_db: float = Field(3.5, ge=0, le=20, description="Standard deviation of shadowing.")
-    shadowing_time_s: float = Field(4.5, gt=0, le=600, description="Correlation time of shadowing (4.5 s is 0.8 at 1 s).")
+    shadowing_time_s: float = Field(
+        4.5, gt=0, le=600, description="Correlation time of shadowing (4.5 s is 0.8 at 1 s)."
+    )
     rician_k_db: float = Field(12.0, ge=-10, le=40, description="Rician factor of small-scale fading.")
     group_rate_mbps: float = Field(6.0, ge=1, le=54, description="Basic rate of group-addressed frames (descriptors).")
     retry_limit: int = Field(7, ge=0, le=32, description="MAC retries of a unicast frame.")
@@ -136,9 +192,18 @@ class Radio(Section):
 
 
 class Context(Section):
-    rate_hz: float = Field(10.0, gt=0, le=10, description="Descriptors a second and drone, at most 10 (the plane's bound); also the frame rate.")
-    degraded_after_periods: float = Field(3.0, gt=0, le=100, description="A descriptor older than this marks the link degraded.")
-    detached_after_periods: float = Field(10.0, gt=0, le=1000, description="A descriptor older than this marks the peer detached.")
+    rate_hz: float = Field(
+        10.0,
+        gt=0,
+        le=10,
+        description="Descriptors a second and drone, at most 10 (the plane's bound); also the frame rate.",
+    )
+    degraded_after_periods: float = Field(
+        3.0, gt=0, le=100, description="A descriptor older than this marks the link degraded."
+    )
+    detached_after_periods: float = Field(
+        10.0, gt=0, le=1000, description="A descriptor older than this marks the peer detached."
+    )
     authentication: bool = Field(True, description="HMAC-SHA256 and a replay counter on every descriptor (28 B).")
 
 
@@ -159,13 +224,18 @@ class Scene(Section):
 class Perception(Section):
     detector: Literal["torch", "none"] = Field("torch", description="The detector; none flies the traffic alone.")
     weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights.")
-    sample_rate_hz: float = Field(2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz.")
+    sample_rate_hz: float = Field(
+        2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
+    )
     compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
     fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
     max_age_s: float = Field(0.5, gt=0, le=60, description="Received payloads older than this are not fused.")
     score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
-    unsent_cells: Literal["masked", "zero"] = Field("masked", description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).")
+    unsent_cells: Literal["masked", "zero"] = Field(
+        "masked",
+        description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
+    )
     scene: Scene = Scene()
 
 
@@ -193,7 +263,7 @@ class LinkDrop(_Event):
 class Jam(_Event):
     kind: Literal["jam"]
     until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
-    position_m: tuple[float, float, float] = Field(description="The jammer, ENU.")
+    position_m: tuple[float, float, float] = Field(description="The jammer, ENU (x, y, z).")
     power_dbm: float = Field(20.0, ge=-50, le=60, description="Its power in the channel.")
 
 
@@ -211,14 +281,18 @@ class BatteryFault(_Event):
 class ClockSkew(_Event):
     kind: Literal["clock_skew"]
     drone: DroneId = Field(description="Whose clock is off.")
-    skew_s: float = Field(ge=-3600, le=3600, description="Added to its stamps; negative makes its descriptors look old.")
+    skew_s: float = Field(
+        ge=-3600, le=3600, description="Added to its stamps; negative makes its descriptors look old."
+    )
 
 
 class Spoof(_Event):
     kind: Literal["spoof"]
     drone: DroneId = Field(description="Whose descriptors are imitated.")
     until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
-    attack: Literal["forged", "replayed", "malformed", "oversized"] = Field("forged", description="What is put on the air.")
+    attack: Literal["forged", "replayed", "malformed", "oversized"] = Field(
+        "forged", description="What is put on the air."
+    )
     rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
 
 
@@ -235,7 +309,31 @@ class Expectation(Section):
     @model_validator(mode="after")
     def _bounded(self) -> Expectation:
         if self.at_least is None and self.at_most is None and self.equals is None:
-            raise ValueError("one of at_least, at_most, equals is needed")
+            raise _inconsistent((), "no bound", "at_least, at_most or equals")
+        if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
+            raise _inconsistent(("at_least",), f"{self.at_least:g}", f"≤ at_most = {self.at_most:g}")
+        return self
+
+
+class DecisionExpectation(Section):
+    """Some directive that a drone's gate takes up within a window."""
+
+    drone: DroneId = Field(description="Whose gate.")
+    peer: DroneId | None = Field(None, description="The link's other end; left out, any.")
+    from_s: float = Field(ge=0, description="Begin of the window, inclusive.")
+    until_s: float = Field(ge=0, description="End of the window, inclusive.")
+    representation: Literal["none", "tracks", "detections", "features", "raw"] | None = Field(
+        None, description="What the link is to carry."
+    )
+    rate_at_most_hz: float | None = Field(None, ge=0, le=30, description="Its highest rate.")
+    roi: bool | None = Field(None, description="Whether it is confined to a region.")
+    reason: str = Field("", description="Text that its reason contains.")
+    because: str = Field("", description="Why it is expected; shown when it fails.")
+
+    @model_validator(mode="after")
+    def _window(self) -> DecisionExpectation:
+        if self.until_s < self.from_s:
+            raise _inconsistent(("until_s",), f"{self.until_s:g}", f"at least from_s = {self.from_s:g}")
         return self
 
 
@@ -253,26 +351,37 @@ class Scenario(Section):
     perception: Perception = Perception()
     policy: Policy = Policy()
     events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
-    expect: tuple[Expectation, ...] = Field((), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`.")
+    expect: tuple[Expectation, ...] = Field(
+        (), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`."
+    )
+    expect_decisions: tuple[DecisionExpectation, ...] = Field(
+        (), max_length=1000, description="What the gates must take up, and when; asserted by `sortie check`."
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
         n = self.fleet.drones
-        for i, override in enumerate(self.fleet.overrides):
-            if override.drone >= n:
-                raise ValueError(f"fleet.overrides.{i}.drone is {override.drone}, must be below fleet.drones = {n}")
         for i, event in enumerate(self.events):
             for end in ("drone", "peer"):
                 who = getattr(event, end, None)
                 if who is not None and who >= n:
-                    raise ValueError(f"events.{i}.{end} is {who}, must be below fleet.drones = {n}")
+                    raise _inconsistent(("events", i, end), f"{who}", f"below fleet.drones = {n}")
+            if isinstance(event, LinkDrop) and event.peer == event.drone:
+                raise _inconsistent(("events", i, "peer"), f"{event.peer}", "another drone than drone")
             if event.at_s >= self.duration_s:
-                raise ValueError(f"events.{i}.at_s is {event.at_s:g}, must be below duration_s = {self.duration_s:g}")
+                raise _inconsistent(("events", i, "at_s"), f"{event.at_s:g}", f"below duration_s = {self.duration_s:g}")
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
-                raise ValueError(f"events.{i}.until_s is {until_s:g}, must be above at_s = {event.at_s:g}")
-        if self.context.detached_after_periods <= self.context.degraded_after_periods:
-            raise ValueError("context.detached_after_periods must be above context.degraded_after_periods")
+                raise _inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
+        for i, decision in enumerate(self.expect_decisions):
+            for end in ("drone", "peer"):
+                who = getattr(decision, end)
+                if who is not None and who >= n:
+                    raise _inconsistent(("expect_decisions", i, end), f"{who}", f"below fleet.drones = {n}")
+        degraded, detached = self.context.degraded_after_periods, self.context.detached_after_periods
+        if detached <= degraded:
+            bound = f"above degraded_after_periods = {degraded:g}"
+            raise _inconsistent(("context", "detached_after_periods"), f"{detached:g}", bound)
         return self
 
     @property
@@ -283,8 +392,6 @@ class Scenario(Section):
     @property
     def frames(self) -> int:
         """Frames that begin before the end (end exclusive)."""
-        import math
-
         return math.ceil(round(self.duration_s * self.context.rate_hz, 9))
 
 

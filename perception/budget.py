@@ -1,0 +1,67 @@
+"""The cell budget: which cells a peer may send, and what they weigh in bytes. Free of torch."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+GRID = 64
+CELLS = GRID * GRID
+CELL_M = 3.2
+CHANNELS = 80
+DETECTION_BYTES = 24
+TRACK_BYTES = 20
+
+
+def payload_bytes(cells: int) -> int:
+    """Feature bytes: cells × 80 channels × 2 B (FP16), as the paper counts them."""
+    return cells * CHANNELS * 2
+
+
+def index_bytes(cells: int) -> int:
+    """Which cells they are: 12 bits a cell or a 512 B bitmap, the smaller; nothing when all are sent."""
+    return 0 if cells >= CELLS else min(CELLS // 8, math.ceil(cells * 12 / 8))
+
+
+@lru_cache(maxsize=1)
+def _centres_m() -> np.ndarray:
+    """[64] centres along either axis of the sender's levelled frame: x forward (rows), y left (columns)."""
+    return (np.arange(GRID) + 0.5 - GRID / 2) * CELL_M
+
+
+def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> np.ndarray:
+    """[64, 64] bool: cells of a sender at this estimated pose whose centres are in the disc (x, y, radius), ENU."""
+    if roi is None:
+        return np.ones((GRID, GRID), bool)
+    mask = np.zeros((GRID, GRID), bool)
+    rows, columns, inside = _window(roi, x_m, y_m, yaw_rad)
+    mask[rows, columns] = inside
+    return mask
+
+
+@lru_cache(maxsize=256)  # every link of a drone asks for the same disc from the same pose
+def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> int:
+    """How many cells go: ⌊ρ·4096⌋, at most those in the ROI."""
+    budget = math.floor(rho * CELLS + 1e-9)
+    if roi is None or budget == 0:
+        return budget
+    return min(budget, int(np.count_nonzero(_window(roi, x_m, y_m, yaw_rad)[2])))
+
+
+def _window(roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float) -> tuple[slice, slice, np.ndarray]:
+    """The rows and columns that a disc can touch, and which of their cells have their centres in it."""
+    dx, dy, radius_m = roi[0] - x_m, roi[1] - y_m, roi[2]
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    forward_m, left_m = c * dx + s * dy, -s * dx + c * dy
+    rows, columns = _span(forward_m, radius_m), _span(left_m, radius_m)
+    along = _centres_m()
+    inside = ((along[rows] - forward_m) ** 2)[:, None] + (along[columns] - left_m) ** 2 <= radius_m**2
+    return rows, columns, inside
+
+
+def _span(centre_m: float, radius_m: float) -> slice:
+    low = math.floor((centre_m - radius_m) / CELL_M) + GRID // 2
+    high = math.ceil((centre_m + radius_m) / CELL_M) + GRID // 2
+    return slice(min(max(low, 0), GRID), min(max(high, 0), GRID))

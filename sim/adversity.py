@@ -1,0 +1,122 @@
+"""Scenario events: what goes wrong, when, put on the clock."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Generator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import simpy
+
+from fleet.auth import TRAILER_BYTES, Sealer
+from fleet.wire import decode_descriptor, encode_descriptor
+from scenarios.schema import BatteryFault, ClockSkew, DroneLost, Event, Jam, LinkDrop, Scenario, Spoof
+from scenarios.streams import stream
+from sim.ether import Ether
+from sim.world import World, apply_event_loss, at
+
+OVERSIZED_BYTES = 2000
+
+
+def group_key(seed: int) -> bytes:
+    """The fleet's 32-byte group key of a sortie: secret inside the simulation, derived so that runs repeat."""
+    return hashlib.sha256(b"sortie group key" + struct.pack("<Q", seed)).digest()
+
+
+def schedule(scenario: Scenario, world: World, ether: Ether, *, seed: int, replication: int) -> None:
+    """Put every event of the scenario on the clock; call once, before anything else is scheduled.
+
+    Events come before the frame that begins at the same instant.
+    """
+    for index, event in enumerate(scenario.events):
+        at(world.env, event.at_s, _Begin(scenario, world, ether, event, index, seed, replication))
+
+
+class _Begin:
+    """An event's begin; a callable, so that each keeps its own event."""
+
+    def __init__(
+        self, scenario: Scenario, world: World, ether: Ether, event: Event, index: int, seed: int, replication: int
+    ) -> None:
+        self.scenario, self.world, self.ether, self.event = scenario, world, ether, event
+        self.index, self.seed, self.replication = index, seed, replication
+
+    def __call__(self) -> None:
+        world, event = self.world, self.event
+        env = world.env
+        match event:
+            case LinkDrop():
+                whom = f"{event.drone}" + ("" if event.peer is None else f"–{event.peer}")
+                world.note(event.drone, "link_drop", f"links of {whom} lose {event.loss_db:g} dB")
+                apply_event_loss(world.extra_loss_db, event.drone, event.peer, event.loss_db)
+                if event.until_s is not None:
+                    at(env, event.until_s, self._end_link_drop)
+            case Jam():
+                world.note(-1, "jam", f"a jammer of {event.power_dbm:g} dBm at {event.position_m}")
+                world.jammers[self.index] = (event.position_m, event.power_dbm)
+                if event.until_s is not None:
+                    at(env, event.until_s, self._end_jam)
+            case DroneLost():
+                if world.agents[event.drone].airborne:
+                    world.remove(event.drone, "drone_lost", "fell silent")
+            case BatteryFault():
+                world.note(event.drone, "battery_fault", f"{event.lost_fraction:.0%} of the remaining energy is gone")
+                world.drain()
+                world.batteries.fault(event.drone, event.lost_fraction)
+                world.ground_landed()
+            case ClockSkew():
+                world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
+                world.agents[event.drone].clock_skew_s = event.skew_s
+            case Spoof():
+                world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
+                env.process(self._spoof(env, event))
+
+    def _end_link_drop(self) -> None:
+        event = self.event
+        assert isinstance(event, LinkDrop)  # noqa: S101
+        apply_event_loss(self.world.extra_loss_db, event.drone, event.peer, -event.loss_db)
+        self.world.note(event.drone, "link_back", f"links of {event.drone} are back")
+
+    def _end_jam(self) -> None:
+        del self.world.jammers[self.index]
+        self.world.note(-1, "jam_over", "the jammer is off")
+
+    def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
+        """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""
+        rng = stream(self.seed, self.replication, (event.drone, self.index), "spoof")
+        sealer = Sealer(rng.bytes(32), key_id=1)
+        captured = b""
+        end_s = self.scenario.duration_s if event.until_s is None else event.until_s
+        listeners = [i for i in range(self.scenario.fleet.drones) if i != event.drone]
+        while env.now < end_s:
+            genuine = self.ether.last_datagram.get(event.drone, b"")
+            captured = captured or genuine
+            if genuine:
+                self.ether.inject(self._datagram(event, genuine, captured, sealer, rng), listeners)
+            yield env.timeout(1.0 / event.rate_hz)
+
+    def _datagram(
+        self, event: Spoof, genuine: bytes, captured: bytes, sealer: Sealer, rng: np.random.Generator
+    ) -> bytes:
+        authentic = self.scenario.context.authentication
+        match event.attack:
+            case "forged":
+                # A false descriptor: the drone claims an empty battery and no links.
+                body = genuine[:-TRAILER_BYTES] if authentic else genuine
+                lie = _empty_handed(body)
+                return sealer.seal(lie) if authentic else lie
+            case "replayed":
+                return captured
+            case "malformed":
+                return rng.bytes(len(genuine))
+            case "oversized":
+                return genuine + bytes(OVERSIZED_BYTES)
+
+
+def _empty_handed(descriptor_bytes: bytes) -> bytes:
+    descriptor = decode_descriptor(descriptor_bytes)
+    goodput = tuple(0.0 for _ in descriptor.peer_goodput_mbps)
+    return encode_descriptor(replace(descriptor, battery_soc=0.0, peer_goodput_mbps=goodput))

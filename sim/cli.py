@@ -1,0 +1,278 @@
+"""The command line: fly, compare, view, check, list, train."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from policies.contract import PolicyError
+from policies.registry import POLICIES, parameters
+from scenarios.load import ScenarioError, library, load
+from scenarios.schema import Scenario, json_schema
+from sim import rundir, tables
+from sim.compare import compare as compare_policies
+from sim.expect import check as check_expectations
+from sim.outcome import outcome
+from sim.sortie import VERSION, Observer, run_sortie
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Fly drone fleets that share what they see, and tell what they saw and what it cost.",
+)
+out = Console()
+err = Console(stderr=True, highlight=False)
+
+USER_ERRORS = (ScenarioError, PolicyError, rundir.RunError)
+"""What a user can mend: one line and exit code 2, no traceback."""
+
+ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.battery.initial_soc=0.5")
+]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of every random draw; left out, the scenario's.", min=0)]
+PolicyOption = Annotated[
+    str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
+]
+
+
+def main() -> None:
+    """Entry point of the `sortie` command."""
+    try:
+        app()
+    except USER_ERRORS as error:
+        err.print(f"[red]error:[/red] {_plain(error)}", soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        err.print("interrupted; nothing was written")
+        sys.exit(130)
+
+
+def _plain(error: BaseException) -> str:
+    return str(error).replace("[", r"\[")
+
+
+@app.command()
+def fly(
+    scenario: ScenarioArgument,
+    policy: PolicyOption = None,
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; left out, under runs/.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Stream to a Rerun viewer while it flies.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Open the recording afterwards.")] = False,
+    recording: Annotated[bool, typer.Option(help="Save sortie.rrd.")] = True,
+    profile: Annotated[bool, typer.Option("--profile", help="Tell where the wall time went.")] = False,
+) -> None:
+    """Fly one sortie, print its outcome, and keep the run."""
+    flown = _load(scenario, set_, policy)
+    if out_dir is not None:
+        rundir.ensure_writable(out_dir)
+    observer: Observer | None = None
+    if live:
+        from sim.playback import LiveViewer  # here: importing the viewer costs a third of a second
+
+        observer = LiveViewer()
+    with _profiled(profile) as report, _progress() as bar:
+        record = run_sortie(flown, None, seed, progress=bar(flown.name, flown.duration_s), observer=observer)
+    path = out_dir or rundir.default_path(record)
+
+    def save_recording(folder: Path) -> None:
+        from sim.playback import save_rrd
+
+        save_rrd(record, folder / rundir.RECORDING)
+
+    result = rundir.save(record, path, save_recording if recording else None)
+    out.print(tables.outcome_table(result))
+    out.print(tables.transitions_table(result))
+    report(result)
+    out.print(f"kept in [bold]{path}[/bold]" + (f", see it with: sortie view {path}" if recording else ""))
+    if view_:
+        view(path)
+
+
+@app.command()
+def compare(
+    scenario: ScenarioArgument,
+    policies: Annotated[str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence.")],
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
+) -> None:
+    """Fly a scenario under several policies, same seed and draws, and print them side by side."""
+    flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
+    with _progress() as bar:
+        bars = {label: bar(label, s.duration_s) for label, s in flown}
+        rows = compare_policies(flown, seed, progress=lambda label, t_s: bars[label](t_s))
+    out.print(tables.comparison_table(rows))
+    for line in tables.explanations(rows):
+        out.print(line)
+    if out_file is not None:
+        _write_json(out_file, {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows})
+        out.print(f"kept in [bold]{out_file}[/bold]")
+
+
+@app.command()
+def check(
+    scenarios: Annotated[list[str], typer.Argument(help="Scenario files or names; all: the whole library.")],
+    set_: SetOption = None,
+) -> None:
+    """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
+    names = list(library()) if scenarios == ["all"] else scenarios
+    loaded = [load(name, set_ or []) for name in names]
+    failed = 0
+    for flown in loaded:
+        with _progress() as bar:
+            record = run_sortie(flown, progress=bar(flown.name, flown.duration_s))
+        verdicts = check_expectations(flown, record, outcome(record))
+        failed += sum(not v.holds for v in verdicts)
+        out.print(tables.verdict_table(flown.name, verdicts))
+    if failed:
+        err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
+        raise typer.Exit(1)
+
+
+@app.command()
+def view(run: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
+    """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
+    from sim.playback import open_viewer, save_rrd
+
+    record = rundir.load(run)
+    path = run / rundir.RECORDING
+    if not path.is_file():
+        save_rrd(record, path)
+    open_viewer(path)
+
+
+@app.command("list")
+def list_(
+    what: Annotated[str, typer.Argument(help="policies, scenarios, detectors or schema (JSON Schema).")],
+) -> None:
+    """List what there is."""
+    if what == "policies":
+        for name, function in POLICIES.items():
+            defaults = ", ".join(f"{k}={v}" for k, v in parameters(function).items())
+            summary = (function.__doc__ or "").strip().splitlines()[0]
+            out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}", soft_wrap=True)
+    elif what == "scenarios":
+        for name, path in library().items():
+            out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
+    elif what == "detectors":
+        out.print(
+            "[bold]torch[/bold]  the shipped network: encoder, DiscoNet-style fusion, centre head", soft_wrap=True
+        )
+        out.print("[bold]none[/bold]   traffic alone; boxes are counted from the scene", soft_wrap=True)
+    elif what == "schema":
+        out.print_json(data=json_schema())
+    else:
+        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, detectors or schema")
+
+
+@app.command()
+def train(
+    out_file: Annotated[Path, typer.Option("--out", help="Where the weights go (safetensors).")] = Path(
+        "runs/train/disconet.safetensors"
+    ),
+    minutes: Annotated[float | None, typer.Option(help="Stop after this much wall time.", min=0.1)] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", min=1)] = None,
+    seed: Annotated[int, typer.Option(help="Seed of data and weights.", min=0)] = 0,
+    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
+) -> None:
+    """Train the detector with full sharing on procedural scenes; resumable."""
+    from perception.train import train as train_detector
+
+    with _progress() as bar:
+        result = train_detector(out_file, steps=steps, minutes=minutes, seed=seed, resume=resume, bar=bar)
+    out.print(tables.training_table(result))
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        out.print(VERSION)
+        raise typer.Exit
+
+
+# --- helpers -------------------------------------------------------------------------------------
+
+
+def _load(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario:
+    """The scenario with `--set` and the policy put in; another policy than its own starts from its own defaults."""
+    overrides = list(set_ or [])
+    flown = load(scenario, overrides)
+    if policy is None:
+        return flown
+    name, bracket, rest = policy.partition("(")
+    name = name.strip()
+    if bracket and not rest.endswith(")"):
+        raise PolicyError(f"policy {policy!r}: the bracket is not closed, as in best-2(rho=0.1)")
+    overrides.append(f"policy.name={name}")
+    if bracket or name != flown.policy.name:
+        overrides.append("policy.params={}")
+    overrides += [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
+    return load(scenario, overrides)
+
+
+def _split_policies(text: str) -> list[str]:
+    """Split at commas outside brackets."""
+    names, depth = [""], 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if letter == "," and depth == 0:
+            names.append("")
+        else:
+            names[-1] += letter
+    cleaned = [n.strip() for n in names if n.strip()]
+    if not cleaned:
+        raise PolicyError("no policy named, as in --policies worked,all-4,silence")
+    if len(set(cleaned)) < len(cleaned):
+        raise PolicyError(f"a policy is named twice: {', '.join(cleaned)}")
+    return cleaned
+
+
+def _write_json(path: Path, data: Any) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(json.dumps(data, indent=2) + "\n")
+        partial.rename(path)
+    except OSError as error:
+        raise rundir.RunError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
+    """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+
+        def add(label: str, total: float) -> Callable[[float], None]:
+            task = progress.add_task(label, total=round(total))
+            return lambda done: progress.update(task, completed=round(done))
+
+        yield add
+
+
+@contextmanager
+def _profiled(wanted: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Wall time by room, measured by cProfile (which itself slows the sortie down about twofold)."""
+    if not wanted:
+        yield lambda result: None
+        return
+    import cProfile
+
+    profiler = cProfile.Profile()
+    profiler.enable()
+    try:
+        yield lambda result: out.print(tables.profile_table(profiler, result))
+    finally:
+        profiler.disable()

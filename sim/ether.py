@@ -1,0 +1,107 @@
+"""Between the agents and the air: who hears which bytes, and what became of each payload.
+
+The radio knows bytes and positions only. This is where a datagram that was heard is opened and handed to its
+receivers, and where a transmission number is joined again with the payload it stands for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fleet.agent import Agent, Received
+from fleet.auth import Dropped, DropReason, Opened, open_datagram
+from fleet.gate import Payload
+from perception.types import Capture
+from radio.air import Air, Status, Transmission
+from sim.record import Recorder
+
+NAN = float("nan")
+
+
+class Ether:
+    """Joins every agent's modem to the one air."""
+
+    def __init__(self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None) -> None:
+        """Args: `keys` by key id, None where descriptors go unauthenticated."""
+        self.agents: Sequence[Agent] = ()
+        self.air = air
+        self.last_datagram: dict[int, bytes] = {}
+        """The latest genuine datagram of each drone, for whoever listens."""
+        self._recorder = recorder
+        self._keys = keys
+        self._pending: dict[int, tuple[Payload, Capture]] = {}
+
+    def modem(self, drone: int) -> _Modem:
+        """The drone's end of the air."""
+        return _Modem(self, drone)
+
+    def publish(self, drone: int, datagram: bytes) -> None:
+        """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
+        self.last_datagram[drone] = datagram
+        opened = open_datagram(datagram, self._keys)
+        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard))
+
+    def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
+        """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""
+        self.hand_over(open_datagram(datagram, self._keys), listeners)
+
+    def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
+        """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
+        for receiver in heard:
+            agent = self.agents[receiver]
+            if not agent.airborne:
+                continue
+            verdict = agent.inbox.accept(opened)
+            if isinstance(verdict, DropReason):
+                self._recorder.rows["drops"].append((agent.env.now, receiver, verdict.value))
+            else:
+                agent.hear(verdict)
+
+    def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
+        """Hand a payload to the radio."""
+        number = self.air.send(
+            drone,
+            peer,
+            payload.size_bytes,
+            kind=payload.representation.name.lower(),
+            reliable=payload.reliable,
+            deadline_s=deadline_s,
+            on_done=self._done,
+        )
+        self._pending[number] = (payload, capture)
+
+    def finish(self) -> None:
+        """Write down what is still in flight."""
+        for transmission in self.air.finish():
+            self._write(transmission, *self._pending.pop(transmission.number))
+
+    def _done(self, transmission: Transmission) -> None:
+        payload, capture = self._pending.pop(transmission.number)
+        self._write(transmission, payload, capture)
+        if transmission.status == Status.DELIVERED:
+            self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s))
+
+    def _write(self, t: Transmission, payload: Payload, capture: Capture) -> None:
+        self._recorder.rows["transmissions"].append(
+            (
+                t.t_sent_s, t.sender, t.receiver, t.kind, capture.t_s, payload.rho, payload.cells, payload.boxes,
+                payload.index_bytes, t.payload_bytes, t.wire_bytes, t.deadline_s, t.t_start_s, t.t_done_s,
+                t.status.value, t.reason, t.fragments, t.fragments_lost, t.repairs, t.mcs, t.snr_db, t.airtime_s,
+            )
+        )  # fmt: skip
+
+
+class _Modem:
+    """One drone's end of the air (fleet.agent.Modem)."""
+
+    def __init__(self, ether: Ether, drone: int) -> None:
+        self._ether, self._drone = ether, drone
+
+    def broadcast(self, datagram: bytes) -> None:
+        self._ether.publish(self._drone, datagram)
+
+    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
+        self._ether.send(self._drone, peer, payload, capture, deadline_s)
+
+    def goodput_mbps(self) -> tuple[float, ...]:
+        return self._ether.air.goodput_mbps(self._drone)

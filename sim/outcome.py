@@ -1,0 +1,234 @@
+"""The outcome of a sortie: what the record comes to, as the plain values of outcome.json.
+
+Everything here is computed from the record's tables; the README of this room lists every field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perception.ap import Boxes, Matched, average_precision, match
+from sim.record import SortieRecord
+
+DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
+
+
+def outcome(record: SortieRecord) -> dict[str, Any]:
+    """All figures of one sortie, JSON-ready; ratios of nothing are null."""
+    tables, totals = record.tables, record.totals
+    sent = tables["transmissions"]
+    data_sent = _sum(sent["payload_bytes"])
+    by_status = {s: _sum(sent.filter(pc.equal(sent["status"], s))["payload_bytes"]) for s in DATA_STATUSES}
+    context_bytes = totals["context_descriptor_bytes"] + totals["context_directive_bytes"]
+    scenario = record.scenario
+    minutes = scenario.duration_s / 60.0
+    links = scenario.fleet.drones * (scenario.fleet.drones - 1)
+    transitions = list(_transitions(tables["directives"]))
+    return {
+        "scenario": scenario.name,
+        "policy": record.policy,
+        "seed": record.seed,
+        "replication": record.replication,
+        "version": record.version,
+        "fingerprint": record.fingerprint,
+        "duration_s": scenario.duration_s,
+        "ap50": {
+            **accuracy(record),
+            "detector": scenario.perception.detector,
+            "sample_rate_hz": scenario.perception.sample_rate_hz,
+            "scored_fusions": tables["fusions"].num_rows,
+        },
+        "bytes": {
+            "context_sent": int(context_bytes),
+            "context_descriptors": int(totals["context_descriptor_bytes"]),
+            "context_directives": int(totals["context_directive_bytes"]),
+            "data_sent": data_sent,
+            **{f"data_{status}": count for status, count in by_status.items()},
+        },
+        "context_share": _ratio(context_bytes, context_bytes + data_sent),
+        "data_rate_mbps": data_sent * 8e-6 / scenario.duration_s,
+        "deadline_miss_rate": _miss_rate(sent),
+        "payload_fates": {
+            f"{row['status']}{'/' + row['reason'] if row['reason'] else ''}": row["count_all"]
+            for row in sent.group_by(["status", "reason"]).aggregate([([], "count_all")]).sort_by("status").to_pylist()
+        },
+        "medium_busy_fraction": totals["medium_busy_fraction"],
+        "age_s": _percentiles(tables["ages"]["age_s"]),
+        "data_age_s": _percentiles(pc.list_flatten(tables["fusions"]["ages_s"])),
+        "descriptor_drops": _counts(tables["drops"]["reason"]),
+        "battery": _final_charge(tables["states"], tables["energy"], scenario.fleet.drones),
+        "energy_j": _energy(tables["energy"]),
+        "switches": len(transitions) / (links * minutes) if links else None,
+        "transitions": transitions,
+        "phases": [_phase(record, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
+        "events": tables["events"].to_pylist(),
+        "policy_eval_us": {
+            "p50": record.wall.get("policy_eval_us_p50"),
+            "p99": record.wall.get("policy_eval_us_p99"),
+        },
+        "wall_s": record.wall.get("wall_s"),
+        "realtime_factor": _ratio(scenario.duration_s, record.wall.get("wall_s", 0.0)),
+    }
+
+
+# --- accuracy ------------------------------------------------------------------------------------
+
+
+def matched(
+    record: SortieRecord, *, mission: bool, begin_s: float = 0.0, end_s: float = float("inf")
+) -> dict[tuple[float, int], Matched]:
+    """Every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
+
+    Args:
+        mission: count the mission disc alone, and only fusions made while there is one.
+    """
+    fusions, missions = record.tables["fusions"], record.tables["mission"]
+    detections = _boxes_by_fusion(record.tables["detections"])
+    truths = _boxes_by_fusion(record.tables["truths"])
+    mission_t = missions["t_s"].to_numpy()
+    discs = np.column_stack([missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
+    found = {}
+    for t_s, drone in zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True):
+        if not begin_s <= t_s < end_s:
+            continue
+        disc = discs[np.searchsorted(mission_t, t_s, side="right") - 1].tolist()
+        if mission and np.isnan(disc[2]):
+            continue
+        key = (t_s, drone)
+        boxes, truth = detections.get(key, Boxes.empty()), truths.get(key, Boxes.empty())
+        found[key] = match(boxes, truth, tuple(disc) if mission else None)
+    return found
+
+
+def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
+    """AP@0.5 in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
+    found = {}
+    for name, mission in (("full_scene", False), ("mission", True)):
+        frames = list(matched(record, mission=mission, begin_s=begin_s, end_s=end_s).values())
+        ap = average_precision(frames) if frames else float("nan")
+        found[name] = None if np.isnan(ap) else ap
+    return found
+
+
+def _boxes_by_fusion(table: pa.Table) -> dict[tuple[float, int], Boxes]:
+    """Split a box table into the boxes of each (time, ego); rows of one fusion stand together."""
+    if table.num_rows == 0:
+        return {}
+    column = {c: table[c].to_numpy() for c in table.column_names}
+    t_s, drone = column["t_s"], column["drone"]
+    cuts = np.flatnonzero((np.diff(t_s) != 0) | (np.diff(drone) != 0)) + 1
+    score = column.get("score", np.ones(len(t_s)))
+    xy = np.column_stack([column["x_m"], column["y_m"]])
+    size = np.column_stack([column["length_m"], column["width_m"]])
+    parts = zip(*(np.split(c, cuts) for c in (t_s, drone, xy, size, column["yaw_rad"], score)), strict=True)
+    return {(float(t[0]), int(d[0])): Boxes(p, s, y, w) for t, d, p, s, y, w in parts}
+
+
+# --- traffic, decisions, energy ------------------------------------------------------------------
+
+
+def _sum(column: pa.ChunkedArray) -> int:
+    return int(pc.sum(pc.cast(column, pa.int64())).as_py() or 0)
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return part / whole if whole else None
+
+
+def _percentiles(column: Any) -> dict[str, float | None]:
+    values = column.to_numpy()
+    if len(values) == 0:
+        return {"p50": None, "p99": None}
+    p50, p99 = np.percentile(values, [50, 99])
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def _counts(column: pa.ChunkedArray) -> dict[str, int]:
+    return {str(v["values"]): int(v["counts"]) for v in pc.value_counts(column).to_pylist()}
+
+
+def _miss_rate(sent: pa.Table) -> float | None:
+    """Payloads that missed their deadline or were replaced before it, over those whose fate is known."""
+    fates = _counts(sent["status"])
+    known = sent.num_rows - fates.get("in_flight", 0)
+    return _ratio(fates.get("expired", 0), known)
+
+
+def _final_charge(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, Any]:
+    last = states.slice(max(0, states.num_rows - drones))
+    spent = np.zeros(drones)
+    np.add.at(spent, energy["drone"].to_numpy(), energy["energy_j"].to_numpy())
+    return {
+        str(row["drone"]): {
+            "soc": row["soc"],
+            "voltage_v": row["voltage_v"],
+            "airborne": row["airborne"],
+            "energy_j": float(spent[row["drone"]]),
+        }
+        for row in last.to_pylist()
+    }
+
+
+def _energy(energy: pa.Table) -> dict[str, float]:
+    by_cause = energy.group_by("cause", use_threads=False).aggregate([("energy_j", "sum")])
+    return {
+        **{row["cause"]: row["energy_j_sum"] for row in by_cause.to_pylist()},
+        "total": float(pc.sum(energy["energy_j"]).as_py() or 0.0),
+    }
+
+
+def describe(row: dict[str, Any]) -> str:
+    """A directive in words: `features ρ=0.25 at 10 Hz in 32 m`."""
+    if row["representation"] == "none" or row["rate_hz"] <= 0:
+        return "nothing"
+    budget = f" ρ={row['rho']:.3g}" if row["representation"] == "features" else ""
+    roi = "" if np.isnan(row["roi_radius_m"]) else f" in {row['roi_radius_m']:.0f} m"
+    return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
+
+
+def _transitions(directives: pa.Table) -> Iterator[dict[str, Any]]:
+    """Changes of what a link carries (a disc that moves is none), links of a drone that change alike in one entry."""
+    now: dict[tuple[int, int], str] = {}
+    open_entry: dict[str, Any] | None = None
+    for row in directives.to_pylist():
+        link, level = (row["drone"], row["peer"]), describe(row)
+        before = now.get(link, "nothing")
+        if level == before:
+            continue
+        now[link] = level
+        entry = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
+        if open_entry is not None and all(open_entry[k] == v for k, v in entry.items()):
+            open_entry["peers"].append(row["peer"])
+            continue
+        if open_entry is not None:
+            yield open_entry
+        open_entry = {**entry, "peers": [row["peer"]]}
+    if open_entry is not None:
+        yield open_entry
+
+
+def _phases(record: SortieRecord) -> Iterator[tuple[float, float, str]]:
+    phases, end_s = record.scenario.mission.phases, record.scenario.duration_s
+    for phase, following in zip(phases, [*phases[1:], None], strict=True):
+        if phase.at_s < end_s:
+            yield phase.at_s, min(end_s, following.at_s) if following else end_s, phase.phase
+
+
+def _phase(record: SortieRecord, begin_s: float, end_s: float, name: str) -> dict[str, Any]:
+    sent = record.tables["transmissions"]
+    sent = sent.filter(pc.and_(pc.greater_equal(sent["captured_s"], begin_s), pc.less(sent["captured_s"], end_s)))
+    features = sent.filter(pc.equal(sent["representation"], "features"))
+    return {
+        "phase": name,
+        "begin_s": begin_s,
+        "end_s": end_s,
+        "ap50": accuracy(record, begin_s, end_s),
+        "data_rate_mbps": _sum(sent["payload_bytes"]) * 8e-6 / (end_s - begin_s),
+        "feature_payload_bytes": _percentiles(pc.cast(features["payload_bytes"], pa.float64()))["p50"],
+        "deadline_miss_rate": _miss_rate(sent),
+    }

@@ -1,0 +1,190 @@
+"""The record of a sortie: what happened, as tables, and its fingerprint.
+
+Rows are gathered as plain tuples while the sortie flies and become Arrow tables at its end. The column lists
+below are the documentation of the Parquet files. Wall-clock figures are kept apart, so that the fingerprint is a
+function of (scenario, policy, seed, version) alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet.staleness import LinkHealth
+from policies.contract import Descriptor, Directive
+from scenarios.schema import Scenario
+
+NAN = float("nan")
+DIRECTIVE_WIRE_BYTES = 36
+F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
+
+TABLES: dict[str, dict[str, pa.DataType]] = {
+    # one row a drone and frame; position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU
+    "states": dict(
+        t_s=F, drone=I, x_m=F, y_m=F, z_m=F, qx=F, qy=F, qz=F, qw=F, vx_mps=F, vy_mps=F, vz_mps=F,
+        p_radps=F, q_radps=F, r_radps=F, soc=F, voltage_v=F, current_a=F, airborne=B,
+    ),
+    # one row a descriptor published; goodput to each other drone by ascending id, 0 where unmeasured
+    "descriptors": dict(
+        t_s=F, drone=I, stamp_ns=pa.int64(), wire_bytes=I, soc=F, cpu_headroom=F, gpu_headroom=F,
+        goodput_mbps=pa.list_(F), phase=S, region_x_m=F, region_y_m=F, region_radius_m=F,
+        novelty_flags=I, coverage_grid=pa.binary(),
+    ),
+    # one row a descriptor heard or refused at a receiver: `reason` is empty where it was accepted
+    "drops": dict(t_s=F, receiver=I, reason=S),
+    # one row a change of what a gate enforces, with the reason that decided it
+    "directives": dict(
+        t_s=F, drone=I, peer=I, representation=S, rho=F, roi_x_m=F, roi_y_m=F, roi_radius_m=F, rate_hz=F,
+        deadline_s=F, fusion_weight=F, duty_percent=I, asked=S, asked_rate_hz=F, link=S, reason=S,
+    ),
+    # one row a payload handed to the radio, with its fate
+    "transmissions": dict(
+        t_sent_s=F, drone=I, peer=I, representation=S, captured_s=F, rho=F, cells=I, boxes=I, index_bytes=I,
+        payload_bytes=I, wire_bytes=I, deadline_s=F, t_start_s=F, t_done_s=F, status=S, reason=S, fragments=I,
+        fragments_lost=I, repairs=I, mcs=I, snr_db=F, airtime_s=F,
+    ),
+    # one row a scored fusion: an ego, and the peers whose payloads it held
+    "fusions": dict(
+        t_s=F, drone=I, peers=pa.list_(I), representations=pa.list_(S), ages_s=pa.list_(F), detections=I, truths=I,
+    ),
+    # boxes detected by an ego and true boxes in its range, ENU
+    "detections": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, score=F),
+    "truths": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F),
+    # the mission over time, one row a frame: NaN where there is no region or target
+    "mission": dict(t_s=F, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target_x_m=F, target_y_m=F),
+    # the medium, one row a frame
+    "medium": dict(t_s=F, busy_fraction=F, connected_drones=I),
+    # energy by drone and cause at the end
+    "energy": dict(drone=I, cause=S, energy_j=F),
+    # what happened to the fleet: scenario events, landings
+    "events": dict(t_s=F, drone=I, kind=S, text=S),
+    # age of each peer's descriptor whenever a policy read it
+    "ages": dict(t_s=F, drone=I, age_s=F),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SortieRecord:
+    """Everything that one sortie left behind."""
+
+    scenario: Scenario
+    policy: str
+    seed: int
+    replication: int
+    version: str
+    tables: Mapping[str, pa.Table]
+    totals: Mapping[str, float]
+    """Counts that are no table: context bytes, medium utilisation, ..."""
+    wall: Mapping[str, float] = field(default_factory=dict)
+    """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over version, policy, seed and every table's values; equal records have equal fingerprints."""
+        digest = hashlib.sha256(f"{self.version}/{self.policy}/{self.seed}/{self.replication}".encode())
+        for name in sorted(self.tables):
+            digest.update(name.encode())
+            for column in self.tables[name].column_names:
+                digest.update(column.encode())
+                _digest_column(digest, self.tables[name][column])
+        for name in sorted(self.totals):
+            digest.update(f"{name}={self.totals[name]!r}".encode())
+        return digest.hexdigest()
+
+
+def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
+    """Feed a column's values, not its buffers, whose padding and chunking may differ."""
+    array = column.combine_chunks()
+    if pa.types.is_list(array.type):
+        digest.update(np.asarray(array.value_lengths(), np.int64).tobytes())
+        array = array.flatten()
+    if pa.types.is_string(array.type) or pa.types.is_binary(array.type):
+        for value in array.to_pylist():
+            digest.update(value if isinstance(value, bytes) else value.encode())
+            digest.update(b"\0")
+    else:
+        digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
+
+
+class Recorder:
+    """Gathers rows by table; `rows["states"].append((...))` in the column order of `TABLES`."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
+        self._taken = dict.fromkeys(TABLES, 0)
+
+    def tables(self) -> dict[str, pa.Table]:
+        """All rows so far as Arrow tables."""
+        return {name: _table(name, rows) for name, rows in self.rows.items()}
+
+    def take_new(self) -> dict[str, pa.Table]:
+        """The rows since the last call, for a viewer that follows the flight."""
+        new = {}
+        for name, rows in self.rows.items():
+            new[name] = _table(name, rows[self._taken[name] :])
+            self._taken[name] = len(rows)
+        return new
+
+
+def _table(name: str, rows: list[tuple[Any, ...]]) -> pa.Table:
+    columns = TABLES[name]
+    values = list(zip(*rows, strict=True)) if rows else [()] * len(columns)
+    return pa.table({c: pa.array(v, t) for (c, t), v in zip(columns.items(), values, strict=True)})
+
+
+class AgentNotes:
+    """Writes agents' acts into a recorder (fleet.agent.AgentLog)."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._rows = recorder.rows
+        self._eval_ns: list[int] = []
+        self._descriptor_bytes = self._directives = 0
+
+    def descriptor(self, t_s: float, d: Descriptor, wire_bytes: int) -> None:
+        """One descriptor was published."""
+        self._descriptor_bytes += wire_bytes
+        region = (NAN, NAN, NAN) if d.region is None else (d.region.x_m, d.region.y_m, d.region.radius_m)
+        self._rows["descriptors"].append(
+            (
+                t_s, d.agent_id, d.stamp_ns, wire_bytes, d.battery_soc, d.cpu_headroom, d.gpu_headroom,
+                d.peer_goodput_mbps, d.task_phase.name.lower(), *region, d.novelty_flags, d.coverage_grid,
+            )
+        )  # fmt: skip
+
+    def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
+        """A gate enforces something new."""
+        self._directives += 1
+        roi = (NAN, NAN, NAN) if enforced.roi is None else (enforced.roi.x_m, enforced.roi.y_m, enforced.roi.radius_m)
+        self._rows["directives"].append(
+            (
+                t_s, enforced.source, enforced.destination, enforced.representation.name.lower(), enforced.rho, *roi,
+                enforced.rate_hz, enforced.deadline_s, enforced.fusion_weight, enforced.duty_percent,
+                asked.representation.name.lower(), asked.rate_hz, link.name.lower(), reason,
+            )
+        )  # fmt: skip
+
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None:
+        """A policy decided, reading peers' descriptors of these ages."""
+        self._eval_ns.append(elapsed_ns)
+        self._rows["ages"].extend((t_s, drone, age_s) for age_s in peer_ages_s)
+
+    def totals(self) -> dict[str, float]:
+        """Context-plane bytes: descriptors on the air, directives to the gates."""
+        return {
+            "context_descriptor_bytes": self._descriptor_bytes,
+            "context_directive_bytes": self._directives * DIRECTIVE_WIRE_BYTES,
+            "directives": self._directives,
+            "decisions": len(self._eval_ns),
+        }
+
+    def policy_eval_us(self) -> dict[str, float]:
+        """Wall time of a policy decision, µs, median and 99th percentile."""
+        if not self._eval_ns:
+            return {}
+        p50, p99 = np.percentile(np.array(self._eval_ns) / 1e3, [50, 99])
+        return {"policy_eval_us_p50": float(p50), "policy_eval_us_p99": float(p99)}

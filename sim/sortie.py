@@ -1,0 +1,167 @@
+"""Fly a sortie: the one place that wires the rooms together, on one SimPy clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Protocol
+
+import pyarrow as pa
+import simpy
+
+from fleet.agent import Agent, PlaneRules
+from fleet.auth import Sealer
+from fleet.battery import FleetBatteries
+from fleet.motion import fly
+from perception.scene import SceneModel
+from perception.types import Capture
+from policies.contract import Disc, Policy
+from policies.registry import resolve
+from radio.air import Air
+from scenarios.schema import Scenario
+from scenarios.streams import stream
+from sim.adversity import group_key, schedule
+from sim.ether import Ether
+from sim.mission import MissionPlan
+from sim.record import AgentNotes, Recorder, SortieRecord
+from sim.scoring import Scorer
+from sim.world import World, route_bounds
+
+VERSION = version("sortie-sim")
+KEY_ID = 1
+PHASE_SHARE = 0.1
+"""Drones act within the first tenth of a frame, each at its own moment: clocks disciplined, not locked."""
+
+
+class Observer(Protocol):
+    """Watches a sortie while it flies; nothing that it does changes the record."""
+
+    def begin(self, scenario: Scenario, scene: SceneModel) -> None: ...
+    def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
+
+
+def run_sortie(
+    scenario: Scenario,
+    policy: str | Policy | None = None,
+    seed: int | None = None,
+    *,
+    replication: int = 0,
+    progress: Callable[[float], None] | None = None,
+    observer: Observer | None = None,
+) -> SortieRecord:
+    """Fly one sortie from 0 to `scenario.duration_s` (exclusive) and return its record.
+
+    Args:
+        scenario: what is to be flown.
+        policy: a policy's name, `file.py:function`, or a callable; None takes the scenario's own.
+        seed: None takes the scenario's own.
+        replication: another draw of everything random, for campaigns.
+        progress: called with the simulated time once a simulated second.
+        observer: gets the new rows once a simulated second.
+
+    Returns:
+        The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
+
+    Raises:
+        PolicyError: an unknown policy, or one that breaks its contract.
+    """
+    begin_s = time.perf_counter()
+    seed = scenario.seed if seed is None else seed
+    name, decide = _policy(scenario, policy)
+    n, config = scenario.fleet.drones, scenario.perception
+    env, recorder = simpy.Environment(), Recorder()
+
+    motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
+    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n)
+    air = Air(env, scenario.radio, n, seed=seed, replication=replication, frame_s=scenario.frame_s)
+    scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
+    plan = MissionPlan(scenario.mission)
+    world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
+    keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
+    ether = Ether(air, recorder, keys=keys)
+    detector = None
+    if config.detector == "torch":
+        from perception.detector import TorchDetector  # here, so that sorties without it never load torch
+
+        weights = None if config.weights is None else Path(config.weights)
+        detector = TorchDetector(scene, config, seed=seed, weights=weights)
+
+    def count_boxes(capture: Capture, roi: Disc | None) -> int:
+        assert detector is not None  # noqa: S101
+        return detector.count_boxes(capture, None if roi is None else (roi.x_m, roi.y_m, roi.radius_m))
+
+    rules = PlaneRules(
+        period_s=scenario.frame_s,
+        frames=scenario.frames,
+        degraded_after_periods=scenario.context.degraded_after_periods,
+        detached_after_periods=scenario.context.detached_after_periods,
+        dwell_s=scenario.policy.dwell_s,
+        compute_delay_s=config.compute_delay_s,
+    )
+    notes = AgentNotes(recorder)
+    agents = [
+        Agent(
+            env,
+            i,
+            rules=rules,
+            policy=decide,
+            senses=world.senses(i, count_boxes if detector is not None else None),
+            modem=ether.modem(i),
+            log=notes,
+            sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
+            phase_s=PHASE_SHARE * scenario.frame_s * stream(seed, replication, i, "phase").random(),
+        )
+        for i in range(n)
+    ]
+    world.agents = ether.agents = agents
+
+    def each_second(t_s: float) -> None:
+        if progress is not None:
+            progress(t_s)
+        if observer is not None:
+            observer.second(t_s, recorder.take_new())
+
+    world.on_second = each_second
+    if observer is not None:
+        observer.begin(scenario, scene)
+    schedule(scenario, world, ether, seed=seed, replication=replication)
+    world.start()
+    for agent in agents:
+        agent.start()
+    if detector is not None:
+        Scorer(env, scenario, detector, agents, recorder).start()
+
+    env.run(until=scenario.duration_s)
+    world.drain()
+    ether.finish()
+    recorder.rows["energy"].extend(
+        (i, cause, joules) for cause, per_drone in batteries.energy_j.items() for i, joules in enumerate(per_drone)
+    )
+    each_second(env.now)
+    return SortieRecord(
+        scenario=scenario,
+        policy=name,
+        seed=seed,
+        replication=replication,
+        version=VERSION,
+        tables=recorder.tables(),
+        totals={**notes.totals(), **_air_totals(air)},
+        wall={"wall_s": time.perf_counter() - begin_s, **notes.policy_eval_us()},
+    )
+
+
+def _air_totals(air: Air) -> dict[str, float]:
+    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
+    return {**counters, "medium_busy_fraction": air.utilisation}
+
+
+def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Policy]:
+    """The policy's name and callable; the scenario's parameters go with the scenario's own policy only."""
+    if policy is None or policy == scenario.policy.name:
+        return scenario.policy.name, resolve(scenario.policy.name, scenario.policy.params)
+    if isinstance(policy, str):
+        return policy, resolve(policy)
+    return getattr(policy, "__name__", "policy"), policy

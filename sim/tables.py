@@ -1,0 +1,207 @@
+"""Outcomes for people: the terminal tables of the command line."""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from sim.compare import Compared
+from sim.expect import Verdict
+
+ROOMS = ("sim", "fleet", "radio", "policies", "perception", "scenarios")
+MAX_TRANSITIONS = 24
+
+
+def number(value: Any, form: str = ".3f", unit: str = "") -> str:
+    """A figure with its unit; a dash where there is none."""
+    return "–" if value is None else f"{value:{form}}{unit and ' ' + unit}"
+
+
+def size(count: float) -> str:
+    """Bytes in the unit that reads best (decimal prefixes)."""
+    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= limit:
+            return f"{count / limit:.1f} {unit}"
+    return f"{count:.0f} B"
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %" if value >= 1e-3 else f"{100 * value:.2g} %"
+
+
+def outcome_table(result: dict[str, Any]) -> Table:
+    """One sortie: what the fleet saw and what it cost."""
+    table = Table(title=f"{result['scenario']} · {result['policy']} · seed {result['seed']}", show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    ap, data = result["ap50"], result["bytes"]
+    if ap["detector"] != "none":
+        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions"
+        table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
+        for phase in result["phases"]:
+            seen = phase["ap50"]
+            payload = (
+                "" if phase["feature_payload_bytes"] is None else f", {size(phase['feature_payload_bytes'])} a payload"
+            )
+            table.add_row(
+                f"  {phase['phase']} {phase['begin_s']:g}–{phase['end_s']:g} s",
+                f"{number(seen['full_scene'])} full, {number(seen['mission'])} mission, "
+                f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {_percent(phase['deadline_miss_rate'])} missed",
+            )
+    table.add_row(
+        "context plane",
+        f"{size(data['context_sent'])} ({_percent(result['context_share'])} of all bytes), "
+        f"age {number(result['age_s']['p50'])} s median, {number(result['age_s']['p99'])} s p99",
+    )
+    fates = ", ".join(
+        f"{size(data[f'data_{s}'])} {s.replace('_', ' ')}" for s in ("delivered", "lost", "expired", "in_flight")
+    )
+    table.add_row("data plane", f"{size(data['data_sent'])} sent: {fates}")
+    table.add_row(
+        "deadlines",
+        f"{_percent(result['deadline_miss_rate'])} missed; medium busy {_percent(result['medium_busy_fraction'])}",
+    )
+    energy = result["energy_j"]
+    causes = ", ".join(f"{c} {energy[c] / 1e3:.1f}" for c in energy if c != "total" and energy[c] > 0)
+    table.add_row("energy", f"{energy['total'] / 1e3:.1f} kJ ({causes})")
+    left = "  ".join(
+        f"{i}: {_percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["battery"].items()
+    )
+    table.add_row("charge left", left)
+    if result["descriptor_drops"]:
+        table.add_row("descriptors refused", ", ".join(f"{n} {r}" for r, n in result["descriptor_drops"].items()))
+    table.add_row("switches", f"{number(result['switches'], '.2f')} a link-minute")
+    table.add_row(
+        "decision",
+        f"{number(result['policy_eval_us']['p50'], '.0f', 'µs')} median, {number(result['policy_eval_us']['p99'], '.0f', 'µs')} p99",
+    )
+    table.add_row(
+        "wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(result['realtime_factor'], '.1f')} × real time"
+    )
+    table.add_row("fingerprint", result["fingerprint"][:16])
+    return table
+
+
+def transitions_table(result: dict[str, Any]) -> Table:
+    """What the gates switched, when and why; events among them."""
+    rows = [
+        (t["t_s"], f"{t['drone']} → {', '.join(map(str, t['peers']))}", f"{t['from']} → {t['to']}", t["reason"])
+        for t in result["transitions"]
+    ]
+    rows += [
+        (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), f"[yellow]{e['kind']}[/yellow]", e["text"])
+        for e in result["events"]
+    ]
+    rows.sort(key=lambda r: r[0])
+    more = len(rows) - MAX_TRANSITIONS
+    table = Table(title="decisions and events", caption=f"and {more} more in outcome.json" if more > 0 else None)
+    for column in ("t (s)", "who", "what", "why"):
+        table.add_column(column, justify="right" if column == "t (s)" else "left")
+    for t_s, who, what, why in rows[:MAX_TRANSITIONS]:
+        table.add_row(f"{t_s:.2f}", who, what, why)
+    return table
+
+
+def comparison_table(rows: Sequence[Compared]) -> Table:
+    """Policies side by side; gains are over the first, with paired 95 % intervals."""
+    first = rows[0].outcome
+    table = Table(
+        title=f"{first['scenario']} · seed {first['seed']} · gains over {rows[0].policy} in AP points, 95 % paired"
+    )
+    for name in (
+        "policy",
+        "AP full",
+        "gain",
+        "AP mission",
+        "gain",
+        "data sent",
+        "delivered",
+        "missed",
+        "busy",
+        "context",
+        "energy",
+        "charge left",
+    ):
+        table.add_column(name, justify="left" if name == "policy" else "right")
+    for r in rows:
+        o = r.outcome
+        lowest = min((b["soc"] for b in o["battery"].values()), default=None)
+        table.add_row(
+            r.policy,
+            number(o["ap50"]["full_scene"]),
+            _gain(r.gain["full_scene"]),
+            number(o["ap50"]["mission"]),
+            _gain(r.gain["mission"]),
+            size(o["bytes"]["data_sent"]),
+            size(o["bytes"]["data_delivered"]),
+            _percent(o["deadline_miss_rate"]),
+            _percent(o["medium_busy_fraction"]),
+            size(o["bytes"]["context_sent"]),
+            f"{o['energy_j']['total'] / 1e3:.1f} kJ",
+            f"≥ {_percent(lowest)}",
+        )
+    return table
+
+
+def _gain(gain: tuple[float, float, float] | None) -> str:
+    if gain is None:
+        return ""
+    value, low, high = (100 * g for g in gain)
+    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def explanations(rows: Sequence[Compared]) -> Iterator[str]:
+    """Why the figures differ, a line a policy, from the record."""
+    for r in rows:
+        fates = r.outcome["payload_fates"]
+        total = sum(fates.values())
+        if not total:
+            yield f"[bold]{r.policy}[/bold]: sent nothing; every drone saw with its own eyes only"
+            continue
+        parts = ", ".join(f"{_percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
+        age = r.outcome["data_age_s"]["p50"]
+        fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
+        yield f"[bold]{r.policy}[/bold]: {total} payloads, {parts}; {fused}"
+
+
+def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
+    """A scenario's expectations, held or not."""
+    table = Table(title=name, caption=None if verdicts else "this scenario expects nothing")
+    for column in ("", "expected", "got", "because"):
+        table.add_column(column)
+    for v in verdicts:
+        table.add_row("[green]ok[/green]" if v.holds else "[red]FAILED[/red]", v.expected, v.got, v.because)
+    return table
+
+
+def training_table(result: Any) -> Table:
+    """What training came to."""
+    table = Table(title="training", show_header=False)
+    for name in result.__slots__ if hasattr(result, "__slots__") else vars(result):
+        table.add_row(name, str(getattr(result, name)))
+    return table
+
+
+def profile_table(profiler: cProfile.Profile, result: dict[str, Any]) -> Table:
+    """Share of the wall time spent in each room's own code and in libraries, profiler's overhead included."""
+    root = Path(__file__).resolve().parent.parent
+    spent: dict[str, float] = {}
+    for (file, _, _), (_, _, own_s, _, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
+        path = Path(file)
+        room = path.relative_to(root).parts[0] if path.is_absolute() and path.is_relative_to(root) else ""
+        if room not in ROOMS:
+            room = next((p for p in ("simpy", "torch", "numpy", "scipy", "pyarrow") if p in file), "other libraries")
+        spent[room] = spent.get(room, 0.0) + own_s
+    total = sum(spent.values())
+    table = Table(title=f"where {result['wall_s']:.2f} s went (profiled: about twice the plain time)")
+    table.add_column("code")
+    table.add_column("own time", justify="right")
+    table.add_column("share", justify="right")
+    for room, own_s in sorted(spent.items(), key=lambda s: -s[1]):
+        table.add_row(room, f"{own_s:.2f} s", f"{100 * own_s / total:.1f} %")
+    return table

@@ -1,0 +1,221 @@
+"""The physical side of a sortie: once a frame, drones have moved and drained, and the links are new.
+
+Also where scenario events act on the physics: extra loss, jammers, battery faults, lost drones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
+
+import numpy as np
+import simpy
+
+from fleet.agent import Agent, Platform, Task
+from fleet.battery import FleetBatteries, climb_power_w, rotor_power_w
+from fleet.coverage import RANGE_M, footprint_radius_m
+from fleet.motion import Motion
+from perception.scene import SceneModel
+from perception.types import Capture
+from policies.contract import Disc
+from radio.air import Air
+from radio.topology import link_graph
+from scenarios.schema import Scenario
+from sim.mission import MissionPlan
+from sim.record import Recorder
+
+NAN = float("nan")
+SECOND_S = 1.0
+USABLE_SNR_DB = 0.0
+"""Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
+
+
+def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
+    """Call `act` at simulated time `t_s`."""
+    event = env.timeout(max(0.0, t_s - env.now))
+    event.callbacks.append(lambda _event: act())  # type: ignore[union-attr]
+
+
+class World:
+    """Positions, batteries, links and mission, stepped once a frame."""
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        scenario: Scenario,
+        motion: Motion,
+        batteries: FleetBatteries,
+        air: Air,
+        scene: SceneModel,
+        plan: MissionPlan,
+        recorder: Recorder,
+    ) -> None:
+        self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
+            env, motion, batteries, air, scene, plan,
+        )  # fmt: skip
+        self.agents: Sequence[Agent] = ()
+        n = scenario.fleet.drones
+        self.extra_loss_db = np.zeros((n, n))
+        self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
+        self.on_second: Callable[[float], None] | None = None
+        """Called once a simulated second; must not change anything."""
+        self._scenario, self._recorder = scenario, recorder
+        # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
+        rotor_w = rotor_power_w(motion.air_speed_mps) + climb_power_w(motion.velocity_mps[..., 2])
+        self._rotor_w: list[list[float]] = rotor_w.tolist()
+        self._positions: list[list[list[float]]] = motion.position_m.tolist()
+        columns = (motion.position_m, motion.orientation_xyzw, motion.velocity_mps, motion.body_rates_radps)
+        self._states: list[list[list[float]]] = np.concatenate(columns, axis=-1).tolist()
+        self._est_position = motion.est_position_m.tolist()
+        self._est_yaw = motion.est_yaw_rad.tolist()
+        self._airtime_s = [0.0] * n
+        self._stepped_to_s = 0.0
+        self._busy_at_s = (0.0, 0.0)
+        self._frame = 0
+        self.airtime_share = [0.0] * n
+        self.now = plan.at(0.0)
+        """The mission in this frame: the ground station's cue comes with the frame."""
+
+    def start(self) -> None:
+        """Begin the world's process; call once, before the agents start."""
+        self.env.process(self._run())
+
+    def _run(self) -> Generator[simpy.Event, Any, None]:
+        env, scenario = self.env, self._scenario
+        frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
+        for frame in range(scenario.frames):
+            yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
+            self.drain()
+            self._frame = frame
+            self.now = self.plan.at(env.now)
+            self.air.advance(self.motion.position_m[frame], self.extra_loss_db, list(self.jammers.values()))
+            self._write(frame)
+            if frame % frames_a_second == 0:
+                self._write_medium()
+                if self.on_second is not None:
+                    self.on_second(env.now)
+
+    def drain(self) -> None:
+        """Drain the batteries for the time since the last call, and land who has to."""
+        dt_s = self.env.now - self._stepped_to_s
+        if dt_s <= 0:
+            return
+        self._stepped_to_s = self.env.now
+        airtime_s = list(self.air.airtime_s)
+        self.airtime_share = [min(1.0, (a - b) / dt_s) for a, b in zip(airtime_s, self._airtime_s, strict=True)]
+        self._airtime_s = airtime_s
+        self.batteries.step(dt_s, self._rotor_w[self._frame], [self.duty(a) for a in self.agents], self.airtime_share)
+        self.ground_landed()
+
+    def duty(self, agent: Agent) -> float:
+        """Share of a frame in which the drone's computer runs perception: its compute delay, when it senses."""
+        busy = min(1.0, self._scenario.perception.compute_delay_s * self._scenario.context.rate_hz)
+        return busy if agent.sensed else 0.0
+
+    def ground_landed(self) -> None:
+        """Take drones whose battery gave out off the plane and the air."""
+        for agent, landed in zip(self.agents, self.batteries.landed, strict=True):
+            if landed and agent.airborne:
+                self.remove(agent.drone, "landed", f"charge {self.batteries.soc[agent.drone]:.1%}")
+
+    def remove(self, drone: int, kind: str, text: str) -> None:
+        """A drone leaves the sortie: it is silent from now on and draws nothing."""
+        self.agents[drone].stop()
+        self.air.silence(drone)
+        self.batteries.land(drone)
+        self.note(drone, kind, text)
+
+    def note(self, drone: int, kind: str, text: str) -> None:
+        """Write an event down; drone −1 is the whole fleet."""
+        self._recorder.rows["events"].append((self.env.now, drone, kind, text))
+
+    def _write_medium(self) -> None:
+        """How busy the channel has been since the last row, and how many drones have a usable link."""
+        busy_s = self.air.utilisation * self.env.now
+        since_s = self.env.now - self._busy_at_s[0]
+        busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
+        self._busy_at_s = (self.env.now, busy_s)
+        flying = [a.drone for a in self.agents if a.airborne]
+        graph = link_graph(self.air.snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
+        linked = sum(1 for drone in graph if graph.degree(drone))
+        self._recorder.rows["medium"].append((self.env.now, busy, linked))
+
+    def _write(self, frame: int) -> None:
+        rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
+        rows["states"].extend(
+            (
+                now_s, agent.drone, *self._states[frame][agent.drone], batteries.soc[agent.drone],
+                batteries.voltage_v[agent.drone], batteries.current_a[agent.drone], agent.airborne,
+            )
+            for agent in self.agents
+        )  # fmt: skip
+        region, target = self.now.region, self.now.target_xy
+        disc = (NAN, NAN, NAN) if region is None else (region.x_m, region.y_m, region.radius_m)
+        rows["mission"].append((now_s, self.now.phase, *disc, *((NAN, NAN) if target is None else target)))
+
+    # --- what one drone knows of itself ----------------------------------------------------------
+
+    def senses(self, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> _OwnSenses:
+        """The drone's own sensors (fleet.agent.Senses); without a detector, boxes are the cars in range."""
+        return _OwnSenses(self, drone, count_boxes)
+
+
+class _OwnSenses:
+    """One drone's view of itself; the rest of the world stays behind it."""
+
+    def __init__(self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> None:
+        self._world, self._drone, self._count_boxes = world, drone, count_boxes
+
+    def capture(self, frame: int) -> Capture:
+        world, i = self._world, self._drone
+        state = world._states[frame][i]
+        return Capture(
+            drone=i,
+            t_s=frame * world._scenario.frame_s,  # sensors trigger with the frame, the drone's phase comes after
+            position_m=(state[0], state[1], state[2]),
+            orientation_xyzw=(state[3], state[4], state[5], state[6]),
+            est_position_m=tuple(world._est_position[frame][i]),
+            est_yaw_rad=world._est_yaw[frame][i],
+        )
+
+    def velocity_mps(self, frame: int) -> tuple[float, float, float]:
+        state = self._world._states[frame][self._drone]
+        return state[7], state[8], state[9]
+
+    def platform(self) -> Platform:
+        """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
+        world, i = self._world, self._drone
+        return Platform(world.batteries.soc[i], 1.0 - world.airtime_share[i], 1.0 - world.duty(world.agents[i]))
+
+    def task(self) -> Task:
+        world = self._world
+        x_m, y_m, z_m = world._positions[world._frame][self._drone]
+        return world.now.task((x_m, y_m), footprint_radius_m(z_m))
+
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        if self._count_boxes is not None:
+            return self._count_boxes(capture, roi)
+        x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
+        if roi is not None:
+            x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
+        return self._world.scene.cars_near(capture.t_s, x_m, y_m, radius_m)
+
+
+def apply_event_loss(extra_loss_db: np.ndarray, drone: int, peer: int | None, loss_db: float) -> None:
+    """Add loss to both directions of a link, or of every link of a drone; in place."""
+    if peer is None:
+        extra_loss_db[drone, :] += loss_db
+        extra_loss_db[:, drone] += loss_db
+    else:
+        extra_loss_db[drone, peer] += loss_db
+        extra_loss_db[peer, drone] += loss_db
+
+
+def route_bounds(motion: Motion) -> tuple[float, float, float, float]:
+    """x_min, y_min, x_max, y_max of everything flown, ENU."""
+    low = motion.position_m.min(axis=(0, 1))
+    high = motion.position_m.max(axis=(0, 1))
+    if not all(math.isfinite(v) for v in (*low, *high)):
+        raise ValueError("the motion is not finite")
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

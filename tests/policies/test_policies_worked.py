@@ -1,0 +1,131 @@
+"""The worked policy against the paper's decision table, row by row and at its thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from policies_examples import fleet_of
+
+from policies.contract import Directive, Disc, FleetView, PolicyError, Representation, TaskPhase, check_directives
+from policies.geometry import circle_overlap
+from policies.registry import parameters, resolve
+from policies.worked import worked
+
+
+def to_peer_1(view: FleetView) -> Directive:
+    return next(d for d in worked(view) if d.destination == 1)
+
+
+@pytest.mark.parametrize(
+    ("soc", "rung", "rate_hz"),
+    [
+        (1.0, Representation.FEATURES, 10.0),
+        (0.60, Representation.FEATURES, 10.0),
+        (0.599, Representation.FEATURES, 5.0),
+        (0.30, Representation.FEATURES, 5.0),
+        (0.299, Representation.DETECTIONS, 2.0),
+        (0.0, Representation.DETECTIONS, 2.0),
+    ],
+)
+def test_battery_picks_rung_and_rate(soc: float, rung: Representation, rate_hz: float) -> None:
+    d = to_peer_1(fleet_of(5, soc=soc))
+    assert (d.representation, d.rate_hz) == (rung, rate_hz)
+    assert "battery" in d.reason
+
+
+@pytest.mark.parametrize(("goodput", "rung"), [(5.0, Representation.FEATURES), (4.99, Representation.DETECTIONS)])
+def test_a_weak_link_carries_detections(goodput: float, rung: Representation) -> None:
+    d = to_peer_1(fleet_of(5, goodput=goodput))
+    assert d.representation == rung
+    assert d.rate_hz == (10.0 if rung == Representation.FEATURES else 2.0)
+
+
+def test_a_weak_link_never_raises_the_rate() -> None:
+    assert to_peer_1(fleet_of(5, soc=0.1, goodput=1.0)).rate_hz == 2.0
+
+
+def test_tracking_confines_to_the_region() -> None:
+    assert to_peer_1(fleet_of(5)).roi is None
+    assert to_peer_1(fleet_of(5, phase=TaskPhase.TRACK)).roi == Disc(0, 0, 32)
+
+
+def test_only_the_two_most_overlapping_peers_get_anything() -> None:
+    sent = {d.destination: d.representation != Representation.NONE for d in worked(fleet_of(5))}
+    assert sent == {1: True, 2: True, 3: False, 4: False}
+
+
+def test_jitter_of_a_metre_does_not_reorder_peers() -> None:
+    view = fleet_of(5)
+    near = dict(view.descriptors)
+    near[3] = replace(near[3], position_m=(15.0, 0.5, 60.0))
+    near[2] = replace(near[2], position_m=(15.5, 0.0, 60.0))
+    sent = [d.destination for d in worked(FleetView(0, 0.1, near, view.age_s)) if d.rate_hz]
+    assert sent == [1, 2], "overlaps within a step tie, and ties go to the lower id"
+
+
+@pytest.mark.parametrize(
+    ("distance", "expected"),
+    [(0.0, 1.0), (84.0, 0.0), (100.0, 0.0), (42.0, 2 / 3 - 3**0.5 / (2 * 3.141592653589793))],
+)
+def test_circle_overlap_closed_forms(distance: float, expected: float) -> None:
+    """Equal circles one radius apart share 2/3 − √3/(2π) of their area."""
+    assert circle_overlap(distance, 42.0, 42.0) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_circle_within_another_is_covered() -> None:
+    assert circle_overlap(5.0, 10.0, 42.0) == 1.0
+    assert circle_overlap(5.0, 0.0, 42.0) == 0.0
+
+
+# --- the contract and the registry ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rho": 1.5}, r"directive 0→1: rho is 1.5, must be in \[0, 1\]"),
+        ({"rho": float("nan")}, r"directive 0→1: rho is nan, must be in \[0, 1\]"),
+        ({"rate_hz": -1.0}, r"directive 0→1: rate_hz is -1.0, must be in \[0, 30\]"),
+        ({"source": 2}, r"directive 2→1: source is 2, must be the ego 0"),
+        ({"destination": 9}, r"directive 0→9: destination 9 is not a peer in the view \[1, 2, 3, 4\]"),
+        ({"destination": 0}, r"directive 0→0: destination 0 is not a peer"),
+        ({"roi": Disc(0, 0, 0)}, r"directive 0→1: roi.radius_m is 0, must be > 0"),
+        ({"duty_percent": 101}, r"directive 0→1: duty_percent is 101, must be in \[0, 100\]"),
+    ],
+)
+def test_a_broken_directive_is_named(change: dict[str, object], message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        check_directives([replace(Directive(0, 1), **change)], fleet_of(5))
+
+
+def test_two_directives_for_one_link_are_refused() -> None:
+    with pytest.raises(PolicyError, match="directive 0→1: second directive for the same link"):
+        check_directives([Directive(0, 1), Directive(0, 1)], fleet_of(5))
+
+
+def test_something_else_than_a_directive_is_refused() -> None:
+    with pytest.raises(PolicyError, match="a policy returns Directive, got str"):
+        check_directives(["all"], fleet_of(5))  # type: ignore[list-item]
+
+
+def test_registry_errors_name_what_there_is(tmp_path) -> None:
+    with pytest.raises(PolicyError, match="unknown policy 'best', known: worked, all-4"):
+        resolve("best")
+    with pytest.raises(PolicyError, match="policy 'worked' has no parameter 'k', it has: rho"):
+        resolve("worked", {"k": 3})
+    with pytest.raises(PolicyError, match="not found"):
+        resolve(f"{tmp_path}/none.py:decide")
+    (tmp_path / "mine.py").write_text("def decide(view): return []\n")
+    with pytest.raises(PolicyError, match="has no function 'decode'"):
+        resolve(f"{tmp_path}/mine.py:decode")
+    (tmp_path / "bad.py").write_text("def decide(view) return []\n")
+    with pytest.raises(PolicyError, match="does not load: SyntaxError"):
+        resolve(f"{tmp_path}/bad.py:decide")
+    assert list(resolve(f"{tmp_path}/mine.py:decide")(fleet_of(5))) == []
+
+
+def test_parameters_are_the_keyword_only_arguments() -> None:
+    assert parameters(worked) == {"rho": 1.0}
+    assert to_peer_1(fleet_of(5)).rho == 1.0
+    assert next(iter(resolve("worked", {"rho": 0.25})(fleet_of(5)))).rho == 0.25
