@@ -1,0 +1,91 @@
+"""What editors and readers are shown is what the schema says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from scenarios import reference
+from scenarios.load import library
+from scenarios.schema import Scenario
+
+REMEDY = "run python -m scenarios.reference"
+
+
+def test_schema_json_is_current() -> None:
+    assert (reference.HERE / "schema.json").read_text("utf-8") == reference.schema_text(), REMEDY
+
+
+def test_the_readmes_tables_are_current() -> None:
+    readme = (reference.HERE / "README.md").read_text("utf-8")
+    assert readme == reference.readme_text(readme), REMEDY
+    assert reference.fields_markdown() in readme
+
+
+def test_every_field_of_the_schema_is_described() -> None:
+    schema = json.loads(reference.schema_text())
+    for section in (schema, *schema["$defs"].values()):
+        for name, field in section["properties"].items():
+            assert "description" in field or "$ref" in field or name == "kind", f"{section['title']}.{name}"
+
+
+def test_the_tables_show_bounds_and_defaults() -> None:
+    tables = reference.fields_markdown()
+    assert "| `initial_soc` | number, > 0, ≤ 1 | 0.95 |" in tables
+    assert "| `waypoints_m` | list of (2 × number, ≥ -5000, ≤ 5000) | must be given |" in tables
+
+
+def test_write_makes_both_files_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "README.md").write_text(f"# before\n{reference.BEGIN}\nstale table\n{reference.END}\nafter\n")
+    monkeypatch.setattr(reference, "HERE", tmp_path)
+    reference.write()
+    readme = (tmp_path / "README.md").read_text("utf-8")
+    assert readme.startswith("# before\n")
+    assert readme.endswith("\nafter\n")
+    assert "stale table" not in readme
+    assert "**fleet.battery**" in readme
+    assert json.loads((tmp_path / "schema.json").read_text("utf-8"))["title"] == "Scenario"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["README.md", "schema.json"]
+
+
+@pytest.mark.parametrize("name", library())
+def test_library_files_point_editors_to_the_schema(name: str) -> None:
+    first = library()[name].read_text("utf-8").split("\n", 1)[0]
+    assert first == "# yaml-language-server: $schema=../schema.json"
+    assert (library()[name].parent / "../schema.json").resolve() == (reference.HERE / "schema.json")
+
+
+def test_units_stand_in_names() -> None:
+    """A number that has a dimension says so in its name."""
+    unitless = {
+        "seed",
+        "drones",
+        "drone",
+        "peer",
+        "cells",
+        "initial_soc",
+        "drivetrain_efficiency",
+        "landing_soc",
+        "path_loss_exponent",
+        "retry_limit",
+        "max_ampdu_frames",
+        "degraded_after_periods",
+        "detached_after_periods",
+        "score_threshold",
+        "building_density",
+        "tree_density",
+        "parked_density",
+        "lost_fraction",
+        "at_least",
+        "at_most",
+        "moving_cars_per_km",
+    }
+    units = {"m", "s", "hz", "mps", "db", "dbm", "ghz", "mhz", "mbps", "w", "wh", "mohm", "deg", "bytes"}
+    schema = Scenario.model_json_schema()
+    for section in (schema, *schema["$defs"].values()):
+        for name, field in section["properties"].items():
+            kinds = {field.get("type"), *(member.get("type") for member in field.get("anyOf", []))}
+            if kinds & {"number", "integer"} and kinds <= {"number", "integer", "null"}:
+                assert name in unitless or name.rpartition("_")[2] in units, f"{section['title']}.{name}"
