@@ -1,0 +1,136 @@
+"""The way through the rooms: who may import whom, where a library is at home, and what no room does.
+
+`violations` reads one file's syntax tree; the tests run it over every file, and over small planted
+sources to show that each rule can fail.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+MAY_IMPORT = {
+    "sim": {"fleet", "radio", "policies", "perception", "scenarios"},
+    "fleet": {"radio", "policies", "perception", "scenarios"},
+    "radio": {"scenarios"},
+    "policies": {"scenarios"},
+    "perception": {"scenarios"},
+    "scenarios": set(),
+}
+"""sim → fleet → radio | policies | perception → scenarios; the three middle rooms do not know each other."""
+
+HOMES = {
+    "simpy": ("sim/*", "fleet/agent.py", "radio/medium.py", "radio/air.py"),
+    "torch": ("perception/*",),
+    "rerun": ("sim/playback.py",),
+    "pymavlink": ("fleet/mavlink.py",),
+    "yaml": ("scenarios/load.py",),
+}
+"""Third-party libraries with one home each."""
+
+NOT_IMPORTED = {"pickle", "dill", "cloudpickle", "shelve", "marshal"}
+NOT_CALLED = {"print", "eval", "exec"}
+
+
+def violations(source: str, path: str) -> list[str]:
+    """What a file does against the rules, as `path:line: what`; `path` is relative to the root."""
+    room = path.partition("/")[0]
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        for name in _imported(node):
+            top = name.partition(".")[0]
+            if top in MAY_IMPORT and top != room and top not in MAY_IMPORT[room]:
+                found.append((node, f"{room} must not import {top}"))
+            if top == "tests":
+                found.append((node, f"{room} must not import tests"))
+            if top in HOMES and not any(fnmatch(path, home) for home in HOMES[top]):
+                found.append((node, f"{top} is at home in {', '.join(HOMES[top])}"))
+            if top in NOT_IMPORTED:
+                found.append((node, f"{top} is not used: it runs what it reads"))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in NOT_CALLED:
+            found.append((node, f"{node.func.id}() is not called in a room"))
+    return [f"{path}:{getattr(node, 'lineno', 0)}: {what}" for node, what in found]
+
+
+def _imported(node: ast.AST) -> Iterator[str]:
+    """Modules that a node imports, by statement or by name, wherever it stands."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and node.level != 1:  # a single dot stays in the room, two leave it
+        yield from [node.module] if node.module else (alias.name for alias in node.names)
+    elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if called in ("import_module", "__import__", "find_spec", "importorskip") and isinstance(
+            node.args[0].value, str
+        ):
+            yield node.args[0].value
+
+
+FILES = sorted(path.relative_to(ROOT).as_posix() for room in MAY_IMPORT for path in (ROOT / room).rglob("*.py"))
+
+
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_a_room_keeps_to_the_rules(room: str) -> None:
+    files = [path for path in FILES if path.startswith(f"{room}/")]
+    assert files
+    assert [line for path in files for line in violations((ROOT / path).read_text("utf-8"), path)] == []
+
+
+def test_every_package_at_the_root_is_a_room() -> None:
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert packages == set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "what"),
+    [
+        ("radio/rates.py", "import fleet", "radio must not import fleet"),
+        ("radio/rates.py", "from policies.contract import Disc", "radio must not import policies"),
+        ("radio/rates.py", "import perception.ap as ap", "radio must not import perception"),
+        ("policies/worked.py", "from perception import ap", "policies must not import perception"),
+        ("perception/ap.py", "from radio.air import Air", "perception must not import radio"),
+        ("scenarios/load.py", "import policies", "scenarios must not import policies"),
+        ("fleet/agent.py", "import numpy, sim.record", "fleet must not import sim"),
+        ("fleet/agent.py", "def f():\n    from sim import record", "fleet must not import sim"),
+        ("fleet/agent.py", "if TYPE_CHECKING:\n    import sim", "fleet must not import sim"),
+        ("fleet/agent.py", "from ..sim import record", "fleet must not import sim"),
+        ("fleet/agent.py", "from .. import sim", "fleet must not import sim"),
+        ("fleet/agent.py", "importlib.import_module('sim.record')", "fleet must not import sim"),
+        ("fleet/agent.py", "__import__('sim')", "fleet must not import sim"),
+        ("sim/sortie.py", "import tests.helpers", "sim must not import tests"),
+        ("fleet/motion.py", "import simpy", "simpy is at home in sim/*, fleet/agent.py, radio/medium.py, radio/air.py"),
+        ("policies/worked.py", "import torch", "torch is at home in perception/*"),
+        ("sim/sortie.py", "from torch import nn", "torch is at home in perception/*"),
+        ("sim/sortie.py", "import rerun as rr", "rerun is at home in sim/playback.py"),
+        ("fleet/agent.py", "from pymavlink.dialects import v20", "pymavlink is at home in fleet/mavlink.py"),
+        ("scenarios/nodes.py", "import yaml", "yaml is at home in scenarios/load.py"),
+        ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),
+        ("sim/cli.py", "print('done')", "print() is not called in a room"),
+        ("policies/registry.py", "f = eval(name)", "eval() is not called in a room"),
+        ("policies/registry.py", "exec(text)", "exec() is not called in a room"),
+    ],
+)
+def test_a_planted_violation_is_found(path: str, source: str, what: str) -> None:
+    line = source.count("\n") + 1
+    assert violations(source, path) == [f"{path}:{line}: {what}"]
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("sim/sortie.py", "import fleet, radio, policies, perception, scenarios, simpy, sim.record"),
+        ("fleet/agent.py", "import radio, policies, perception, scenarios, simpy"),
+        ("fleet/wire.py", "from .cdr import encode\nfrom . import cdr\nfrom fleet.cdr import decode"),
+        ("perception/model.py", "import torch\nmodel.eval()\nconsole.print(x)"),
+        ("perception/nets/head.py", "import torch"),
+        ("radio/air.py", "import simpy, numpy, simulator, yamlish"),
+    ],
+)
+def test_what_is_allowed_is_not_found(path: str, source: str) -> None:
+    assert violations(source, path) == []
