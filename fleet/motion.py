@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fleet.formation import slots
 from fleet.frames import yaw_rad
-from fleet.noise import gauss_markov, smooth
+from fleet.noise import LAGS, gauss_markov, smooth
 from fleet.route import frame_path
 from scenarios import schema
 from scenarios.streams import stream
@@ -26,8 +26,8 @@ Array = npt.NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.81
 DRAG_PER_S = 0.2
-"""Rotor and body drag over mass, linear in air speed: 10 m/s of air tilts the airframe by 11.5°. Measured values
-are a few tenths (Faessler, Franchi & Scaramuzza 2018 fit 0.54 and 0.39 to a small, fast quadrotor)."""
+"""Rotor and body drag over mass, linear in air speed (the form of Faessler, Franchi & Scaramuzza 2018). The value is
+chosen, not measured: 10 m/s of air tilts the airframe by 11.5°. The rotor-power formula has its own drag."""
 ESTIMATE_TIME_S = 10.0
 """Correlation time of the errors of the position and heading estimates."""
 
@@ -126,7 +126,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     velocity = _raise(path.velocity_mps[:, None] + rate * across)
     acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
 
-    offsets = smooth(draws("pose_jitter", 3, 3), config.pose_jitter_m, config.pose_jitter_time_s, frame_s)
+    offsets = smooth(draws("pose_jitter", LAGS, 3), config.pose_jitter_m, config.pose_jitter_time_s, frame_s)
     position, velocity, acceleration = (
         held + np.moveaxis(offset, -1, 1)
         for held, offset in zip((position, velocity, acceleration), offsets, strict=True)

@@ -4,9 +4,10 @@ Two processes, both stationary from their first sample, both given by a standard
 correlation time (the integral of the autocorrelation from 0 to ∞):
 
 * `gauss_markov`, first order (Ornstein–Uhlenbeck): continuous, not differentiable. Gusts, estimate errors.
-* `smooth`, three equal poles (Matérn 5/2): twice differentiable, so that velocity and acceleration exist
-  and belong to the position. Where a drone really is. Two poles would not do: the acceleration, from which
-  the attitude follows, would be white noise, its size a matter of the time step.
+* `smooth`, four equal poles (Matérn 7/2): three times differentiable, so that velocity, acceleration and jerk
+  exist and belong to the position. Where a drone really is. Fewer poles would not do: attitude follows from
+  acceleration and body rates from jerk; with two poles the one, with three the other would be white noise, its
+  size a matter of the time step.
 
 Both run as linear filters over blocks of standard normal draws, time along the first axis, so that a longer
 sortie begins with the same numbers as a shorter one.
@@ -22,6 +23,8 @@ from scipy.signal import lfilter
 from scipy.special import gammainc
 
 Array = npt.NDArray[np.float64]
+
+LAGS = 4
 
 
 def gauss_markov(normals: Array, sigma: float, time_s: float, step_s: float) -> Array:
@@ -42,13 +45,13 @@ def gauss_markov(normals: Array, sigma: float, time_s: float, step_s: float) -> 
 
 
 def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[Array, Array, Array]:
-    """Twice differentiable process, with its derivatives; autocorrelation (1 + u + u²/3)·e^{−u}, u = λ|t|.
+    """Smooth process with its derivatives; autocorrelation (1 + u + 2u²/5 + u³/15)·e^{−u}, u = λ|t|.
 
-    Three chained first-order lags of rate λ = 8/(3·time_s). The derivatives' standard deviations are
-    λ·sigma/√3 and λ²·sigma (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, §4.2 and B.2).
+    Four chained first-order lags of rate λ = 16/(5·time_s). The derivatives' standard deviations are
+    λ·sigma/√5 and λ²·sigma/√5 (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, §4.2 and B.2).
 
     Args:
-        normals: [T, 3, ...] independent standard normal draws.
+        normals: [T, 4, ...] independent standard normal draws.
         sigma: standard deviation of the value.
         time_s: correlation time, > 0.
         step_s: time between samples, > 0.
@@ -56,18 +59,19 @@ def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[
     Returns:
         value, first derivative, second derivative, each [T, ...], in sigma's unit, per s, per s².
     """
-    rate = 8 / (3 * time_s)
+    rate = 16 / (5 * time_s)
     d = rate * step_s  # from here on time is counted in 1/λ
     driven = np.einsum("ij,tj...->ti...", np.linalg.cholesky(_lag_covariance(d)), normals)
     driven[0] = np.einsum("ij,j...->i...", np.linalg.cholesky(_lag_covariance(math.inf)), normals[0])
     decay = math.exp(-d)
-    z1 = _lag(driven[:, 0], decay)
-    driven[1:, 1] += decay * d * z1[:-1]
-    z2 = _lag(driven[:, 1], decay)
-    driven[1:, 2] += decay * (d * z2[:-1] + d * d / 2 * z1[:-1])
-    z3 = _lag(driven[:, 2], decay)
-    gain = sigma * 4 / math.sqrt(3)  # the last lag's variance is 3/16
-    return gain * z3, gain * rate * (z2 - z3), gain * rate**2 * (z1 - 2 * z2 + z3)
+    lags: list[Array] = []
+    for i in range(LAGS):  # exact transition: lag j feeds lag i by e^{−d}·d^{i−j}/(i−j)!
+        for j, lag in enumerate(lags):
+            driven[1:, i] += decay * d ** (i - j) / math.factorial(i - j) * lag[:-1]
+        lags.append(_lag(driven[:, i], decay))
+    _, z2, z3, z4 = lags
+    gain = sigma * math.sqrt(32 / 5)  # the last lag's variance is 5/32
+    return gain * z4, gain * rate * (z3 - z4), gain * rate**2 * (z2 - 2 * z3 + z4)
 
 
 def _lag(driven: Array, decay: float) -> Array:
@@ -76,14 +80,14 @@ def _lag(driven: Array, decay: float) -> Array:
 
 
 def _lag_covariance(d: float) -> Array:
-    """Covariance [3, 3] that white noise leaves in three chained unit lags after time d (∞: the stationary one).
+    """Covariance [4, 4] that white noise leaves in four chained unit lags after time d (∞: the stationary one).
 
     ∫₀ᵈ e^{−2s} s^{i+j}/(i! j!) ds by the incomplete gamma function: the difference of stationary covariances
     is the same in algebra, but cancels to nothing in floats when d is small.
     """
-    i, j = np.indices((3, 3))
+    i, j = np.indices((LAGS, LAGS))
     m = i + j + 1
-    factorial = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
+    factorial = np.array([1.0, 1.0, 2.0, 6.0, 24.0, 120.0, 720.0])
     share = np.ones_like(m, dtype=float) if math.isinf(d) else gammainc(m, 2 * d)
     covariance: Array = factorial[m - 1] / (factorial[i] * factorial[j]) * 0.5**m * share
     return covariance
