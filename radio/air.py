@@ -548,7 +548,7 @@ class Air:
         now = self._env.now
         if not served:
             waited = now - s.t_sent_s
-            if isnan(s.t_first_s) and waited >= _WINDOW_S:
+            if s.repairs == 0 and waited >= _WINDOW_S:
                 rate = (self._drained(s.sender) - s.drained_bits) / waited * 1e-6
                 self._goodput.bounded(s.sender, s.receiver, rate)
             return

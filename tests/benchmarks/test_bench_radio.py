@@ -1,0 +1,42 @@
+"""What the air costs: 120 s of five drones at 10 Hz, descriptors alone and with two samples per drone and frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import simpy
+
+from radio import Air
+from scenarios.schema import Radio
+
+CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60]], float)
+FRAMES = 1200
+
+
+def _sortie(samples: int) -> int:
+    env = simpy.Environment()
+    air = Air(env, Radio(), 5, seed=1, frame_s=0.1)
+    done: list[Any] = []
+
+    def frames() -> simpy.events.ProcessGenerator:
+        for _ in range(FRAMES):
+            air.advance(CROSS_M)
+            for i in range(5):
+                air.broadcast(i, 208, done.append)
+            yield env.timeout(0.03)
+            for i in range(5):
+                for hop in range(1, samples + 1):
+                    air.send(i, (i + hop) % 5, 13_120, kind="f", reliable=False, deadline_s=0.065, on_done=done.append)
+            yield env.timeout(0.07)
+
+    env.process(frames())
+    env.run(until=120.0)
+    return len(done)
+
+
+@pytest.mark.parametrize("samples", [0, 2])
+def test_120_s_of_five_drones(benchmark: Any, samples: int) -> None:
+    ends = benchmark.pedantic(_sortie, args=(samples,), rounds=3, iterations=1)
+    assert ends >= 5 * FRAMES * (1 + samples) - 5  # the last broadcasts may be on the air

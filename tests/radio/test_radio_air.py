@@ -1,0 +1,414 @@
+"""The air as a whole: fates, repairs, goodput as measured, conservation, determinism."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from math import isnan
+
+import numpy as np
+import pytest
+import simpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from radio import Air, Status, Transmission
+from radio.rates import RATES_MBPS
+from radio.transmission import losses
+from scenarios.schema import Radio
+
+CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60], [40, 0, 60]], float)
+DEFAULT = Radio()
+STILL = Radio(shadowing_sigma_db=0.0)
+
+
+class Flight:
+    """A fleet that hovers in a cross; `tick` is called in every frame after the links have moved on."""
+
+    def __init__(
+        self, config: Radio = DEFAULT, n: int = 5, *, seed: int = 1, replication: int = 0, spread: float = 0.8
+    ) -> None:
+        self.env = simpy.Environment()
+        self.n = n
+        self.air = Air(self.env, config, n, seed=seed, replication=replication, frame_s=0.1, publish_spread=spread)
+        self.rows: list[Transmission] = []
+        self.heard: list[tuple[float, int, tuple[int, ...]]] = []
+        self.extra = np.zeros((n, n))
+
+    def send(
+        self,
+        sender: int,
+        receiver: int,
+        payload: int,
+        *,
+        kind: str = "f",
+        reliable: bool = False,
+        deadline_s: float = 0.1,
+    ) -> int:
+        return self.air.send(
+            sender, receiver, payload, kind=kind, reliable=reliable, deadline_s=deadline_s, on_done=self.rows.append
+        )
+
+    def publish(self, sender: int) -> None:
+        self.air.broadcast(sender, 208, lambda ids: self.heard.append((self.env.now, sender, tuple(ids))))
+
+    def fly(self, duration_s: float, tick: Callable[[float], object] = lambda t: None) -> Flight:
+        def frames() -> simpy.events.ProcessGenerator:
+            for k in range(round(duration_s * 10)):
+                if k:
+                    yield self.env.timeout(k / 10 - self.env.now)
+                self.air.advance(CROSS_M[: self.n], self.extra)
+                tick(k / 10)
+
+        self.env.process(frames())
+        self.env.run(until=duration_s)
+        return self
+
+    def everyone(
+        self, payload: int, *, peers: int = 4, deadline_s: float = 0.1, reliable: bool = False
+    ) -> Callable[[float], None]:
+        def tick(_: float) -> None:
+            for i in range(self.n):
+                for j in range(1, peers + 1):
+                    self.send(i, (i + j) % self.n, payload, deadline_s=deadline_s, reliable=reliable)
+
+        return tick
+
+
+def test_full_sharing_does_not_fit_one_channel() -> None:
+    f = Flight()
+    f.fly(5.0, f.everyone(655_360, deadline_s=0.09))
+    fates = Counter((r.status, r.reason) for r in f.rows)
+    assert f.air.utilisation > 0.85  # idle between a deadline and the next frame
+    assert fates[Status.EXPIRED, "deadline_queued"] > 100
+    assert fates[Status.EXPIRED, "deadline_in_service"] > 100
+    assert f.air.counters.data_delivered_bytes < 0.5 * f.air.counters.data_sent_bytes
+    f = Flight()
+    f.fly(5.0, f.everyone(655_360, deadline_s=10.0))
+    assert f.air.utilisation > 0.999
+    assert Counter(r.reason for r in f.rows)["replaced"] > 100
+
+
+def test_two_percent_of_the_cells_fit_without_a_miss() -> None:
+    f = Flight()
+    f.fly(5.0, f.everyone(13_120))
+    assert {r.status for r in f.rows} == {Status.DELIVERED}
+    assert len(f.rows) == 5 * 4 * 50
+    assert f.air.utilisation < 0.2
+
+
+def test_the_row_of_one_sample() -> None:
+    f = Flight(Radio(shadowing_sigma_db=0.0, tx_power_dbm=30.0))
+    f.fly(0.2, lambda t: t == 0 and f.send(0, 1, 2000, kind="features"))
+    (row,) = f.rows
+    assert (row.number, row.sender, row.receiver, row.kind, row.payload_bytes) == (0, 0, 1, "features", 2000)
+    assert (row.status, row.reason, row.fragments, row.fragments_lost, row.repairs) == (Status.DELIVERED, "", 2, 0, 0)
+    assert row.wire_bytes == 2000 + 2 * 150
+    assert row.mcs == 11
+    assert row.t_sent_s == row.t_start_s == 0.0
+    assert row.t_done_s == pytest.approx(row.airtime_s)
+    assert row.t_done_s == pytest.approx(67.5e-6 + 44e-6 + 13.6e-6 * 3 + 16e-6 + 32e-6 + 34e-6 + 9e-6, rel=1e-3)
+    assert row.deadline_s == 0.1
+
+
+@pytest.mark.parametrize("q", [1e-3, 1e-2])
+@pytest.mark.parametrize("payload", [655_360, 163_840, 13_120, 1000])
+def test_best_effort_delivers_the_power_of_its_fragments(q: float, payload: int) -> None:
+    k = -(-payload // 1344)
+    u = np.random.default_rng(5).random(20_000)
+    delivered = np.mean([losses(x, k, q) == 0 for x in u])
+    expected = (1 - q) ** k
+    assert delivered == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9)
+
+
+@given(st.floats(0, 1, exclude_max=True), st.integers(1, 2000), st.floats(0, 1))
+def test_losses_invert_the_binomial(u: float, count: int, q: float) -> None:
+    k = losses(u, count, q)
+    assert 0 <= k <= count
+    if 1e-12 < q < 1 - 1e-12:
+        assert stats.binom.cdf(k, count, q) >= u - 1e-9
+        assert k == 0 or stats.binom.cdf(k - 1, count, q) <= u + 1e-9
+
+
+def test_a_lossy_link_loses_best_effort_samples_and_repairs_reliable_ones() -> None:
+    edge = Radio(shadowing_sigma_db=0.0, retry_limit=0)  # every failed frame is a lost fragment
+    fates = {}
+    for reliable in (False, True):
+        f = Flight(edge, 2)
+        f.fly(20.0, lambda t, f=f, r=reliable: f.send(0, 1, 30_000, reliable=r))
+        fates[reliable] = f.rows
+    assert all(r.status in (Status.DELIVERED, Status.LOST) for r in fates[False])
+    lost = [r for r in fates[False] if r.status is Status.LOST]
+    assert len(lost) > 10
+    assert {r.reason for r in lost} == {"fragment_lost"}
+    assert all(r.fragments_lost > 0 and r.t_done_s - r.t_sent_s < 0.01 for r in lost)
+    repaired = [r for r in fates[True] if r.repairs]
+    assert len(repaired) == len(lost)  # the same draws
+    for r in repaired:
+        assert r.status is Status.DELIVERED
+        assert r.t_done_s - r.t_sent_s > 0.025 * r.repairs  # heartbeat + NACK delay, each round
+        assert r.wire_bytes > max(x.wire_bytes for x in fates[True] if not x.repairs)
+    f = Flight(edge, 2)
+    f.fly(20.0, lambda t: f.send(0, 1, 30_000, reliable=True, deadline_s=0.02))
+    assert {(r.status, r.reason) for r in f.rows if r.fragments_lost} == {(Status.EXPIRED, "deadline_in_service")}
+
+
+def test_a_dead_link_costs_a_few_tries_and_says_so() -> None:
+    f = Flight(STILL, 3)
+    f.extra[0, 1] = 90.0
+    f.fly(1.0, lambda t: (f.send(0, 1, 50_000), f.send(0, 2, 50_000)))
+    fates = Counter((r.receiver, r.status, r.reason) for r in f.rows)
+    assert fates == {(1, Status.LOST, "no_link"): 10, (2, Status.DELIVERED, ""): 10}
+    assert all(r.airtime_s < 10e-3 and r.mcs == -1 and r.wire_bytes == 0 for r in f.rows if r.receiver == 1)
+    assert f.air.goodput_mbps(0)[0] == 0.0
+    assert f.air.goodput_mbps(0)[1] > 100
+
+
+def test_a_newer_sample_replaces_the_older_of_its_kind_only() -> None:
+    f = Flight(STILL, 2)
+
+    def tick(t: float) -> None:
+        if t == 0:
+            for kind in ("features", "detections", "features"):
+                f.send(0, 1, 600_000, kind=kind)
+
+    f.fly(0.1, tick)
+    assert [(r.number, r.reason) for r in f.rows] == [(0, "replaced"), (1, ""), (2, "")]
+    assert isnan(f.rows[0].t_start_s) or f.rows[0].airtime_s == 0.0
+
+
+def test_a_silenced_drone_neither_sends_nor_hears() -> None:
+    f = Flight(STILL)
+
+    def tick(t: float) -> None:
+        for i in range(5):
+            f.publish(i)
+        if t == 0.5:
+            f.send(2, 1, 600_000)
+            f.send(1, 2, 600_000)
+            f.air.silence(2)
+            f.send(2, 1, 600_000)
+            f.send(1, 3, 1000)
+
+    f.fly(1.0, tick)
+    late = [(sender, ids) for t, sender, ids in f.heard if t > 0.5]
+    assert all(sender != 2 and 2 not in ids for sender, ids in late)
+    assert any(ids for _, ids in late)
+    assert any(2 in ids for t, _, ids in f.heard if t < 0.5)
+    fates = {r.number: (r.status, r.reason) for r in f.rows}
+    assert fates == {
+        0: (Status.LOST, "sender_gone"),
+        1: (Status.LOST, "receiver_gone"),
+        2: (Status.LOST, "sender_gone"),
+        3: (Status.DELIVERED, ""),
+    }
+
+
+def test_what_is_in_flight_at_the_end_is_told() -> None:
+    f = Flight(STILL, 2)
+    f.air.advance(CROSS_M[:2])
+    f.send(0, 1, 2_000_000)
+    f.send(0, 1, 1000, kind="d")
+    f.env.run(until=0.005)
+    rows = f.air.finish()
+    assert [(r.number, r.status, r.reason) for r in rows] == [(0, Status.IN_FLIGHT, ""), (1, Status.IN_FLIGHT, "")]
+    assert rows[0].airtime_s == pytest.approx(0.005)
+    assert 0 < rows[0].wire_bytes < 2_000_000
+    assert isnan(rows[1].t_start_s)
+    assert isnan(rows[1].t_done_s)
+    assert f.air.data_in_flight_bytes == 2_001_000
+
+
+# --- goodput as measured -----------------------------------------------------------------------------
+
+
+def test_goodput_of_a_large_sample_is_its_bits_over_its_time() -> None:
+    f = Flight(STILL, 2)
+    f.fly(0.1, lambda t: f.send(0, 1, 64 * 1344 * 5))
+    (row,) = f.rows
+    assert f.air.goodput_mbps(0)[0] == pytest.approx(
+        row.payload_bytes * 8e-6 / (row.t_done_s - row.t_start_s), rel=0.01
+    )
+    assert f.air.goodput_mbps(1) == (0.0,)  # nothing sent, nothing known
+
+
+@pytest.mark.parametrize("payload", [50_000, 163_840, 655_360])
+def test_a_drop_of_30_db_shows_within_one_frame(payload: int) -> None:
+    f = Flight()
+    read: dict[float, tuple[float, ...]] = {}
+
+    def tick(t: float) -> None:
+        read[round(t, 1)] = f.air.goodput_mbps(2)
+        if t >= 1.9:
+            f.extra[2, :] = f.extra[:, 2] = 30.0  # in force from 2.0
+        send = f.everyone(payload, deadline_s=0.065)
+        f.env.timeout(0.03).callbacks.append(lambda _: send(t))
+
+    f.fly(3.0, tick)
+    assert max(read[2.0]) > 50
+    assert max(read[2.1]) < 5
+
+
+def test_small_samples_show_that_a_link_has_recovered() -> None:
+    f = Flight(STILL, 3)
+    read: dict[float, float] = {}
+
+    def tick(t: float) -> None:
+        t = round(t, 1)
+        read[t] = f.air.goodput_mbps(0)[0]
+        f.extra[0, 1] = 60.0 if 0.9 <= t < 1.9 else 0.0  # in force from 1.0 to 2.0
+        if t * 2 == int(t * 2):
+            f.send(0, 1, 150, kind="detections")
+
+    f.fly(4.0, tick)
+    assert read[0.9] > 100
+    assert read[1.9] == 0.0
+    assert read[2.6] > 5
+
+
+def test_a_sample_held_up_by_its_own_queue_lowers_the_reading() -> None:
+    f = Flight(STILL, 3)
+
+    def tick(t: float) -> None:
+        t = round(t, 1)
+        if t == 0:
+            f.send(0, 1, 100_000)
+            f.send(0, 2, 100_000)
+        if t == 0.1:
+            assert min(f.air.goodput_mbps(0)) > 100
+            f.extra[0, 1] = 33.0
+        if t == 0.2:
+            f.send(0, 1, 3_000_000)
+            f.send(0, 2, 100_000)
+        if t == 0.3:
+            assert max(f.air.goodput_mbps(0)) < 5
+
+    f.fly(0.4, tick)
+    assert {r.reason for r in f.rows[2:]} <= {"deadline_queued", "deadline_in_service"}
+
+
+traffic = st.lists(
+    st.tuples(
+        st.integers(0, 19),  # frame
+        st.integers(0, 3),  # sender
+        st.integers(1, 3),  # receiver, relative
+        st.integers(1, 900_000),
+        st.sampled_from("ab"),
+        st.booleans(),
+        st.floats(0, 0.4),
+    ),
+    max_size=40,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    traffic,
+    st.integers(0, 99),
+    st.sampled_from([0, 7]),
+    st.sampled_from([0.0, 10.0, 25.0]),
+    st.none() | st.integers(0, 19),
+)
+def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
+    samples: list, seed: int, retry_limit: int, loss_db: float, silenced_at: int | None
+) -> None:
+    f = Flight(Radio(retry_limit=retry_limit, tx_power_dbm=15.0), 4, seed=seed)
+    f.extra[1, :] = loss_db
+
+    def tick(t: float) -> None:
+        k = round(t * 10)
+        for i in range(4):
+            f.publish(i)
+            assert all(0 <= g < RATES_MBPS[80][11] for g in f.air.goodput_mbps(i))
+        for frame, sender, hop, payload, kind, reliable, deadline_s in samples:
+            if frame == k:
+                f.send(sender, (sender + hop) % 4, payload, kind=kind, reliable=reliable, deadline_s=deadline_s)
+        if k == silenced_at:
+            f.air.silence(3)
+
+    f.fly(2.0, tick)
+    flying = f.air.finish()
+    c = f.air.counters
+    rows = f.rows + flying
+    assert sorted(r.number for r in rows) == list(range(len(samples)))
+    by = {s: sum(r.payload_bytes for r in rows if r.status is s) for s in Status}
+    assert by[Status.DELIVERED] == c.data_delivered_bytes
+    assert by[Status.LOST] == c.data_lost_bytes
+    assert by[Status.EXPIRED] == c.data_expired_bytes
+    assert by[Status.IN_FLIGHT] == f.air.data_in_flight_bytes
+    assert sum(by.values()) == c.data_sent_bytes == sum(s[3] for s in samples)
+    for r in f.rows:
+        assert r.t_sent_s <= r.t_done_s <= r.deadline_s + 1e-9
+        assert isnan(r.t_start_s) or r.t_sent_s <= r.t_start_s <= r.t_done_s
+        assert (r.status is Status.DELIVERED) == (r.reason == "")
+        assert r.status is not Status.DELIVERED or r.wire_bytes >= r.payload_bytes
+    assert sum(f.air.airtime_s) <= 4 * 2.0
+    assert f.air.utilisation <= 1.0
+
+
+# --- context -----------------------------------------------------------------------------------------
+
+
+def test_broadcasts_reach_everyone_near_and_cost_one_event_each() -> None:
+    f = Flight(STILL, spread=0.0)
+    f.fly(2.0, lambda t: f.publish(round(t * 10) % 5))
+    assert len(f.heard) == 20
+    assert all(ids == tuple(i for i in range(5) if i != sender) for _, sender, ids in f.heard)
+    assert f.air.counters.receptions == 80
+    assert next(f.env._eid) <= 20 + 20 + 3  # one a frame to tick, one a broadcast, the process and the end
+    assert f.air.airtime_s == pytest.approx([4 * 468e-6] * 5)
+
+
+def test_broadcasts_in_step_collide_and_out_of_step_hardly_do() -> None:
+    collided = {}
+    for spread in (0.0, 0.8):
+        f = Flight(STILL, spread=spread)
+        f.fly(20.0, lambda t, f=f: [f.publish(i) for i in range(5)])
+        collided[spread] = f.air.counters.collided / 1000
+    assert collided[0.0] == pytest.approx(1 - (15 / 16) ** 4, abs=0.05)
+    assert collided[0.8] < 0.02
+
+
+def test_a_far_receiver_misses_some_broadcasts_a_dead_one_all() -> None:
+    f = Flight(STILL, 3)
+    f.extra[0, 1], f.extra[0, 2] = 41.5, 90.0
+    f.fly(20.0, lambda t: f.publish(0))
+    counts = Counter(i for _, _, ids in f.heard for i in ids)
+    assert 20 < counts[1] < 190
+    assert counts[2] == 0
+    assert f.air.counters.missed == 400 - counts[1]
+
+
+def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
+    def fates(n: int, seed: int = 1) -> tuple[list, list]:
+        f = Flight(Radio(retry_limit=0), n, seed=seed)
+
+        def tick(_: float) -> None:
+            for i in range(5):
+                f.publish(i)
+                f.send(i, (i + 1) % 5, 100_000)
+
+        f.fly(5.0, tick)
+        return f.rows, [(t, s, tuple(i for i in ids if i < 5)) for t, s, ids in f.heard]
+
+    assert fates(5) == fates(5)
+    assert fates(5) == fates(6)
+    assert fates(5) != fates(5, seed=2)
+
+
+def test_arguments_out_of_bounds_are_refused() -> None:
+    f = Flight(STILL, 2)
+    f.air.advance(CROSS_M[:2])
+    with pytest.raises(ValueError, match=r"sender is 0 and receiver 0, must be two drones in \[0, 1\]"):
+        f.send(0, 0, 1)
+    with pytest.raises(ValueError, match="payload_bytes is 0, must be at least 1"):
+        f.send(0, 1, 0)
+    with pytest.raises(ValueError, match=r"deadline_s is nan, must be at least 0"):
+        f.send(0, 1, 1, deadline_s=float("nan"))
+    with pytest.raises(ValueError, match=r"sender is 2, must be in \[0, 1\]"):
+        f.air.broadcast(2, 10, print)
+    with pytest.raises(ValueError, match=r"payload_bytes is 3000, must be in \[1, 2200\]"):
+        f.air.broadcast(0, 3000, print)
+    with pytest.raises(ValueError, match=r"publish_spread is 2, must be in \[0, 1\]"):
+        Flight(STILL, 2, spread=2)

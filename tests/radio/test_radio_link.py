@@ -1,0 +1,182 @@
+"""Path loss, shadowing, fading and rates against closed forms and independent computations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from radio.channel import Channel, free_space_loss_db, noise_dbm, path_loss_db
+from radio.rates import LEGACY_RATES_MBPS, NO_LINK_PER, RATES_MBPS, choose_mcs, group_mcs, per, rate_table, rescale
+from scenarios.schema import Radio
+
+CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60], [40, 0, 60]], float)
+
+
+@pytest.mark.parametrize(
+    ("carrier_ghz", "distance_m", "loss_db"),
+    [
+        *[(2.437, 1, 40.2), (2.437, 20, 66.2), (2.437, 100, 80.2), (2.437, 300, 89.7)],
+        *[(5.2, 1, 46.8), (5.2, 20, 72.8), (5.2, 100, 86.8), (5.2, 300, 96.3)],
+    ],
+)
+def test_free_space_loss_is_friis(carrier_ghz: float, distance_m: float, loss_db: float) -> None:
+    assert float(free_space_loss_db(distance_m, carrier_ghz)) == pytest.approx(loss_db, abs=0.06)
+    assert float(path_loss_db(distance_m, carrier_ghz, 2.0)) == pytest.approx(loss_db, abs=0.06)
+
+
+def test_log_distance_adds_ten_times_the_exponent_a_decade_and_stops_at_one_metre() -> None:
+    near, far = path_loss_db([10.0, 100.0], 5.2, 2.7)
+    assert far - near == pytest.approx(27.0)
+    assert path_loss_db(0.0, 5.2, 2.7) == path_loss_db(1.0, 5.2, 2.7)
+
+
+@pytest.mark.parametrize(("bandwidth_mhz", "dbm"), [(20, -94.0), (40, -91.0), (80, -88.0)])
+def test_noise_floor(bandwidth_mhz: int, dbm: float) -> None:
+    assert noise_dbm(bandwidth_mhz, 7.0) == pytest.approx(dbm, abs=0.05)
+
+
+def test_snr_without_shadowing_is_the_link_budget() -> None:
+    channel = Channel(Radio(shadowing_sigma_db=0.0), 2, 1, 0, 0.1)
+    snr = channel.advance(CROSS_M[:2])
+    assert snr[0, 1] == pytest.approx(20.0 - float(path_loss_db(20.0, 5.2, 2.1)) - noise_dbm(80, 7.0))
+    assert np.isnan(np.diag(snr)).all()
+    extra = np.array([[0.0, 30.0], [0.0, 0.0]])
+    again = channel.advance(CROSS_M[:2], extra)
+    np.testing.assert_allclose((snr - again)[[0, 1], [1, 0]], [30.0, 0.0], atol=1e-9)
+
+
+def test_a_jammer_adds_its_received_power_to_the_noise() -> None:
+    channel = Channel(Radio(shadowing_sigma_db=0.0), 2, 1, 0, 0.1)
+    clear = channel.advance(CROSS_M[:2])
+    where = (20.0, 50.0, 60.0)
+    received = [20.0 - float(path_loss_db(d, 5.2, 2.1)) for d in (np.hypot(20, 50), 50.0)]
+    jammed = channel.advance(CROSS_M[:2], None, [(where, 20.0)])
+    for sender, receiver in ((0, 1), (1, 0)):
+        rise = 10 * np.log10(1 + 10 ** ((received[receiver] - channel.noise_dbm) / 10))
+        assert clear[sender, receiver] - jammed[sender, receiver] == pytest.approx(rise)
+
+
+def _shadowing(frames: int) -> np.ndarray:
+    channel = Channel(Radio(), 6, 3, 0, 0.1)
+    rows = []
+    for _ in range(frames):
+        channel.advance(CROSS_M)
+        rows.append(channel.shadow_db[np.triu_indices(6, 1)])
+    return np.array(rows)
+
+
+def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> None:
+    channel = Channel(Radio(), 6, 3, 0, 0.1)
+    channel.advance(CROSS_M)
+    channel.advance(CROSS_M)
+    np.testing.assert_array_equal(channel.shadow_db, channel.shadow_db.T)
+    x = _shadowing(12_000)  # 1200 s × 15 pairs, about 2000 independent values
+    assert x.std() == pytest.approx(3.5, rel=0.08)
+    lagged = (x[:-10] * x[10:]).mean() / x.var()
+    assert lagged == pytest.approx(np.exp(-1 / 4.5), abs=0.03)  # 0.80 at one second
+
+
+def test_fading_is_rician_in_mean_and_outage() -> None:
+    channel = Channel(Radio(rician_k_db=8.0), 6, 3, 0, 0.1)
+    gains = []
+    for _ in range(4000):
+        channel.advance(CROSS_M)
+        gains.append(10 ** (channel.fade_db[~np.eye(6, dtype=bool)] / 10))
+    envelope = np.sqrt(np.array(gains).ravel())  # 120,000 values
+    k = 10**0.8
+    rice = stats.rice(b=np.sqrt(2 * k), scale=np.sqrt(1 / (2 * (k + 1))))
+    assert envelope.mean() == pytest.approx(rice.mean(), rel=2e-3)
+    assert (envelope**2).mean() == pytest.approx(1.0, rel=4e-3)
+    for depth_db in (-3.0, -6.0, -9.0):
+        outage = rice.cdf(10 ** (depth_db / 20))
+        assert (envelope < 10 ** (depth_db / 20)).mean() == pytest.approx(outage, abs=4 * np.sqrt(outage / 120_000))
+
+
+def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None:
+    five, six = Channel(Radio(), 5, 9, 2, 0.1), Channel(Radio(), 6, 9, 2, 0.1)
+    for _ in range(1100):  # past the first block of draws
+        a, b = five.advance(CROSS_M[:5]), six.advance(CROSS_M)
+        np.testing.assert_array_equal(a, b[:5, :5])
+        np.testing.assert_array_equal(five.fade_db, six.fade_db[:5, :5])
+        np.testing.assert_array_equal(five.group_reach_bytes, six.group_reach_bytes[:5, :5])
+    other = Channel(Radio(), 5, 9, 3, 0.1)
+    assert not np.array_equal(other.advance(CROSS_M[:5]), a, equal_nan=True)
+
+
+def test_group_frames_arrive_as_often_as_their_per_says() -> None:
+    config = Radio(shadowing_sigma_db=0.0, rician_k_db=40.0)
+    channel = Channel(config, 2, 1, 0, 0.1)
+    loss_db = 20.0 - float(path_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) + 0.94 - 0.1
+    extra = np.full((2, 2), loss_db)  # leaves 0.1 dB above s50 in the primary 20 MHz
+    fade_db = stats.norm(0, 10 / np.log(10) * np.sqrt(2 / 1e4))  # what K = 40 dB leaves of it
+    for length in (304, 1458):
+        heard, again = [], []
+        for _ in range(6000):
+            channel.advance(CROSS_M[:2], extra)
+            heard.append(channel.group_reach_bytes[0, 1] >= length)
+            again.append(channel.reach_again(0, 1)[1] >= length)
+        expected = integrate.quad(
+            lambda g, n=length, fade_db=fade_db: (1 - per(-0.84 + g, 0, n)) * fade_db.pdf(g), -0.5, 0.5
+        )[0]
+        assert np.mean(heard) == pytest.approx(expected, abs=0.025)
+        assert np.mean(again) == pytest.approx(expected, abs=0.025)
+
+
+def test_wrong_shapes_are_refused() -> None:
+    channel = Channel(Radio(), 2, 1, 0, 0.1)
+    with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(2, 3\)"):
+        channel.advance(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="positions_m holds a value that is not finite"):
+        channel.advance(np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"):
+        channel.advance(np.zeros((2, 3)), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="n_drones is 0, must be at least 1"):
+        Channel(Radio(), 0, 1, 0, 0.1)
+    with pytest.raises(ValueError, match=r"frame_s is 0\.0, must be > 0"):
+        Channel(Radio(), 1, 1, 0, 0.0)
+
+
+# --- rates -----------------------------------------------------------------------------------------
+
+
+def test_per_is_a_half_at_s50_and_scales_with_length() -> None:
+    assert per(14.78, 5) == pytest.approx(0.5)
+    assert per(14.78, 5, 2 * 1458) == pytest.approx(0.75)
+    assert rescale(0.5, 2.0) == pytest.approx(0.75)
+    assert per(-500.0, 11) == 1.0
+    assert per(500.0, 0) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("k_db", [0.0, 12.0])
+@pytest.mark.parametrize(("snr_db", "mcs"), [(6.0, 1), (20.0, 7), (33.0, 11)])
+def test_mean_per_is_the_average_over_a_rice_envelope(k_db: float, snr_db: float, mcs: int) -> None:
+    k = 10 ** (k_db / 10)
+    rice = stats.rice(b=np.sqrt(2 * k), scale=np.sqrt(1 / (2 * (k + 1))))
+    r = np.linspace(1e-4, 4.0, 400_001)
+    values = np.array([per(snr_db + g, mcs, 1494) for g in 20 * np.log10(r[::20])])
+    expected = integrate.trapezoid(values * rice.pdf(r[::20]), r[::20])
+    table = rate_table(80, k_db, 1494)
+    assert table.all_per[mcs][table.index(snr_db)] == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_chosen_mcs_has_the_highest_goodput() -> None:
+    table = rate_table(80, 12.0)
+    for snr_db in np.arange(-1.5, 45.0, 0.5):
+        mcs, rate, mean_per = choose_mcs(snr_db, 80, 12.0)
+        goodputs = [r * (1 - table.all_per[m][table.index(snr_db)]) for m, r in enumerate(RATES_MBPS[80])]
+        assert rate * (1 - mean_per) == max(goodputs)
+        assert goodputs[mcs] == max(goodputs)
+
+
+def test_no_link_below_mcs_zero_and_the_top_rate_above() -> None:
+    assert choose_mcs(-30.0, 80, 12.0) == (-1, 0.0, 1.0)
+    assert choose_mcs(200.0, 80, 12.0)[:2] == (11, 600.5)
+    table = rate_table(20, 12.0)
+    edge = table.mcs.index(0)
+    assert table.all_per[0][edge] <= NO_LINK_PER < table.all_per[0][edge - 1]
+
+
+def test_basic_rates_borrow_the_curve_of_their_modulation() -> None:
+    assert [group_mcs(r) for r in LEGACY_RATES_MBPS] == [0, 1, 2, 3, 4, 5, 6]
+    assert (group_mcs(1.0), group_mcs(9.0)) == (0, 1)
