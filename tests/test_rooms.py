@@ -28,7 +28,7 @@ MAY_IMPORT = {
 HOMES = {
     "simpy": ("sim/*", "fleet/agent.py", "radio/medium.py", "radio/air.py"),
     "torch": ("perception/*",),
-    "rerun": ("sim/playback.py",),
+    "rerun": ("sim/playback.py", "sim/playback_*.py"),
     "pymavlink": ("fleet/mavlink.py",),
     "yaml": ("scenarios/load.py",),
 }
@@ -107,7 +107,7 @@ def test_every_package_at_the_root_is_a_room() -> None:
         ("fleet/motion.py", "import simpy", "simpy is at home in sim/*, fleet/agent.py, radio/medium.py, radio/air.py"),
         ("policies/worked.py", "import torch", "torch is at home in perception/*"),
         ("sim/sortie.py", "from torch import nn", "torch is at home in perception/*"),
-        ("sim/sortie.py", "import rerun as rr", "rerun is at home in sim/playback.py"),
+        ("sim/sortie.py", "import rerun as rr", "rerun is at home in sim/playback.py, sim/playback_*.py"),
         ("fleet/agent.py", "from pymavlink.dialects import v20", "pymavlink is at home in fleet/mavlink.py"),
         ("scenarios/nodes.py", "import yaml", "yaml is at home in scenarios/load.py"),
         ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import scenarios.load as loader
 from scenarios.load import ScenarioError, dump, library, load, loads
-from scenarios.schema import Scenario
+from scenarios.schema import Policy, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
 PARSERS = {"python": yaml.SafeLoader, "libyaml": getattr(yaml, "CSafeLoader", None)}
@@ -316,6 +316,32 @@ def test_a_dumped_scenario_loads_to_an_equal_one(
     again = loads(dump(scenario))
     assert again == scenario
     assert {k: type(v) for k, v in again.policy.params.items()} == {k: type(v) for k, v in params.items()}
+
+
+LOOK_ALIKES = [
+    *AMBIGUOUS,
+    "0.5",
+    "1e3",
+    ".5",
+    "5.",
+    "true",
+    "FALSE",
+    "null",
+    "~",
+    "",
+    ".inf",
+    ".NaN",
+    "9" * 40,
+    "1e999",
+    "<<",
+    "y",
+]
+
+
+@pytest.mark.parametrize("text", LOOK_ALIKES)
+def test_text_that_looks_like_something_else_comes_back_as_text(text: str) -> None:
+    scenario = Scenario(name="a", description=text, policy=Policy(params={"v": text, "k" + text: 1}))
+    assert loads(dump(scenario)) == scenario
 
 
 # --- the library ---------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scenarios import reference
-from scenarios.load import library
+from scenarios.load import library, loads
 from scenarios.schema import Scenario
 
 REMEDY = "run python -m scenarios.reference"
@@ -22,6 +22,12 @@ def test_the_readmes_tables_are_current() -> None:
     readme = (reference.HERE / "README.md").read_text("utf-8")
     assert readme == reference.readme_text(readme), REMEDY
     assert reference.fields_markdown() in readme
+
+
+def test_the_readmes_example_is_a_scenario() -> None:
+    readme = (reference.HERE / "README.md").read_text("utf-8")
+    example = readme.partition("```yaml\n")[2].partition("```")[0]
+    assert loads(example).name == "over_the_valley"
 
 
 def test_every_field_of_the_schema_is_described() -> None:
