@@ -57,7 +57,9 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
 def _lower_of(current: Directive, proposed: Directive) -> Directive:
     """The directive that is nowhere above either: what may be enforced at once."""
     if current.representation == Representation.NONE:
-        return current  # nothing flows, so there is nothing to lower
+        # Nothing flows, so the duty cycle alone can be lowered.
+        duty = min(current.duty_percent, proposed.duty_percent)
+        return current if duty == current.duty_percent else replace(current, duty_percent=duty, reason=proposed.reason)
     if proposed.representation < current.representation:
         rho, roi = proposed.rho, proposed.roi  # the budget of another rung does not bound this one
     else:

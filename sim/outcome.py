@@ -29,6 +29,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     minutes = scenario.duration_s / 60.0
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
     transitions = list(_transitions(tables["directives"]))
+    drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
     return {
         "scenario": scenario.name,
         "policy": record.policy,
@@ -37,6 +38,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "version": record.version,
         "fingerprint": record.fingerprint,
         "duration_s": scenario.duration_s,
+        "frame_s": scenario.frame_s,
         "ap50": {
             **accuracy(record),
             "detector": scenario.perception.detector,
@@ -61,7 +63,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "age_s": _percentiles(tables["ages"]["age_s"]),
         "data_age_s": _percentiles(pc.list_flatten(tables["fusions"]["ages_s"])),
         "descriptor_drops": _counts(tables["drops"]["reason"]),
-        "battery": _final_charge(tables["states"], tables["energy"], scenario.fleet.drones),
+        "battery": {d: v["soc"] for d, v in drones.items()},
+        "drones": drones,
         "energy_j": _energy(tables["energy"]),
         "switches": len(transitions) / (links * minutes) if links else None,
         "transitions": transitions,
@@ -159,15 +162,14 @@ def _miss_rate(sent: pa.Table) -> float | None:
     return _ratio(fates.get("expired", 0), known)
 
 
-def _final_charge(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, Any]:
+def _drones(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, dict[str, Any]]:
+    """Each drone at the end, and the energy it spent."""
     last = states.slice(max(0, states.num_rows - drones))
     spent = np.zeros(drones)
     np.add.at(spent, energy["drone"].to_numpy(), energy["energy_j"].to_numpy())
     return {
         str(row["drone"]): {
-            "soc": row["soc"],
-            "voltage_v": row["voltage_v"],
-            "airborne": row["airborne"],
+            **{name: row[name] for name in ("soc", "voltage_v", "airborne")},
             "energy_j": float(spent[row["drone"]]),
         }
         for row in last.to_pylist()

@@ -70,7 +70,7 @@ def outcome_table(result: dict[str, Any]) -> Table:
     causes = ", ".join(f"{c} {energy[c] / 1e3:.1f}" for c in energy if c != "total" and energy[c] > 0)
     table.add_row("energy", f"{energy['total'] / 1e3:.1f} kJ ({causes})")
     left = "  ".join(
-        f"{i}: {_percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["battery"].items()
+        f"{i}: {_percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["drones"].items()
     )
     table.add_row("charge left", left)
     if result["descriptor_drops"]:
@@ -88,16 +88,18 @@ def outcome_table(result: dict[str, Any]) -> Table:
 
 
 def transitions_table(result: dict[str, Any]) -> Table:
-    """What the gates switched, when and why; events among them."""
-    rows = [
-        (t["t_s"], f"{t['drone']} → {', '.join(map(str, t['peers']))}", f"{t['from']} → {t['to']}", t["reason"])
-        for t in result["transitions"]
-    ]
+    """What the gates switched, when and why, drones that do alike in one row; events among them."""
+    frame_s = result["frame_s"]
+    alike: dict[tuple[int, str, str], tuple[float, list[str]]] = {}
+    for t in result["transitions"]:
+        key = (int(t["t_s"] / frame_s + 1e-6), f"{t['from']} → {t['to']}", t["reason"])
+        alike.setdefault(key, (t["t_s"], []))[1].append(f"{t['drone']}→{','.join(map(str, t['peers']))}")
+    rows = [(t_s, "  ".join(sorted(who)), what, why) for (_, what, why), (t_s, who) in alike.items()]
     rows += [
         (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), f"[yellow]{e['kind']}[/yellow]", e["text"])
         for e in result["events"]
     ]
-    rows.sort(key=lambda r: r[0])
+    rows.sort(key=lambda row: row[0])
     more = len(rows) - MAX_TRANSITIONS
     table = Table(title="decisions and events", caption=f"and {more} more in outcome.json" if more > 0 else None)
     for column in ("t (s)", "who", "what", "why"):
@@ -130,7 +132,7 @@ def comparison_table(rows: Sequence[Compared]) -> Table:
         table.add_column(name, justify="left" if name == "policy" else "right")
     for r in rows:
         o = r.outcome
-        lowest = min((b["soc"] for b in o["battery"].values()), default=None)
+        lowest = min(o["battery"].values(), default=None)
         table.add_row(
             r.policy,
             number(o["ap50"]["full_scene"]),

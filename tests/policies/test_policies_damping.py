@@ -106,3 +106,11 @@ def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Direc
         state = after
     assert len(upgrades) <= 1 + 0.1 * len(asked) / dwell_s
     assert all(b - a >= dwell_s - 1e-6 for a, b in itertools.pairwise(upgrades))
+
+
+def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
+    resting = replace(NOTHING, duty_percent=20)
+    assert run(NOTHING, [resting]) == [resting]
+    assert [d.duty_percent for d in run(resting, [NOTHING] * 11)] == [20] * 10 + [100]
+    (first,) = run(NOTHING, [replace(FULL, duty_percent=20)])
+    assert (first.representation, first.duty_percent) == (Representation.NONE, 20)

@@ -1,0 +1,299 @@
+"""A sortie as a whole: one clock, the same record every time, and effects where the scenario asks for them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from sim_examples import example
+
+from policies.contract import Directive, PolicyError
+from scenarios.load import load
+from scenarios.schema import Scenario
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+
+@pytest.fixture(scope="module")
+def base() -> SortieRecord:
+    return run_sortie(example())
+
+
+@pytest.fixture(scope="module")
+def full_sharing() -> SortieRecord:
+    """All-to-all, whole maps: 1.05 Gb/s asked of one 80 MHz channel."""
+    return run_sortie(example(), "all-4")
+
+
+# --- determinism ---------------------------------------------------------------------------------
+
+
+def test_the_same_sortie_twice_is_the_same_record(base: SortieRecord) -> None:
+    again = run_sortie(example())
+    assert again.fingerprint == base.fingerprint
+    assert all(again.tables[name].equals(base.tables[name]) for name in base.tables if name not in WITH_NANS)
+
+
+WITH_NANS = {"descriptors", "directives", "mission", "transmissions"}  # NaN ≠ NaN; the fingerprint compares their bytes
+
+
+def test_another_process_gives_the_same_fingerprint(base: SortieRecord) -> None:
+    code = (
+        "from sim_examples import example; from sim.sortie import run_sortie; print(run_sortie(example()).fingerprint)"
+    )
+    for hash_seed in ("1", "2"):
+        printed = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True, text=True, check=True, cwd=__file__.rsplit("/", 1)[0],
+            env={"PYTHONHASHSEED": hash_seed, "PYTHONPATH": ":".join(p for p in sys.path if p)},
+        )  # fmt: skip
+        assert printed.stdout.strip() == base.fingerprint
+
+
+@pytest.mark.parametrize("change", [{"seed": 2}, {"replication": 1}, {"policy": "silence"}])
+def test_seed_replication_and_policy_make_another_record(base: SortieRecord, change: dict[str, object]) -> None:
+    assert run_sortie(example(), **change).fingerprint != base.fingerprint
+
+
+def test_a_sixth_drone_leaves_the_first_five_as_they_were(base: SortieRecord) -> None:
+    six = run_sortie(example("fleet.drones=6"))
+    columns = ["t_s", "drone", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "p_radps", "q_radps", "r_radps"]
+    ours = base.tables["states"].select(columns)
+    theirs = six.tables["states"].filter(pc.less(six.tables["states"]["drone"], 5)).select(columns)
+    assert theirs.equals(ours)
+    first = six.tables["descriptors"].filter(pc.less(six.tables["descriptors"]["drone"], 5))
+    assert first["t_s"].to_pylist() == base.tables["descriptors"]["t_s"].to_pylist(), "when they publish"
+
+
+def test_an_observer_changes_nothing(base: SortieRecord) -> None:
+    seen: list[pa.Table] = []
+
+    class Watcher:
+        def begin(self, scenario: Scenario, scene: object) -> None: ...
+
+        def second(self, t_s: float, new: dict[str, pa.Table]) -> None:
+            seen.append(new["states"])
+
+    assert run_sortie(example(), observer=Watcher(), progress=lambda t_s: None).fingerprint == base.fingerprint
+    assert pa.concat_tables(seen).num_rows == base.tables["states"].num_rows, "every row is streamed once"
+
+
+# --- the clock -----------------------------------------------------------------------------------
+
+
+def test_the_end_is_exclusive(base: SortieRecord) -> None:
+    t_s = base.tables["states"]["t_s"].to_numpy()
+    assert len(np.unique(t_s)) == 60
+    assert t_s.max() == pytest.approx(5.9)
+    one_frame = run_sortie(example("duration_s=0.1", "mission.phases=[{at_s: 0, phase: search}]"))
+    assert one_frame.tables["states"].num_rows == 5
+
+
+def test_every_drone_publishes_once_a_frame(base: SortieRecord) -> None:
+    published = base.tables["descriptors"]
+    assert published.num_rows == 5 * 60
+    assert set(published["wire_bytes"].to_pylist()) <= {208, 210}, "180 B and 28 B; 2 B more with the target's id"
+    assert not base.tables["drops"].num_rows
+
+
+def test_nothing_polls() -> None:
+    """Events grow with what happens, not with time: a silent fleet needs a handful a drone and frame."""
+    import simpy
+
+    steps = 0
+    step = simpy.Environment.step
+
+    def counted(env: simpy.Environment) -> None:
+        nonlocal steps
+        steps += 1
+        step(env)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simpy.Environment, "step", counted)
+        run_sortie(example(), "silence")
+    assert steps < 60 * (5 * 4 + 3)
+
+
+# --- traffic -------------------------------------------------------------------------------------
+
+
+def test_bytes_are_conserved(full_sharing: SortieRecord) -> None:
+    o = outcome(full_sharing)["bytes"]
+    assert o["data_sent"] == sum(o[f"data_{s}"] for s in ("delivered", "lost", "expired", "in_flight"))
+    assert o["data_sent"] == full_sharing.totals["data_sent_bytes"]
+    assert o["context_sent"] == o["context_descriptors"] + o["context_directives"]
+    assert o["data_in_flight"] > 0, "the end cuts through traffic"
+
+
+def test_full_sharing_does_not_fit_into_the_channel(full_sharing: SortieRecord) -> None:
+    o = outcome(full_sharing)
+    assert o["medium_busy_fraction"] > 0.85
+    assert o["deadline_miss_rate"] > 0.5
+    sent = full_sharing.tables["transmissions"]
+    queued_s = pc.subtract(sent["t_start_s"], sent["t_sent_s"]).to_numpy()
+    assert np.nanmax(queued_s) > 0.05, "the record shows the queue"
+    assert "replaced" in set(sent["reason"].to_pylist()), "a newer frame takes the place of one that still waits"
+
+
+def test_a_small_budget_fits() -> None:
+    o = outcome(run_sortie(example("policy.name=all-4", "policy.params={rho: 0.02}")))
+    assert o["deadline_miss_rate"] == 0.0
+    assert o["bytes"]["data_delivered"] > 0.99 * (o["bytes"]["data_sent"] - o["bytes"]["data_in_flight"])
+
+
+def test_deliveries_come_after_the_compute_delay_and_before_the_deadline(base: SortieRecord) -> None:
+    sent = base.tables["transmissions"].filter(pc.equal(base.tables["transmissions"]["status"], "delivered"))
+    age_s = pc.subtract(sent["t_done_s"], sent["captured_s"]).to_numpy()
+    assert age_s.min() > 0.03
+    assert (sent["t_done_s"].to_numpy() <= sent["deadline_s"].to_numpy() + 1e-9).all()
+
+
+# --- decisions -----------------------------------------------------------------------------------
+
+
+def decisions(record: SortieRecord, **where: object) -> list[dict[str, object]]:
+    return [r for r in record.tables["directives"].to_pylist() if all(r[k] == v for k, v in where.items())]
+
+
+def test_the_papers_three_transitions() -> None:
+    record = run_sortie(load("paper_replay", ["perception.detector=none"]))
+    o = outcome(record)
+    # Drone 1's battery falls through 60 % and 30 %.
+    charge = {row["t_s"]: row["soc"] for row in record.tables["descriptors"].to_pylist() if row["drone"] == 1}
+    for threshold, rate_hz, rung, reason in (
+        (0.6, 5.0, "features", "battery < 60 %"),
+        (0.3, 2.0, "detections", "battery < 30 %"),
+    ):
+        crossed_s = next(t_s for t_s, soc in charge.items() if soc < threshold)
+        first = decisions(record, drone=1, peer=0, representation=rung, rate_hz=rate_hz, reason=reason)
+        late = decisions(record, drone=1, peer=0, representation=rung, rate_hz=rate_hz)
+        got = (first or [r for r in late if str(r["reason"]).startswith(reason)])[0]
+        assert got["t_s"] == crossed_s, "decided on the very descriptor that crossed the threshold"
+    # The phase changes at 45 s: the payload falls about tenfold.
+    search, track = o["phases"]
+    assert 8 < search["feature_payload_bytes"] / track["feature_payload_bytes"] < 16
+    confined = [t for t in o["transitions"] if "in 32 m" in t["to"] and "in 32 m" not in t["from"]]
+    assert min(t["t_s"] for t in confined) == pytest.approx(45.0, abs=0.02)
+    assert "track: ROI 32 m" in confined[0]["reason"]
+    # Drone 2's links drop at 60 s: its outgoing links carry detections within one descriptor period.
+    dropped = next(t for t in o["transitions"] if t["drone"] == 2 and t["t_s"] >= 60.0)
+    assert dropped["t_s"] <= 60.0 + 0.1 + 0.02
+    assert dropped["to"].startswith("detections at 2 Hz")
+    assert dropped["reason"].startswith("goodput")
+
+
+def test_a_lost_drone_degrades_and_detaches() -> None:
+    record = run_sortie(
+        example("events=[{kind: drone_lost, drone: 2, at_s: 3.0}]", "policy.name=all-4", "policy.params={rho: 0.02}")
+    )
+    rows = decisions(record, drone=0, peer=2)
+    degraded = next(r for r in rows if r["link"] == "degraded")
+    detached = next(r for r in rows if r["link"] == "detached")
+    assert degraded["representation"] == "detections"
+    assert degraded["t_s"] == pytest.approx(3.0 + 0.3, abs=0.11), "more than three periods after the last one"
+    assert detached["representation"] == "none"
+    assert detached["t_s"] == pytest.approx(3.0 + 1.0, abs=0.11)
+    assert str(detached["reason"]).startswith("detached: descriptor")
+    after = [r for r in record.tables["transmissions"].to_pylist() if r["drone"] == 2 and r["t_sent_s"] > 3.0]
+    assert after == []
+
+
+def test_a_skewed_clock_looks_stale() -> None:
+    record = run_sortie(example("events=[{kind: clock_skew, drone: 2, at_s: 2.0, skew_s: -0.5}]"))
+    assert {r["link"] for r in decisions(record, drone=0, peer=2) if r["t_s"] > 2.2} >= {"degraded"}
+    assert all(r["link"] == "fresh" for r in decisions(record, drone=0, peer=1))
+
+
+@pytest.mark.parametrize(
+    ("attack", "reason"),
+    [
+        ("forged", "unknown_key|forged"),
+        ("replayed", "replayed"),
+        ("malformed", "unknown_key|forged"),
+        ("oversized", "oversized"),
+    ],
+)
+def test_bad_datagrams_are_counted_by_reason_and_change_nothing(base: SortieRecord, attack: str, reason: str) -> None:
+    attacked = run_sortie(example(f"events=[{{kind: spoof, drone: 0, at_s: 1.0, attack: {attack}, rate_hz: 20}}]"))
+    drops = outcome(attacked)["descriptor_drops"]
+    assert set(drops) <= set(reason.split("|"))
+    assert sum(drops.values()) == pytest.approx(4 * 20 * 5, abs=8)
+    for name in set(base.tables) - {"drops", "events"} - WITH_NANS:
+        assert attacked.tables[name].equals(base.tables[name]), f"the attack changed {name}"
+
+
+def test_without_authentication_a_forged_descriptor_is_believed(base: SortieRecord) -> None:
+    open_plane = ("context.authentication=false",)
+    honest = run_sortie(example(*open_plane))
+    attack = "events=[{kind: spoof, drone: 0, at_s: 1.0, attack: forged, rate_hz: 20}]"
+    attacked = run_sortie(example(*open_plane, attack))
+    assert set(honest.tables["descriptors"]["wire_bytes"].to_pylist()) <= {180, 182}
+    assert not attacked.tables["drops"].num_rows
+    assert attacked.fingerprint != honest.fingerprint
+
+
+def test_a_drone_lands_at_its_landing_charge() -> None:
+    record = run_sortie(example("fleet.overrides=[{drone: 3, capacity_wh: 2, initial_soc: 0.3}]"))
+    (event,) = record.tables["events"].to_pylist()
+    assert (event["drone"], event["kind"]) == (3, "landed")
+    states = [r for r in record.tables["states"].to_pylist() if r["drone"] == 3]
+    assert min(r["soc"] for r in states) >= 0
+    assert [r["airborne"] for r in states] == sorted((r["airborne"] for r in states), reverse=True)
+    silent_from_s = event["t_s"]
+    assert not [r for r in record.tables["descriptors"].to_pylist() if r["drone"] == 3 and r["t_s"] > silent_from_s]
+
+
+def test_a_battery_fault_takes_its_energy_and_is_in_the_ledger() -> None:
+    o = outcome(run_sortie(example("events=[{kind: battery_fault, drone: 1, at_s: 2.0, lost_fraction: 0.5}]")))
+    assert o["energy_j"]["fault"] > 0.4 * 130 * 3600 * 0.9
+    assert o["battery"]["1"] < 0.6 < o["battery"]["0"]
+
+
+def test_jam_and_link_drop_end_when_they_should(base: SortieRecord) -> None:
+    def snr(record: SortieRecord, begin_s: float, end_s: float) -> float:
+        sent = record.tables["transmissions"]
+        keep = pc.and_(pc.greater_equal(sent["t_sent_s"], begin_s), pc.less(sent["t_sent_s"], end_s))
+        keep = pc.and_(keep, pc.equal(sent["drone"], 2))
+        return float(np.nanmean(sent.filter(keep)["snr_db"].to_numpy()))
+
+    for event in ("kind: link_drop, drone: 2, loss_db: 15", "kind: jam, position_m: [-60, 0, 60], power_dbm: 0"):
+        hit = run_sortie(example(f"events=[{{at_s: 2.0, until_s: 4.0, {event}}}]"))
+        assert snr(hit, 1.0, 2.0) == pytest.approx(snr(base, 1.0, 2.0))
+        assert snr(hit, 2.2, 4.0) < snr(base, 2.2, 4.0) - 5
+        assert snr(hit, 4.2, 6.0) > snr(hit, 2.2, 4.0) + 5
+        assert len(outcome(hit)["events"]) == 2
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+def test_a_policy_that_breaks_the_contract_stops_the_sortie_with_its_name() -> None:
+    def greedy(view: object) -> list[Directive]:
+        return [Directive(view.ego, p, rho=7.0) for p in view.peers]  # type: ignore[attr-defined]
+
+    with pytest.raises(PolicyError, match=r"directive \d→\d: rho is 7.0, must be in \[0, 1\]"):
+        run_sortie(example(), greedy)
+
+
+def test_one_drone_flies_alone() -> None:
+    o = outcome(run_sortie(example("fleet.drones=1")))
+    assert o["bytes"]["data_sent"] == 0
+    assert o["deadline_miss_rate"] is None
+    assert o["switches"] is None
+
+
+def test_duty_cycle_rests_the_computer() -> None:
+    def resting(view: object) -> list[Directive]:
+        return [Directive(view.ego, p, duty_percent=20) for p in view.peers]  # type: ignore[attr-defined]
+
+    def awake(view: object) -> list[Directive]:
+        return [Directive(view.ego, p) for p in view.peers]  # type: ignore[attr-defined]
+
+    rested, worked = (outcome(run_sortie(example(), p))["energy_j"]["compute"] for p in (resting, awake))
+    idle = 5 * 6 * 10.0
+    assert rested - idle == pytest.approx(0.2 * (worked - idle), rel=0.15)
