@@ -450,7 +450,7 @@ class Air:
         else:
             s.left = lost
             wait_s = self._config.heartbeat_s + self._config.nack_delay_s
-            wait_s = min(wait_s, s.deadline_s - self._env.now)
+            wait_s = max(0.0, min(wait_s, s.deadline_s - self._env.now))
             self._env.timeout(wait_s, s).callbacks.append(self._repair)
 
     @staticmethod
