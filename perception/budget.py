@@ -1,4 +1,9 @@
-"""The cell budget: which cells a peer may send, and what they weigh in bytes. Free of torch."""
+"""The cell budget: which cells a peer may send, and what they weigh in bytes. Free of torch.
+
+A sender fills its region of interest first: it ranks the cells whose centres lie in the disc, by its own
+confidence or by feature norm, and sends the best ⌊ρ · 4096⌋ of them. How *many* cells that is follows from
+pose and directive alone, so traffic is exact without running the detector.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,10 @@ CELLS = GRID * GRID
 CELL_M = 3.2
 CHANNELS = 80
 DETECTION_BYTES = 24
+"""One detection: x, y, length, width, yaw, score as float32."""
 TRACK_BYTES = 20
+"""One track: x, y, vx, vy as float32, id, class and score packed in 4 B."""
+MAX_TRACKS = 12
 
 
 def payload_bytes(cells: int) -> int:
@@ -65,3 +73,36 @@ def _span(centre_m: float, radius_m: float) -> slice:
     low = math.floor((centre_m - radius_m) / CELL_M) + GRID // 2
     high = math.ceil((centre_m + radius_m) / CELL_M) + GRID // 2
     return slice(min(max(low, 0), GRID), min(max(high, 0), GRID))
+
+
+def select(
+    rank: np.ndarray, rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float
+) -> np.ndarray:
+    """[64, 64] bool: the cells that are sent, exactly `cells_sent` of them.
+
+    Args:
+        rank: [64, 64] what ranks the cells (confidence or norm), higher first; ties go to the lower index.
+        rho, roi, x_m, y_m, yaw_rad: as for `cells_sent`.
+    """
+    allowed = roi_mask(roi, x_m, y_m, yaw_rad).ravel()
+    count = cells_sent(rho, roi, x_m, y_m, yaw_rad)
+    out = np.zeros(CELLS, bool)
+    if count:
+        order = np.argsort(np.where(allowed, -rank.ravel().astype(np.float64), np.inf), kind="stable")
+        out[order[:count]] = True
+    return out.reshape(GRID, GRID)
+
+
+def payload(representation: str, *, cells: int = 0, boxes: int = 0) -> int:
+    """Content bytes of one share: features with their index, detections, or tracks (at most 12).
+
+    Raises:
+        ValueError: another representation, naming it.
+    """
+    if representation == "features":
+        return payload_bytes(cells) + index_bytes(cells)
+    if representation == "detections":
+        return boxes * DETECTION_BYTES
+    if representation == "tracks":
+        return min(boxes, MAX_TRACKS) * TRACK_BYTES
+    raise ValueError(f"representation is {representation!r}, must be features, detections or tracks")

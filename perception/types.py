@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +25,17 @@ class Capture:
     """Where it believed it was, ENU."""
     est_yaw_rad: float
     """The heading it believed, from east towards north."""
+
+    @property
+    def est_pose(self) -> tuple[float, float, float]:
+        """x, y, yaw as believed: what places its features and boxes in the world."""
+        return self.est_position_m[0], self.est_position_m[1], self.est_yaw_rad
+
+    @property
+    def true_yaw_rad(self) -> float:
+        """The heading it had."""
+        x, y, z, w = self.orientation_xyzw
+        return float(np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +56,49 @@ class Share:
 class Boxes:
     """Oriented boxes on the ground, world frame ENU; float32 arrays over n boxes."""
 
-    xy_m: np.ndarray
+    xy_m: NDArray[Any]
     """[n, 2] centres."""
-    size_m: np.ndarray
+    size_m: NDArray[Any]
     """[n, 2] length, width."""
-    yaw_rad: np.ndarray
+    yaw_rad: NDArray[Any]
     """[n]"""
-    score: np.ndarray
+    score: NDArray[Any]
     """[n]; ones for ground truth."""
 
     def __len__(self) -> int:
         return len(self.score)
+
+    def take(self, which: NDArray[Any]) -> Boxes:
+        """The boxes at the given indices or under the given mask, in that order."""
+        return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which])
+
+    def inside(self, disc: tuple[float, float, float] | None) -> Boxes:
+        """The boxes whose centres are in the disc (x, y, radius); all of them for None."""
+        if disc is None:
+            return self
+        dx, dy = self.xy_m[:, 0] - disc[0], self.xy_m[:, 1] - disc[1]
+        return self.take(dx * dx + dy * dy <= disc[2] ** 2)
+
+    def table(self) -> NDArray[np.float64]:
+        """[n, 5] float64: x, y, length, width, yaw."""
+        return np.concatenate([self.xy_m, self.size_m, self.yaw_rad[:, None]], axis=1).astype(np.float64)
+
+    @classmethod
+    def empty(cls) -> Boxes:
+        """No boxes."""
+        return cls(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0, 2), 0, 0)))
+
+    @classmethod
+    def join(cls, several: Sequence[Boxes]) -> Boxes:
+        """All boxes of several, in order."""
+        if not several:
+            return cls.empty()
+        return cls(*(np.concatenate([getattr(b, f) for b in several]) for f in cls.__slots__))
+
+    @classmethod
+    def placed(cls, local: NDArray[Any], pose: tuple[float, float, float]) -> Boxes:
+        """Boxes [n, 6] of a drone's frame (x forward, y left, length, width, yaw, score), put into the world by its pose (x, y, yaw)."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        x, y = local[:, 0], local[:, 1]
+        xy = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=1)
+        return cls(*(a.astype(np.float32) for a in (xy, local[:, 2:4], local[:, 4] + pose[2], local[:, 5])))

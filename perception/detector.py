@@ -1,0 +1,180 @@
+"""The detector as a sortie uses it: render when asked, encode once, fuse what was delivered, find the cars.
+
+A capture costs nothing until a job needs it. Features, confidences and single-drone boxes of a capture are
+kept for the latest 64 captures, so a frame that is shared to four peers is rendered and encoded once. Every
+network call has the same shapes whatever else is asked for, so the same capture gives the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from perception import budget
+from perception.ap import suppress
+from perception.bev import HALF_EXTENT_M, lift
+from perception.model import CELLS, decode, load_weights, warp
+from perception.render import Renderer
+from perception.scene import SceneModel
+from perception.town import Bytes
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception
+
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "disconet.safetensors"
+NMS_IOU = 0.15
+KEPT_CAPTURES = 64
+
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth"]
+
+
+def ground_truth(
+    scene: SceneModel,
+    t_s: float,
+    centre_xy: tuple[float, float],
+    half_extent: float = HALF_EXTENT_M,
+    yaw_rad: float = 0.0,
+) -> Boxes:
+    """The cars at `t_s` whose centres lie in the square about `centre_xy` (ENU, m) that is turned by `yaw_rad`.
+
+    Every such car counts, also one that no drone could see. Scores are 1.
+    """
+    cars = scene.cars_at(t_s)
+    dx, dy = cars.x_m - centre_xy[0], cars.y_m - centre_xy[1]
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    cars = cars.where((np.abs(c * dx + s * dy) < half_extent) & (np.abs(c * dy - s * dx) < half_extent))
+    columns = (
+        np.stack([cars.x_m, cars.y_m], 1),
+        np.stack([cars.length_m, cars.width_m], 1),
+        cars.yaw_rad,
+        np.ones(len(cars)),
+    )
+    return Boxes(*(column.astype(np.float32) for column in columns))
+
+
+@dataclass(slots=True)
+class _Encoded:
+    """What is known of one capture: its features [80, 64, 64], and, when asked for, what it finds alone."""
+
+    features: Tensor
+    out: Tensor | None = None
+    boxes: Boxes | None = None
+
+
+class TorchDetector:
+    """The network over one scene.
+
+    Args:
+        scene: what there is to see.
+        config: the scenario's `perception` section.
+        seed: the sortie's seed (sensor noise follows from it).
+        weights: a safetensors file; None takes the shipped one.
+
+    Raises:
+        ValueError: weights that are missing or do not fit, naming file and tensor.
+
+    It computes on the CPU with as many threads as torch is set to (`torch.set_num_threads`), and sets none itself.
+    """
+
+    def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
+        self._scene, self._config = scene, config
+        self._net = load_weights(SHIPPED_WEIGHTS if weights is None else weights)
+        self._renderer = Renderer(scene, seed)
+        self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
+
+    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
+        """Each ego's boxes from its own features and what it was sent, ENU, best first.
+
+        A late share is used as it is: the sender's pose at its capture places it, what has moved since lags.
+        """
+        with torch.inference_mode():
+            self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
+            return [self._fuse(ego, shares) for ego, shares in jobs]
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
+        return ground_truth(self._scene, t_s, ego.position_m[:2], HALF_EXTENT_M, ego.true_yaw_rad)
+
+    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+        """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
+        with torch.inference_mode():
+            self._encode([capture])
+            return len(self._alone(capture).inside(roi))
+
+    def camera_views(self, capture: Capture) -> Bytes:
+        """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
+        views: Bytes = self._renderer.render([capture])[0]
+        return views
+
+    def _encode(self, captures: Iterable[Capture]) -> None:
+        """Render and encode what is not kept yet; then drop the oldest beyond the limit."""
+        wanted = list(dict.fromkeys(captures))
+        missing = [c for c in wanted if c not in self._kept]
+        images = lift(self._renderer.render(missing), missing)
+        for capture, image in zip(missing, images, strict=True):
+            self._kept[capture] = _Encoded(self._net.encoder(image[None])[0])
+        for capture in wanted:
+            self._kept.move_to_end(capture)
+        while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
+            self._kept.popitem(last=False)
+
+    def _alone(self, capture: Capture) -> Boxes:
+        """The capture's own single-drone boxes."""
+        kept = self._kept[capture]
+        if kept.boxes is None:
+            kept.boxes = self._place(self._head_alone(kept), capture)
+        return kept.boxes
+
+    def _head_alone(self, kept: _Encoded) -> Tensor:
+        if kept.out is None:
+            kept.out = self._net.head(kept.features[None])[0]
+        return kept.out
+
+    def _place(self, out: Tensor, capture: Capture) -> Boxes:
+        local = decode(out, self._config.score_threshold).numpy()
+        return suppress(Boxes.placed(local, capture.est_pose), NMS_IOU)
+
+    def _sent(self, share: Share) -> Tensor:
+        """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""
+        if share.representation == "raw":
+            return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
+        kept = self._kept[share.capture]
+        if share.rho >= 1.0 and share.roi is None:
+            rank = np.zeros((CELLS, CELLS))
+        elif self._config.cells_by == "norm":
+            rank = kept.features.norm(dim=0).numpy()
+        else:
+            rank = F.max_pool2d(self._head_alone(kept)[:1], 2)[0].numpy()
+        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose))[None]
+
+    def _fuse(self, ego: Capture, shares: Sequence[Share]) -> Boxes:
+        maps = [s for s in shares if s.representation in ("features", "raw")]
+        if not maps:
+            own = self._alone(ego)
+        else:
+            features = torch.stack([self._kept[s.capture].features for s in maps])
+            # relative to the ego, so that float32 keeps millimetres kilometres from the origin
+            x, y, yaw = ego.est_pose
+            poses = [(s.capture.est_pose[0] - x, s.capture.est_pose[1] - y, s.capture.est_pose[2]) for s in maps]
+            sent = torch.stack([self._sent(s) for s in maps])
+            warped, arrived, inside = warp(features, sent, torch.tensor((0.0, 0.0, yaw)), torch.tensor(poses))
+            weight = torch.tensor([s.weight for s in maps])
+            own_map = self._kept[ego].features[None]
+            fused = self._net.fuse(own_map, warped, arrived, inside, weight, self._config.unsent_cells)
+            own = self._place(self._net.head(fused)[0], ego)
+        late = [self._sent_boxes(s) for s in shares if s.representation in ("detections", "tracks")]
+        return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own
+
+    def _sent_boxes(self, share: Share) -> Boxes:
+        boxes = self._alone(share.capture).inside(share.roi)
+        if share.representation == "tracks":
+            boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))  # they are best first
+        if share.weight <= 0.0:
+            return Boxes.empty()
+        return boxes

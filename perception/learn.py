@@ -1,0 +1,164 @@
+"""What a training step is: batches of frames, what the head should say about them, losses and gradients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from perception.bev import HALF_EXTENT_M
+from perception.frames import DRONES, Frames
+from perception.model import HEAD_M, HEAD_PX, REFERENCE_SIZE_M, CarNet, warp
+from scenarios.streams import stream
+
+SHARDS = 2
+SHARD_FRAMES = 2
+"""A step is two shards of two frames; each shard has a thread, a replica of the network and a batch of its own."""
+EGOS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """b frames × k agents: `images` uint8 [b, k, 4, 256, 256], `pose` (true) and `est` [b, k, 3], `cars` [b, m, 5]."""
+
+    images: Tensor
+    pose: NDArray[np.float64]
+    est: NDArray[np.float64]
+    cars: NDArray[np.float64]
+
+
+def draw_batch(frames: Frames, seed: int, step: int, shard: int) -> Batch:
+    """One shard of a step: random frames, two to five of their drones, mirrored or turned by quarters at random."""
+    k = int(stream(seed, 0, step, "train.agents").choice([2, 3, 4, 5], p=[0.25, 0.25, 0.2, 0.3]))
+    rng = stream(seed, 0, (step, shard), "train.batch")
+    which = rng.choice(len(frames.images), SHARD_FRAMES)
+    agents = np.stack([rng.permutation(DRONES)[:k] for _ in range(SHARD_FRAMES)])
+    images = torch.from_numpy(frames.images[which[:, None], agents])
+    pose, est = frames.true_pose[which[:, None], agents].copy(), frames.est_pose[which[:, None], agents].copy()
+    cars = frames.cars[which].copy()
+    if rng.random() < 0.5:  # the world in a mirror: north and south change places
+        images = images.flip(-1)
+        for table, yaw in ((pose, 2), (est, 2), (cars, 4)):
+            table[..., 1] *= -1
+            table[..., yaw] *= -1
+    for _ in range(int(rng.integers(4))):  # a heading a quarter turn to the left sees old left as forward
+        images = images.flip(-2).transpose(-1, -2)
+        pose[..., 2] += np.pi / 2
+        est[..., 2] += np.pi / 2
+    rgb = images[:, :, :3].float()
+    gain = torch.from_numpy(rng.uniform(0.85, 1.15, (SHARD_FRAMES, 1, 3, 1, 1)).astype(np.float32))
+    images = torch.cat([(rgb * gain).clamp_(0, 255).to(torch.uint8), images[:, :, 3:]], dim=2)
+    return Batch(images, pose, est, cars)
+
+
+def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The cars [n, 5] inside a drone's ±102.4 m square, in its frame (x forward, y left)."""
+    cars = cars[~np.isnan(cars[:, 0])]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = cars[:, 0] - pose[0], cars[:, 1] - pose[1]
+    x, y = c * dx + s * dy, c * dy - s * dx
+    inside = (np.abs(x) < HALF_EXTENT_M) & (np.abs(y) < HALF_EXTENT_M)
+    local: NDArray[np.float64] = np.stack([x, y, cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
+    return local[inside]
+
+
+def targets(
+    cars: NDArray[np.float64],
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """What the head should say: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
+
+    Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are asked for on the 3 × 3 cells around it.
+    """
+    heat = np.zeros((HEAD_PX, HEAD_PX), np.float32)
+    at = (cars[:, :2] + HALF_EXTENT_M) / HEAD_M - 0.5
+    nearest = np.round(at).astype(np.int64)
+    cells, values, weights = [], [], []
+    for di in range(-2, 3):
+        for dj in range(-2, 3):
+            cell = nearest + np.array([di, dj])
+            ok = ((cell >= 0) & (cell < HEAD_PX)).all(axis=1)
+            offset = at - cell
+            g = np.exp(-((offset if (di or dj) else 0.0 * offset) ** 2).sum(axis=1) / (2 * 0.8**2))
+            np.maximum.at(heat, (cell[ok, 0], cell[ok, 1]), g[ok].astype(np.float32))
+            if abs(di) <= 1 and abs(dj) <= 1:
+                size = np.log(cars[:, 2:4] / REFERENCE_SIZE_M)
+                turn = np.stack([np.sin(2 * cars[:, 4]), np.cos(2 * cars[:, 4])], axis=1)
+                cells.append(cell[ok, 0] * HEAD_PX + cell[ok, 1])
+                values.append(np.concatenate([offset, size, turn], axis=1)[ok])
+                weights.append(g[ok])
+    return (
+        heat,
+        np.concatenate(cells),
+        np.concatenate(values).astype(np.float32),
+        np.concatenate(weights).astype(np.float32),
+    )
+
+
+def loss_of(out: Tensor, labels: list[NDArray[np.float64]]) -> Tensor:
+    """Centre-point focal loss plus weighted L1 regressions, per car. `out` [n, 7, 128, 128], `labels` n tables of cars."""
+    made = [targets(cars) for cars in labels]
+    heat = torch.from_numpy(np.stack([m[0] for m in made])).to(out.device)
+    logit = out[:, 0]
+    p = logit.sigmoid().clamp(1e-4, 1 - 1e-4)
+    centre = heat >= 0.999
+    positive = -((1 - p) ** 2 * p.log())[centre].sum()
+    negative = -(((1 - heat) ** 4) * p**2 * (1 - p).log())[~centre].sum()
+    cars = max(sum(len(c) for c in labels), 1)
+    sample = np.repeat(np.arange(len(made)), [len(m[1]) for m in made])
+    cell = torch.from_numpy(np.concatenate([m[1] for m in made])).to(out.device)
+    want = torch.from_numpy(np.concatenate([m[2] for m in made])).to(out.device)
+    weight = torch.from_numpy(np.concatenate([m[3] for m in made])).to(out.device)
+    said = out[:, 1:].flatten(2)[torch.from_numpy(sample).to(out.device), :, cell]
+    scale = torch.tensor([1.0, 1.0, 0.5, 0.5, 0.4, 0.4], device=out.device)
+    regression = ((said - want).abs() * scale * weight[:, None]).sum() / weight.sum().clamp_min(1.0)
+    return (positive + negative) / cars + regression
+
+
+def gradients(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device) -> tuple[float, list[Tensor]]:
+    """Loss and gradients of one shard, in the thread that calls."""
+    if device.type == "cpu":
+        torch.set_num_threads(1)  # of this thread: shards side by side beat two threads in every operation
+    loss = step_loss(net, batch, rng, device)
+    return loss.item(), list(torch.autograd.grad(loss, list(net.parameters())))
+
+
+@torch.no_grad()
+def apply(net: CarNet, replicas: list[CarNet], grads: list[list[Tensor]], optimiser: torch.optim.Optimizer) -> None:
+    """One optimiser step on the mean gradient; then every replica is the network again, its running statistics the mean of theirs."""
+    for parameter, *each in zip(net.parameters(), *grads, strict=True):
+        parameter.grad = torch.stack(each).mean(dim=0)
+    torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+    optimiser.step()
+    for buffer, *own in zip(net.buffers(), *(r.buffers() for r in replicas), strict=True):
+        buffer.copy_(torch.stack(own).mean(dim=0) if buffer.dtype.is_floating_point else own[0])
+    for replica in replicas:
+        replica.load_state_dict(net.state_dict())
+
+
+def step_loss(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device) -> Tensor:
+    """The loss of one step: for each frame, `EGOS` drones that fuse all others and one that is alone."""
+    b, k = batch.images.shape[:2]
+    features = net.encoder(batch.images.flatten(0, 1).to(device))
+    egos = np.stack([rng.permutation(k)[:EGOS] for _ in range(b)])
+    ego = (np.arange(b)[:, None] * k + egos).ravel().repeat(k)  # one row per (frame, ego, agent)
+    agent = (np.arange(b)[:, None, None] * k + np.arange(k)[None, None, :]).repeat(EGOS, axis=1).ravel()
+    est = torch.from_numpy(batch.est.reshape(-1, 3))
+    own = torch.from_numpy(ego == agent).to(device)
+    shape = (len(agent), 1, *features.shape[2:])
+    delta = torch.stack([est[ego], est[agent]]).float()  # float64 poses are near the origin here
+    warped, sent, _ = warp(
+        features[agent], torch.ones(shape, dtype=torch.bool, device=device), delta[0].to(device), delta[1].to(device)
+    )
+    mine = own[:, None, None, None]
+    warped, sent = torch.where(mine, features[agent], warped), sent | mine
+    logit = net.edge(features[ego], warped).masked_fill(~sent, -torch.inf)
+    share = logit.view(b * EGOS, k, *logit.shape[1:]).softmax(dim=1)
+    fused = (share * warped.view(b * EGOS, k, *warped.shape[1:])).sum(dim=1)
+    alone = np.arange(b) * k + rng.integers(k, size=b)
+    out = net.head(torch.cat([fused, features[alone]]))
+    pose = batch.pose.reshape(-1, 3)
+    who = np.concatenate([ego[::k], alone])
+    return loss_of(out, [local_cars(batch.cars[i // k], pose[i]) for i in who])

@@ -1,0 +1,305 @@
+"""A procedural town without edges: every block's content follows from the scene's seed and its index alone.
+
+The world is ENU. Roads run along x = i·block_m and y = j·block_m; block (i, j) is the square between
+them and owns its buildings, trees and the kerb spots on its own sides of the four roads. Across a road,
+from its centre line: a lane to 3.2 m, kerb parking to 5.6 m, pavement to 8.1 m, then the lots.
+`Town.tile` rasterises any 102.4 m square of it; nothing is rasterised before it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.schema import Scene
+from scenarios.streams import stream
+
+Floats = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+LANE_M = 3.2
+LANE_CENTRE_M = 1.6
+KERB_M = 5.6
+PARKING_CENTRE_M = 4.35
+PAVEMENT_M = 8.1
+TREE_LINE_M = 6.9
+
+RES_M = 0.32
+"""Raster resolution, m a pixel."""
+TILE_PX = 320
+TILE_M = RES_M * TILE_PX
+_PAD_PX = 80  # 25.6 m around a tile, so that shadows cross its seams
+_SUN = (0.55, 0.35)  # shadow displacement (x, y) in metres per metre of height
+_SHADE = 0.6  # light that is left in a shadow
+
+CAR_COLOURS: Bytes = np.array(
+    [
+        (232, 232, 230),
+        (198, 200, 204),
+        (120, 122, 126),
+        (42, 43, 47),
+        (28, 44, 92),
+        (150, 28, 26),
+        (40, 92, 58),
+        (196, 170, 110),
+        (70, 120, 176),
+        (212, 106, 34),
+    ],
+    dtype=np.uint8,
+)
+_COLOUR_SHARE = np.cumsum([0.24, 0.2, 0.14, 0.16, 0.08, 0.07, 0.03, 0.03, 0.03, 0.02])
+
+
+def zigzag(index: int) -> int:
+    """Map a signed index to a non-negative one, one to one (seeds know no negative numbers)."""
+    return 2 * index if index >= 0 else -2 * index - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """The shapes of n cars: `size_m` [n, 3] (length, width, height) and `colour` [n, 3] uint8."""
+
+    size_m: Floats
+    colour: Bytes
+
+
+def draw_bodies(u: Floats) -> Bodies:
+    """Car shapes from uniform draws `u` [n, 3]: 85 % cars (3.8–5.0 m), 15 % vans (5.0–5.8 m)."""
+    van = u[:, 0] > 0.85
+    part = np.where(van, (u[:, 0] - 0.85) / 0.15, u[:, 0] / 0.85)
+    length = np.where(van, 5.0 + 0.8 * part, 3.8 + 1.2 * part)
+    width = np.where(van, 1.95 + 0.1 * u[:, 1], 1.7 + 0.25 * u[:, 1])
+    height = np.where(van, 2.0 + 0.4 * u[:, 1], 1.4 + 0.3 * u[:, 1])
+    pick = np.minimum(np.searchsorted(_COLOUR_SHARE, u[:, 2] * _COLOUR_SHARE[-1]), len(CAR_COLOURS) - 1)
+    return Bodies(np.stack([length, width, height], axis=1), CAR_COLOURS[pick])
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """What stands in one block, world coordinates, metres.
+
+    `lots` [n, 5]: x0, y0, x1, y1, tone 0…1; `buildings` [n, 6]: x0, y0, x1, y1, height, tone;
+    `trees` [n, 5]: x, y, radius, height, tone; `parked` [n, 3]: x, y, yaw; `bodies`: their shapes.
+    """
+
+    lots: Floats
+    buildings: Floats
+    trees: Floats
+    parked: Floats
+    bodies: Bodies
+
+
+def block(scene: Scene, i: int, j: int) -> Block:
+    """The content of block (i, j).
+
+    Densities are thresholds on draws that do not depend on them: a denser town keeps what a sparser
+    one with the same seed has, and adds to it.
+    """
+    rng = stream(scene.seed, 0, (zigzag(i), zigzag(j)), "town.block")
+    size = scene.block_m
+    x0, y0 = i * size, j * size
+    inner = size - 2 * PAVEMENT_M
+
+    n = max(1, int(inner // 20.0))
+    pitch = inner / n
+    gx, gy = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    u = rng.random((n * n, 8))
+    lx = x0 + PAVEMENT_M + gx.ravel() * pitch
+    ly = y0 + PAVEMENT_M + gy.ravel() * pitch
+    lots = np.stack([lx, ly, lx + pitch, ly + pitch, u[:, 7]], axis=1)
+    w, d = (0.5 + 0.4 * u[:, 1]) * pitch, (0.5 + 0.4 * u[:, 2]) * pitch
+    bx, by = lx + u[:, 3] * (pitch - w), ly + u[:, 4] * (pitch - d)
+    height = np.clip(scene.building_height_m * (0.5 + u[:, 5]), 2.5, 40.0)
+    built = u[:, 0] < scene.building_density
+    buildings = np.stack([bx, by, bx + w, by + d, height, u[:, 6]], axis=1)[built]
+
+    sides = [
+        # (start x, start y), unit vector along, lateral unit vector into the block, yaw of the adjacent lane
+        ((x0, y0), (0.0, 1.0), (1.0, 0.0), np.pi / 2),
+        ((x0 + size, y0), (0.0, 1.0), (-1.0, 0.0), -np.pi / 2),
+        ((x0, y0), (1.0, 0.0), (0.0, 1.0), np.pi),
+        ((x0, y0 + size), (1.0, 0.0), (0.0, -1.0), 0.0),
+    ]
+    tree_s = np.arange(12.0, size - 11.0, 10.0)
+    spot_s = np.arange(13.0, size - 12.0, 7.0)
+    trees, parked, bodies = [], [], []
+    for (sx, sy), along, inward, yaw in sides:
+        u = rng.random((len(tree_s), 5))
+        s, off = tree_s + 3.0 * (u[:, 1] - 0.5), TREE_LINE_M + 0.5 * (u[:, 4] - 0.5)
+        row = np.stack(
+            [
+                sx + along[0] * s + inward[0] * off,
+                sy + along[1] * s + inward[1] * off,
+                1.3 + 1.4 * u[:, 2],
+                3.5 + 5.0 * u[:, 3],
+                u[:, 4],
+            ],
+            axis=1,
+        )
+        trees.append(row[u[:, 0] < scene.tree_density])
+        may_park = rng.random() < 0.4  # elsewhere stopping is forbidden
+        u = rng.random((len(spot_s), 7))
+        s, off = spot_s + (u[:, 1] - 0.5), PARKING_CENTRE_M + 0.3 * (u[:, 2] - 0.5)
+        row = np.stack(
+            [
+                sx + along[0] * s + inward[0] * off,
+                sy + along[1] * s + inward[1] * off,
+                yaw + np.radians(4.0) * (u[:, 3] - 0.5),
+            ],
+            axis=1,
+        )
+        stands = (u[:, 0] < scene.parked_density) & may_park
+        parked.append(row[stands])
+        bodies.append(u[stands][:, 4:7])
+
+    u = rng.random((n * n, 6))
+    gardens = np.stack(
+        [
+            lx + (0.2 + 0.6 * u[:, 1]) * pitch,
+            ly + (0.2 + 0.6 * u[:, 2]) * pitch,
+            1.5 + 2.0 * u[:, 3],
+            4 + 5 * u[:, 4],
+            u[:, 5],
+        ],
+        axis=1,
+    )
+    trees.append(gardens[(u[:, 0] < scene.tree_density) & ~built])
+    return Block(lots, buildings, np.concatenate(trees), np.concatenate(parked), draw_bodies(np.concatenate(bodies)))
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """Rasters of one 102.4 m square, [row = y, column = x], 0.32 m a pixel.
+
+    `height_m` float32, `albedo` uint8 […, 3] with shadows in it, `light` float32 (1 in the sun).
+    """
+
+    height_m: FloatMap
+    albedo: Bytes
+    light: FloatMap
+
+
+class Town:
+    """Blocks and tiles of one scene, made when first asked for and kept (tiles: the latest 64)."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._blocks: dict[tuple[int, int], Block] = {}
+        self._tiles: OrderedDict[tuple[int, int], Tile] = OrderedDict()
+
+    def block(self, i: int, j: int) -> Block:
+        """Block (i, j), see `block`."""
+        found = self._blocks.get((i, j))
+        if found is None:
+            found = self._blocks[i, j] = block(self.scene, i, j)
+        return found
+
+    def blocks(self, x0: float, y0: float, x1: float, y1: float) -> list[Block]:
+        """All blocks that touch the rectangle (ENU, m)."""
+        size = self.scene.block_m
+        return [
+            self.block(i, j)
+            for i in range(int(np.floor(x0 / size)), int(np.floor(x1 / size)) + 1)
+            for j in range(int(np.floor(y0 / size)), int(np.floor(y1 / size)) + 1)
+        ]
+
+    def tile(self, ix: int, iy: int) -> Tile:
+        """The tile whose south-west corner is (ix, iy) · 102.4 m."""
+        key = (ix, iy)
+        found = self._tiles.get(key)
+        if found is None:
+            found = self._tiles[key] = self._rasterise(ix, iy)
+            if len(self._tiles) > 64:
+                self._tiles.popitem(last=False)
+        else:
+            self._tiles.move_to_end(key)
+        return found
+
+    def _rasterise(self, ix: int, iy: int) -> Tile:
+        x0, y0 = ix * TILE_M - _PAD_PX * RES_M, iy * TILE_M - _PAD_PX * RES_M
+        size = TILE_PX + 2 * _PAD_PX
+        side = size * RES_M
+        blocks = self.blocks(x0 - 4.0, y0 - 4.0, x0 + side + 4.0, y0 + side + 4.0)
+        cx, cy = x0 + (np.arange(size) + 0.5) * RES_M, y0 + (np.arange(size) + 0.5) * RES_M
+        height = np.zeros((size, size), np.float32)
+        colour = _ground(cx, cy, self.scene.block_m)
+
+        def rect(x_0: float, y_0: float, x_1: float, y_1: float) -> tuple[slice, slice]:
+            a, b = np.searchsorted(cx, (x_0, x_1))
+            c, d = np.searchsorted(cy, (y_0, y_1))
+            return slice(c, d), slice(a, b)
+
+        for b in blocks:
+            for lot in b.lots:
+                colour[rect(*lot[:4])] = _mix((88, 118, 62), (150, 142, 120), lot[4])
+            for one in b.buildings:
+                at = rect(*one[:4])
+                height[at] = one[4]
+                colour[at] = _mix((142, 78, 62), (172, 170, 168), one[5])
+                inner = rect(one[0] + 0.8, one[1] + 0.8, one[2] - 0.8, one[3] - 0.8)
+                colour[inner] *= 0.88
+        trees = [t for b in blocks for t in b.trees]
+        for x, y, radius, top, tone in trees:
+            at = rect(x - radius, y - radius, x + radius, y + radius)
+            part = ((cx[at[1]][None, :] - x) ** 2 + (cy[at[0]][:, None] - y) ** 2) / radius**2
+            inside = (part < 1.0) & (height[at] < top)
+            dome = (top * (1.0 - 0.35 * part)).astype(np.float32)
+            height[at] = np.where(inside, dome, height[at])
+            leaf = _mix((34, 70, 30), (74, 104, 44), tone) * (1.05 - 0.35 * part[..., None])
+            colour[at] = np.where(inside[..., None], leaf, colour[at])
+        light = _shadows(height)
+        rng = stream(self.scene.seed, 0, (zigzag(ix), zigzag(iy)), "town.texture")
+        grain = rng.random((size // 4, size // 4), dtype=np.float32).repeat(4, 0).repeat(4, 1)
+        fine = rng.random((size, size), dtype=np.float32)
+        colour *= (light * (0.86 + 0.14 * grain + 0.14 * fine))[..., None]
+        cut = slice(_PAD_PX, _PAD_PX + TILE_PX)
+        return Tile(
+            np.ascontiguousarray(height[cut, cut]),
+            np.clip(colour[cut, cut], 0, 255).astype(np.uint8),
+            np.ascontiguousarray(light[cut, cut]),
+        )
+
+
+def _mix(a: tuple[int, int, int], b: tuple[int, int, int], part: float) -> FloatMap:
+    return np.asarray(a, np.float32) * (1 - part) + np.asarray(b, np.float32) * part
+
+
+def _ground(cx: NDArray[Any], cy: NDArray[Any], block_m: float) -> FloatMap:
+    """Road, marking, kerb, pavement and grass colours by distance from the nearest road centre lines."""
+    fx = np.abs((cx / block_m + 0.5) % 1.0 - 0.5) * block_m
+    fy = np.abs((cy / block_m + 0.5) % 1.0 - 0.5) * block_m
+    near = np.minimum(fx[None, :], fy[:, None])
+    far = np.maximum(fx[None, :], fy[:, None])
+    out = np.empty((len(cy), len(cx), 3), np.float32)
+    out[...] = (98, 126, 70)
+    out[near < PAVEMENT_M] = (158, 154, 146)
+    out[near < KERB_M + 0.2] = (188, 186, 180)
+    out[near < KERB_M] = (92, 92, 94)
+    out[near < LANE_M] = (82, 82, 86)
+    along = np.where(fx[None, :] < fy[:, None], cy[:, None], cx[None, :])
+    dash = (near < 0.24) & (along % 6.0 < 3.0) & (far > KERB_M + 4.0)
+    edge = (np.abs(near - LANE_M) < 0.17) & (far > KERB_M + 1.0)
+    stop = (near < LANE_M) & (np.abs(far - KERB_M - 2.0) < 0.3)
+    out[dash | stop] = (214, 214, 206)
+    out[edge] = (140, 140, 140)
+    return out
+
+
+def _shadows(height: FloatMap) -> FloatMap:
+    """Light on each pixel, 1 or the shade: a pixel is dark if something towards the sun stands above the ray to it."""
+    lit = np.full(height.shape, -1e3, np.float32)
+    top = float(height.max())
+    step_m = 1.0
+    for k in range(1, int(top / step_m) + 1):
+        dx, dy = round(_SUN[0] * k * step_m / RES_M), round(_SUN[1] * k * step_m / RES_M)
+        if dx >= height.shape[1] or dy >= height.shape[0]:
+            break
+        np.maximum(
+            lit[dy:, dx:], height[: height.shape[0] - dy, : height.shape[1] - dx] - k * step_m, out=lit[dy:, dx:]
+        )
+    return np.where(lit > height + 0.1, np.float32(_SHADE), np.float32(1.0))
