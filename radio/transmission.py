@@ -71,7 +71,7 @@ def losses(u: float, count: int, q: float) -> int:
     if u < none:
         return 0
     if none < 1e-200:  # far from both ends; rare
-        return int(binom.ppf(u, count, q))
+        return max(0, int(binom.ppf(u, count, q)))
     k, term, total = 0, none, none
     odds = q / (1.0 - q)
     while total <= u and k < count:

@@ -9,7 +9,7 @@ from math import isnan
 import numpy as np
 import pytest
 import simpy
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -122,6 +122,7 @@ def test_best_effort_delivers_the_power_of_its_fragments(q: float, payload: int)
     assert delivered == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9)
 
 
+@example(0.0, 1075, 0.5)
 @given(st.floats(0, 1, exclude_max=True), st.integers(1, 2000), st.floats(0, 1))
 def test_losses_invert_the_binomial(u: float, count: int, q: float) -> None:
     k = losses(u, count, q)
