@@ -1,0 +1,244 @@
+"""The command line and the run directory, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from sim_examples import BASE, example
+from typer.testing import CliRunner
+
+from sim import rundir
+from sim.cli import app, main
+from sim.expect import check
+from sim.outcome import outcome
+from sim.record import TABLES
+from sim.sortie import run_sortie
+
+FIELDS = {  # DESIGN.md: outcome.json holds at least these
+    "scenario", "policy", "seed", "version", "fingerprint", "ap50", "bytes", "context_share", "deadline_miss_rate",
+    "age_s", "battery", "energy_j", "switches", "policy_eval_us", "wall_s", "realtime_factor",
+}  # fmt: skip
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "example.yaml"
+    path.write_text(BASE)
+    return path
+
+
+def command(*arguments: object) -> int:
+    """The command's entry point in this process; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+def sortie(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The real command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", "from sim.cli import main; main()", *map(str, arguments)],
+        capture_output=True, text=True, cwd=cwd, check=False,
+    )  # fmt: skip
+
+
+# --- the run directory ---------------------------------------------------------------------------
+
+
+def test_a_run_is_kept_whole_and_reads_back(tmp_path: Path) -> None:
+    record = run_sortie(example())
+    result = rundir.save(record, tmp_path / "run")
+    assert set(result) >= FIELDS
+    assert json.loads((tmp_path / "run" / "outcome.json").read_text()) == result
+    assert {p.name for p in (tmp_path / "run").iterdir()} == {
+        "outcome.json", "scenario.yaml", "record.json", *(f"{t}.parquet" for t in TABLES),
+    }  # fmt: skip
+    assert pq.read_table(tmp_path / "run" / "states.parquet").num_rows == 300
+    back = rundir.load(tmp_path / "run")
+    assert back.fingerprint == record.fingerprint
+    assert outcome(back) == result
+
+
+def test_energy_by_cause_is_what_left_the_batteries(tmp_path: Path) -> None:
+    result = outcome(run_sortie(example()))
+    by_cause = {k: v for k, v in result["energy_j"].items() if k != "total"}
+    assert sum(by_cause.values()) == pytest.approx(result["energy_j"]["total"])
+    assert result["energy_j"]["total"] == pytest.approx(sum(d["energy_j"] for d in result["drones"].values()))
+
+
+def test_a_run_that_dies_while_saving_leaves_no_half_run(tmp_path: Path) -> None:
+    record = run_sortie(example())
+    path = tmp_path / "run"
+
+    def dies(folder: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(rundir.RunError, match="run: cannot be written: No space left on device"):
+        rundir.save(record, path, dies)
+    assert list(tmp_path.iterdir()) == []
+    first = rundir.save(record, path)
+    with pytest.raises(rundir.RunError):
+        rundir.save(record, path, dies)
+    assert json.loads((path / "outcome.json").read_text()) == first, "the older run is still whole"
+
+
+def test_a_folder_that_is_no_run_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    with pytest.raises(rundir.RunError, match=r"holds files but no outcome\.json"):
+        rundir.ensure_writable(tmp_path / "thesis")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(rundir.RunError, match="is a file, a run needs a folder"):
+        rundir.ensure_writable(tmp_path / "file")
+
+
+def test_a_damaged_run_says_so(tmp_path: Path) -> None:
+    with pytest.raises(rundir.RunError, match=r"no run there \(outcome\.json is missing\)"):
+        rundir.load(tmp_path)
+    rundir.save(run_sortie(example()), tmp_path / "run")
+    (tmp_path / "run" / "states.parquet").write_bytes(b"PAR1 not really")
+    with pytest.raises(rundir.RunError, match="the run is damaged"):
+        rundir.load(tmp_path / "run")
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path) -> None:
+    done = sortie("fly", scenario, "--set", "fleet.battery.initial_soc=0.5", "--no-recording", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for word in ("context plane", "data plane", "energy", "fingerprint", "decisions and events"):
+        assert word in done.stdout
+    kept = json.loads((tmp_path / "runs" / "example-worked-seed1" / "outcome.json").read_text())
+    assert max(kept["battery"].values()) < 0.5
+    again = sortie(
+        "fly", scenario, "--policy", "best-2(rho=0.1)", "--seed", "7", "--no-recording", "--out", "here", cwd=tmp_path
+    )
+    assert again.returncode == 0, again.stderr
+    kept = json.loads((tmp_path / "here" / "outcome.json").read_text())
+    assert (kept["policy"], kept["seed"]) == ("best-2", 7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("fly", "nowhere.yaml"), "nowhere.yaml"),
+        (("fly", "example.yaml", "--policy", "wrst-2"), "unknown policy 'wrst-2', known: worked, all-4"),
+        (("fly", "example.yaml", "--policy", "all-4(rho=0.1"), "the bracket is not closed"),
+        (("fly", "example.yaml", "--policy", "silence(rho=0.1)"), "policy 'silence' has no parameter 'rho'"),
+        (("fly", "example.yaml", "--policy", "no/such.py:decide"), "policy file 'no/such.py' not found"),
+        (("fly", "example.yaml", "--set", "fleet.batery.initial_soc=0.5"), "did you mean battery?"),
+        (("fly", "example.yaml", "--set", "fleet.battery.initial_soc=1.5"), "1.5"),
+        (("fly", "example.yaml", "--set", "nonsense"), "--set nonsense: must be key.path=value"),
+        (("fly", "example.yaml", "--out", "example.yaml"), "example.yaml: is a file, a run needs a folder"),
+        (("compare", "example.yaml", "--policies", ","), "no policy named"),
+        (("compare", "example.yaml", "--policies", "silence,silence"), "a policy is named twice"),
+        (("check", "example.yaml", "nowhere"), "nowhere"),
+        (("view", "."), "no run there"),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line_and_exit_code_2(
+    scenario: Path,
+    arguments: tuple[str, ...],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(scenario.parent)
+    assert command(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert [p.name for p in scenario.parent.iterdir()] == ["example.yaml"], "nothing was left behind"
+
+
+def test_the_real_command_gives_no_traceback(scenario: Path) -> None:
+    done = sortie("fly", "nowhere.yaml", cwd=scenario.parent)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+
+
+def test_a_users_policy_flies_from_a_file(scenario: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from policies.contract import Directive, Representation\n"
+        "def decide(view, *, rate=5.0):\n"
+        "    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=rate, reason='mine') for p in view.peers]\n"
+    )
+    done = sortie(
+        "fly", scenario, "--policy", "mine.py:decide(rate=2.0)", "--no-recording", "--out", "run", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    rows = pq.read_table(tmp_path / "run" / "directives.parquet").to_pylist()
+    assert {(r["representation"], r["rate_hz"], r["reason"]) for r in rows} == {("detections", 2.0, "mine")}
+
+
+def test_check_tells_what_failed_and_why(scenario: Path) -> None:
+    scenario.write_text(
+        BASE + "expect:\n"
+        "  - {metric: bytes.data_sent, at_least: 1}\n"
+        "  - {metric: deadline_miss_rate, at_most: -1, because: never}\n"
+        "  - {metric: bytes.datasent, at_least: 1}\n"
+        "  - {metric: scenario, equals: example}\n"
+        "expect_decisions:\n"
+        "  - {drone: 0, representation: features, roi: true, from_s: 2.9, until_s: 3.1, reason: track}\n"
+        "  - {drone: 0, representation: raw, from_s: 0, until_s: 6}\n"
+    )
+    done = CliRunner().invoke(app, ["check", str(scenario)])
+    assert done.exit_code == 1
+    assert done.output.count("FAILED") == 3
+    record = run_sortie(example(text=scenario.read_text()))
+    verdicts = check(record.scenario, record, outcome(record))
+    assert [v.holds for v in verdicts] == [True, False, False, True, True, False]
+    assert verdicts[2].got.startswith("bytes.datasent: bytes has no 'datasent', it has context_sent")
+    assert "drone 0: features with ROI because of 'track' decided in [2.9, 3.1] s" in verdicts[4].expected
+    assert verdicts[5].got.startswith("0.41 s: 0 → 1 detections at 2 Hz (goodput 0.0 < 5 Mb/s); ")
+
+
+def test_check_passes_with_code_0(scenario: Path) -> None:
+    scenario.write_text(BASE + "expect:\n  - {metric: bytes.data_sent, at_least: 1}\n")
+    assert CliRunner().invoke(app, ["check", str(scenario)]).exit_code == 0
+
+
+def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: Path, tmp_path: Path) -> None:
+    done = sortie("compare", scenario, "--policies", "worked,all-4(rho=0.1),silence", "--out", "c.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "sent nothing; every drone saw with its own eyes only" in done.stdout
+    kept = json.loads((tmp_path / "c.json").read_text())
+    assert list(kept) == ["worked", "all-4(rho=0.1)", "silence"]
+    assert kept["silence"]["bytes"]["data_sent"] == 0
+    assert kept["all-4(rho=0.1)"]["bytes"]["data_sent"] > 0
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("policies", ["worked", "random-2", "silence"]),
+        ("scenarios", ["track_target", "paper_replay", "search_grid"]),
+        ("detectors", ["torch", "none"]),
+    ],
+)
+def test_list(what: str, words: list[str]) -> None:
+    done = CliRunner().invoke(app, ["list", what])
+    assert done.exit_code == 0
+    assert all(word in done.output for word in words)
+
+
+def test_list_schema_is_json() -> None:
+    done = CliRunner().invoke(app, ["list", "schema"])
+    assert json.loads(done.output)["title"] == "Scenario"
+
+
+def test_profile_tells_the_rooms_apart(scenario: Path, tmp_path: Path) -> None:
+    done = sortie("fly", scenario, "--profile", "--no-recording", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert all(room in done.stdout for room in ("sim", "fleet", "radio", "policies"))

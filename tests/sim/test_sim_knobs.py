@@ -1,0 +1,216 @@
+"""Every documented knob of a scenario acts: changing it changes the record.
+
+The table below names, for every leaf field of the schema, another value and whatever else has to be set for the
+field to matter; a test holds the table to the schema, so that a new field cannot come without its effect.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+
+import pytest
+from pydantic import BaseModel
+from sim_examples import example
+
+from scenarios.schema import Scenario
+from sim.sortie import run_sortie
+
+NOT_KNOBS = ("name", "description", "expect", "expect_decisions")
+"""Words for people, and what is asserted about the outcome."""
+
+JAM = "events=[{kind: jam, at_s: 1, position_m: [0, 0, 60], power_dbm: 0, until_s: 4}]"
+DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"
+SPOOF = "events=[{kind: spoof, at_s: 1, drone: 1, until_s: 4}]"
+LOST = "events=[{kind: drone_lost, at_s: 1, drone: 1}]"
+FAULT = "events=[{kind: battery_fault, at_s: 1, drone: 1, lost_fraction: 0.5}]"
+SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
+TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20}]"
+FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
+HEAVY = ("policy.name=all-4", "policy.params={rho: 0.4}")  # fills the medium
+BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
+FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
+HOVER = "fleet.route.waypoints_m=[[0, 0]]"
+TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
+
+# field: (new value, settings that both sorties get)
+TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
+    "seed": ("2", ()),
+    "duration_s": ("5", ()),
+    "fleet.drones": ("6", ()),
+    "fleet.formation.shape": ("line", ()),
+    "fleet.formation.spacing_m": ("25", ()),
+    "fleet.formation.altitude_m": ("70", ()),
+    "fleet.route.waypoints_m": ("[[-60, 0], [60, 20]]", ()),
+    "fleet.route.speed_mps": ("6", ()),
+    "fleet.route.turn_time_s": ("8", (TURN,)),
+    "fleet.motion.wind_mps": ("[5, 0]", ()),
+    "fleet.motion.gust_sigma_mps": ("2", ()),
+    "fleet.motion.gust_time_s": ("5", ()),
+    "fleet.motion.pose_jitter_m": ("1", ()),
+    "fleet.motion.pose_jitter_time_s": ("5", ()),
+    "fleet.motion.pose_error_m": ("1", ()),
+    "fleet.motion.heading_error_deg": ("5", (FIXED, "mission.target=null")),
+    "fleet.battery.capacity_wh": ("100", ()),
+    "fleet.battery.cells": ("6", ()),
+    "fleet.battery.initial_soc": ("0.8", ()),
+    "fleet.battery.cell_resistance_mohm": ("20", ()),
+    "fleet.battery.drivetrain_efficiency": ("0.7", ()),
+    "fleet.battery.avionics_w": ("12", ()),
+    "fleet.battery.compute_idle_w": ("12", ()),
+    "fleet.battery.compute_active_w": ("50", ()),
+    "fleet.battery.radio_idle_w": ("3", ()),
+    "fleet.battery.radio_tx_w": ("8", ()),
+    "fleet.battery.landing_soc": ("0.3", ("fleet.battery.initial_soc=0.3005",)),
+    "fleet.overrides.drone": ("2", (TIRED,)),
+    "fleet.overrides.initial_soc": ("0.4", (TIRED,)),
+    "fleet.overrides.capacity_wh": ("40", (TIRED,)),
+    "fleet.overrides.cell_resistance_mohm": ("30", (TIRED,)),
+    "mission.phases.at_s": ("2", ()),
+    "mission.phases.phase": ("return", ()),
+    "mission.phases.region.radius_m": ("20", ()),
+    "mission.phases.region.centre_m": ("[10, 0]", (FIXED,)),
+    "mission.target.waypoints_m": ("[[-60, 1.75], [200, 1.75]]", ()),
+    "mission.target.speed_mps": ("8", ()),
+    "radio.carrier_ghz": ("2.4", ()),
+    "radio.bandwidth_mhz": ("20", ()),
+    "radio.tx_power_dbm": ("10", ()),
+    "radio.noise_figure_db": ("10", ()),
+    "radio.path_loss_exponent": ("2.6", ()),
+    "radio.shadowing_sigma_db": ("6", ()),
+    "radio.shadowing_time_s": ("2", ()),
+    "radio.rician_k_db": ("3", ()),
+    "radio.group_rate_mbps": ("12", ()),
+    "radio.retry_limit": ("1", (FAR,)),
+    "radio.max_ampdu_frames": ("8", ()),
+    "radio.fragment_bytes": ("8000", ()),
+    "radio.heartbeat_s": ("0.05", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
+    "radio.nack_delay_s": ("0.02", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
+    "context.rate_hz": ("5", ()),
+    "context.degraded_after_periods": ("5", (LOST, "policy.name=all-4", "policy.params={rho: 0.02}")),
+    "context.detached_after_periods": ("15", (LOST,)),
+    "context.authentication": ("false", ()),
+    "perception.detector": ("torch", ("duration_s=4",)),
+    "perception.compute_delay_s": ("0.05", ()),
+    "policy.name": ("worst-2", ()),
+    "policy.params": ("{rho: 0.1}", ()),
+    "policy.dwell_s": ("0.6", ()),
+    "events.kind": ("battery_fault", ()),  # covered by every event below: the kind is what makes it one
+    "events.at_s": ("2", (DROP,)),
+    "events.until_s": ("3", (DROP,)),
+    "events.drone": ("2", (DROP,)),
+    "events.peer": ("2", (DROP,)),
+    "events.loss_db": ("10", (DROP,)),
+    "events.position_m": ("[300, 0, 60]", (JAM,)),
+    "events.power_dbm": ("20", (JAM,)),
+    "events.lost_fraction": ("0.2", (FAULT,)),
+    "events.skew_s": ("-2", (SKEW,)),
+    "events.attack": ("oversized", (SPOOF,)),
+    "events.rate_hz": ("30", (SPOOF,)),
+}
+
+# These act through the detector, so their sorties fly with it, shortly.
+SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
+    "perception.weights": ("WEIGHTS", ()),
+    "perception.sample_rate_hz": ("5", ()),
+    "perception.fusion_delay_s": ("0.2", ()),
+    "perception.max_age_s": ("0.05", ()),
+    "perception.score_threshold": ("0.5", ()),
+    "perception.cells_by": ("norm", ()),
+    "perception.unsent_cells": ("zero", ()),
+    "perception.scene.seed": ("8", ()),
+    "perception.scene.block_m": ("100", ()),
+    "perception.scene.building_density": ("0.1", ()),
+    "perception.scene.building_height_m": ("20", ()),
+    "perception.scene.tree_density": ("1", ()),
+    "perception.scene.parked_density": ("0.9", ()),
+    "perception.scene.moving_cars_per_km": ("40", ()),
+    "perception.scene.moving_speed_mps": ("15", ()),
+}
+
+
+def leaves(model: type[BaseModel], prefix: str = "") -> set[str]:
+    """Dotted names of every leaf field; list items share their list's name, union members their field's."""
+    found: set[str] = set()
+    for name, field in model.model_fields.items():
+        inner = sections(field.annotation)
+        for section in inner:
+            found |= leaves(section, f"{prefix}{name}.")
+        if not inner:
+            found.add(f"{prefix}{name}")
+    return found
+
+
+def sections(annotation: object) -> list[type[BaseModel]]:
+    """The sections inside a field's type."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is not None:
+        return [s for part in typing.get_args(annotation) for s in sections(part)]
+    return []
+
+
+def test_the_table_names_every_field_of_the_schema() -> None:
+    knobs = {f for f in leaves(Scenario) if f.split(".")[0] not in NOT_KNOBS}
+    assert knobs == set(TRAFFIC) | set(SEEN)
+
+
+def place(field: str, shared: tuple[str, ...]) -> str:
+    """Where `--set` finds the field: lists are addressed by the item that the settings put there."""
+    last_phase = 0 if FIXED in shared else 1
+    return (
+        field.replace("fleet.overrides.", "fleet.overrides.0.")
+        .replace("mission.phases.", f"mission.phases.{last_phase}.")
+        .replace("events.", "events.0.")
+    )
+
+
+@pytest.mark.parametrize("field", [f for f in TRAFFIC if f != "events.kind"])
+def test_a_knob_changes_the_record(field: str) -> None:
+    value, shared = TRAFFIC[field]
+    before = run_sortie(example(*shared))
+    after = run_sortie(example(*shared, f"{place(field, shared)}={value}"))
+    assert after.fingerprint != before.fingerprint
+
+
+@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LOST, FAULT, SKEW])
+def test_every_kind_of_event_changes_the_record(event: str) -> None:
+    assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
+
+
+SHORT = (
+    "perception.detector=torch",
+    "duration_s=2.5",
+    "mission.phases=[{at_s: 0, phase: search}]",
+    "policy.params={rho: 0.05}",
+)
+
+
+@pytest.fixture(scope="module")
+def seen() -> str:
+    return run_sortie(example(*SHORT)).fingerprint
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("field", SEEN)
+def test_a_knob_of_perception_changes_the_record(
+    field: str, seen: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    value, shared = SEEN[field]
+    if value == "WEIGHTS":
+        value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
+    assert run_sortie(example(*SHORT, *shared, f"{field}={value}")).fingerprint != seen
+
+
+def other_weights(path):  # type: ignore[no-untyped-def]
+    """The shipped weights with a more hesitant head."""
+    import torch
+
+    from perception.detector import SHIPPED_WEIGHTS
+    from perception.model import load_weights, save_weights
+
+    net = load_weights(SHIPPED_WEIGHTS)
+    with torch.no_grad():
+        net.head.out.bias[0] -= 1.0
+    save_weights(net, path, {})
+    return path
