@@ -261,7 +261,7 @@ class Medium:
 
     def _set_timer(self, due_s: float) -> None:
         self._due_s = due_s
-        timer = self._env.timeout(due_s - self._env.now)
+        timer = self._env.timeout(max(0.0, due_s - self._env.now))
         timer.callbacks.append(self._on_timer)
         self._timer = timer
 
@@ -344,7 +344,7 @@ class Medium:
         self._context_fire_s = fire
         if until != self._context_until_s or self._context_timer is None:
             self._context_until_s = until
-            timer = self._env.timeout(until - self._env.now)
+            timer = self._env.timeout(max(0.0, until - self._env.now))
             timer.callbacks.append(self._on_context_timer)
             self._context_timer = timer
 

@@ -233,7 +233,7 @@ def test_work_is_conserved_and_shares_are_equal(traffic: list, stop_s: float) ->
 
     def play() -> simpy.events.ProcessGenerator:
         for when, who, amount, deadline_s, context in sorted(traffic):
-            yield b.env.timeout(when - b.env.now)
+            yield b.env.timeout(max(0.0, when - b.env.now))
             if context:
                 b.medium.announce(GroupFrame(who, 300e-6, int(when * 1e6) % 16), 0.3)
             else:
