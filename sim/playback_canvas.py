@@ -1,0 +1,84 @@
+"""The Rerun recording as this room draws on it: two timelines, columns, and the colours that mean something."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Rgba = tuple[int, int, int, int]
+
+SIM_TIME, FRAME = "sim_time", "frame"
+"""Simulated time since take-off, and the frame that it falls into."""
+SPAN_M = 5.0
+"""Drones are drawn this wide, some eight times their size, so that they can be seen."""
+
+DRONE_COLOURS: tuple[Rgba, ...] = (
+    (86, 156, 255, 255), (255, 159, 64, 255), (199, 125, 255, 255), (64, 214, 200, 255), (255, 118, 168, 255),
+    (222, 206, 92, 255), (150, 190, 230, 255), (226, 142, 110, 255), (170, 210, 120, 255), (190, 170, 160, 255),
+)  # fmt: skip
+FOUND, MISSED, FALSE = (70, 220, 90, 255), (255, 200, 40, 255), (255, 60, 60, 255)
+IDLE, FALLEN = (150, 155, 165, 90), (120, 120, 120, 255)
+WARNING = (255, 225, 90, 255)
+MISSION, TARGET = (255, 80, 220, 255), (255, 40, 60, 255)
+SENT: dict[str, Rgba] = {
+    "features": (90, 200, 120, 255),
+    "detections": (250, 180, 60, 255),
+    "tracks": (120, 170, 255, 255),
+    "raw": (230, 110, 230, 255),
+    "nothing": (95, 98, 105, 255),
+}
+PHASES: dict[str, Rgba] = {
+    "transit": (120, 130, 150, 255),
+    "search": (70, 120, 190, 255),
+    "track": MISSION,
+    "return": (140, 120, 100, 255),
+}
+
+
+def drone_colour(drone: int) -> Rgba:
+    """The drone's colour, the same in the scene and in every plot."""
+    return DRONE_COLOURS[drone % len(DRONE_COLOURS)]
+
+
+def goodput_colours(mbps: Floats) -> NDArray[np.uint8]:
+    """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above."""
+    level = np.clip(np.log10(np.maximum(mbps, 1e-3)) / 2.0, 0.0, 1.0)
+    red, green = np.clip(2.0 - 2.0 * level, 0.0, 1.0), np.clip(2.0 * level, 0.0, 1.0)
+    colour = np.stack([50 + 205 * red, 45 + 185 * green, np.full_like(red, 60), np.full_like(red, 255)], axis=-1)
+    return colour.astype(np.uint8)
+
+
+class Canvas:
+    """Writes to one recording, on both timelines; strict, so that a wrong shape is an error and not a warning."""
+
+    def __init__(self, recording: rr.RecordingStream, rate_hz: float) -> None:
+        self._recording, self._rate_hz = recording, rate_hz
+
+    def columns(self, path: str, t_s: Floats, *columns: Iterable[rr.ComponentColumn]) -> None:
+        """Send rows at the times `t_s` [n]; nothing where n is 0."""
+        if len(t_s) == 0:
+            return
+        indexes = [
+            rr.TimeColumn(SIM_TIME, duration=np.round(np.asarray(t_s) * 1e9).astype("timedelta64[ns]")),
+            rr.TimeColumn(FRAME, sequence=np.floor(np.asarray(t_s) * self._rate_hz + 1e-6).astype(np.int64)),
+        ]
+        self._recording.send_columns(path, indexes, [c for group in columns for c in group], strict=True)
+
+    def scalars(self, path: str, t_s: Floats, values: Floats) -> None:
+        """Send one plot's points."""
+        self.columns(path, t_s, rr.Scalars.columns(scalars=values))
+
+    def static(self, path: str, *archetypes: Any) -> None:
+        """Log what holds at all times."""
+        self._recording.log(path, *archetypes, static=True, strict=True)
+
+
+def line(name: str, colour: Rgba, *, width: float = 1.8, steps: bool = False) -> rr.SeriesLines:
+    """A plot line's looks; `steps` holds each value until the next."""
+    mode = rr.components.InterpolationMode.StepAfter if steps else None
+    return rr.SeriesLines(colors=[colour], widths=[width], names=[name], interpolation_mode=mode)

@@ -1,0 +1,246 @@
+"""The plots, lanes and logs of a playback: what was carried, what it cost, and who decided what, and why.
+
+As in `sim.playback_scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from perception.ap import Matched, average_precision
+from scenarios.schema import Scenario
+from sim import playback_canvas as c
+from sim.outcome import describe
+from sim.playback_canvas import Canvas, Floats, line
+from sim.sightings import Sighting
+
+AP_WINDOW_S = 5.0
+RUNGS = ("nothing", "tracks", "detections", "features", "raw")
+FATES: dict[str, c.Rgba] = {"expired": (255, 120, 60, 255), "lost": (255, 50, 70, 255)}
+"""Colours of traffic that did not arrive; what arrived has its representation's colour."""
+
+
+class Charts:
+    """Plots of one sortie; `begin` once, then `add` with the tables in order of time."""
+
+    def __init__(self, canvas: Canvas, scenario: Scenario) -> None:
+        self._canvas, self._scenario, self._n = canvas, scenario, scenario.fleet.drones
+        self._known_s = 0.0
+        self._settled: Floats = np.zeros((0, 2))
+        self._kinds: list[str] = []
+        self._running: set[str] = set()
+        self._ages: Floats = np.zeros((0, 2))
+        self._window: deque[Sighting] = deque()
+        self._carried: dict[tuple[int, int], str] = {}
+        self._lanes: dict[int, str] = {}
+        self._lane_colours: dict[int, dict[str, c.Rgba]] = defaultdict(dict)
+        self._phase = ""
+
+    def begin(self) -> None:
+        """Name and colour every plot line that is known beforehand."""
+        canvas, drones = self._canvas, range(self._n)
+        for i in drones:
+            colour = c.drone_colour(i)
+            canvas.static(f"plots/battery/{i}", line(f"drone {i}", colour))
+            canvas.static(f"plots/goodput/{i}", line(f"drone {i}", colour))
+        phases = list(c.PHASES)
+        canvas.static("lanes/phase", rr.StateConfiguration(values=phases, colors=[c.PHASES[p] for p in phases]))
+        canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
+        canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
+        canvas.static("plots/age/p99_ms", line("descriptor age p99, ms", (190, 190, 200, 255)))
+        canvas.static("plots/medium/busy_percent", line("channel busy, %", (240, 150, 80, 255)))
+
+    def add(self, known_s: float, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
+        """Plot new rows; everything before `known_s` is in by now."""
+        seconds = self._seconds(known_s)
+        states = new["states"]
+        drone, t_s, soc = (states[k].to_numpy() for k in ("drone", "t_s", "soc"))
+        for i in range(self._n):
+            self._canvas.scalars(f"plots/battery/{i}", t_s[drone == i], 100.0 * soc[drone == i])
+        self._goodput(new["descriptors"])
+        self._traffic(seconds, new["transmissions"])
+        self._plane(seconds, new["ages"], new["medium"])
+        self._accuracy(seconds, seen)
+        self._phases(new["mission"])
+        self._decisions(new["directives"])
+        self._events(new["events"])
+
+    def _seconds(self, known_s: float) -> list[tuple[float, float]]:
+        """The seconds (begin, end) that are whole by now; the last one of a sortie may be short."""
+        begin_s, seconds = self._known_s, []
+        while begin_s < known_s:
+            end_s = min(math.floor(begin_s + 1e-9) + 1.0, self._scenario.duration_s)
+            if end_s > known_s + 1e-9:
+                break
+            seconds.append((begin_s, end_s))
+            begin_s = end_s
+        self._known_s = begin_s
+        return seconds
+
+    # --- plots -----------------------------------------------------------------------------------
+
+    def _goodput(self, descriptors: pa.Table) -> None:
+        """The mean goodput of each drone's measured links; a gap where none is."""
+        drone, t_s = descriptors["drone"].to_numpy(), descriptors["t_s"].to_numpy()
+        links = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, self._n - 1))
+        if self._n < 2:
+            return
+        measured = links > 0
+        mean = np.where(measured.any(axis=1), links.sum(axis=1) / np.maximum(measured.sum(axis=1), 1), np.nan)
+        for i in range(self._n):
+            self._canvas.scalars(f"plots/goodput/{i}", t_s[drone == i], mean[drone == i])
+
+    def _traffic(self, seconds: Sequence[tuple[float, float]], transmissions: pa.Table) -> None:
+        """Mb/s by representation and fate, each line from the second in which it first carries anything."""
+        names = [
+            f"{r} {s}"
+            for r, s in zip(*(transmissions[k].to_pylist() for k in ("representation", "status")), strict=True)
+        ]
+        settled = np.column_stack([transmissions[k].to_numpy().astype(float) for k in ("t_done_s", "payload_bytes")])
+        self._kinds, self._settled = self._kinds + names, np.concatenate([self._settled, settled])
+        kinds, t_s = np.array(self._kinds, dtype=object), self._settled[:, 0]
+        if not seconds:
+            return
+        edges = np.array([seconds[0][0], *(end for _, end in seconds)])
+        now = t_s < edges[-1]
+        for name in sorted(set(self._kinds) | self._running):
+            size, _ = np.histogram(t_s[now & (kinds == name)], edges, weights=self._settled[now & (kinds == name), 1])
+            mbps = size * 8e-6 / np.diff(edges)
+            path = f"plots/traffic/{name.replace(' ', '_')}"
+            begin = 0
+            if name not in self._running:
+                if not mbps.any():
+                    continue
+                begin = int(np.argmax(mbps > 0))
+                self._running.add(name)
+                representation, fate = name.split(" ")
+                colour = FATES.get(fate) or c.SENT[representation]
+                self._canvas.static(path, line(name, colour))
+            self._canvas.scalars(path, edges[1:][begin:], mbps[begin:])
+        later = t_s >= edges[-1]  # what is still in flight has no time, and is dropped here
+        self._settled, self._kinds = self._settled[later], kinds[later].tolist()
+
+    def _plane(self, seconds: Sequence[tuple[float, float]], ages: pa.Table, medium: pa.Table) -> None:
+        rows = np.column_stack([ages["t_s"].to_numpy(), ages["age_s"].to_numpy()])
+        self._ages = np.concatenate([self._ages, rows])
+        for begin_s, end_s in seconds:
+            within = self._ages[(self._ages[:, 0] >= begin_s) & (self._ages[:, 0] < end_s), 1]
+            if len(within):
+                p99 = float(np.percentile(within, 99))
+                self._canvas.scalars("plots/age/p99_ms", np.array([end_s]), np.array([1e3 * p99]))
+        if seconds:
+            self._ages = self._ages[self._ages[:, 0] >= seconds[-1][1]]
+        busy = 100.0 * medium["busy_fraction"].to_numpy()
+        self._canvas.scalars("plots/medium/busy_percent", medium["t_s"].to_numpy(), busy)
+
+    def _accuracy(self, seconds: Sequence[tuple[float, float]], seen: Iterable[Sighting]) -> None:
+        """AP@0.5 over the last seconds, all egos pooled."""
+        self._window.extend(seen)
+        points: dict[str, list[tuple[float, float]]] = {"full_scene": [], "mission": []}
+        for _, end_s in seconds:
+            while self._window and self._window[0].t_s < end_s - AP_WINDOW_S:
+                self._window.popleft()
+            within = [s for s in self._window if s.t_s < end_s]
+            frames: dict[str, list[Matched]] = {
+                "full_scene": [s.full for s in within],
+                "mission": [s.mission for s in within if s.mission is not None],
+            }
+            for name, matches in frames.items():
+                if matches:
+                    points[name].append((end_s, average_precision(matches)))
+        for name, several in points.items():
+            rows = np.array(several).reshape(-1, 2)
+            self._canvas.scalars(f"plots/ap/{name}", rows[:, 0], rows[:, 1])
+
+    # --- lanes and logs --------------------------------------------------------------------------
+
+    def _phases(self, mission: pa.Table) -> None:
+        for t_s, phase in zip(mission["t_s"].to_pylist(), mission["phase"].to_pylist(), strict=True):
+            if phase != self._phase:
+                self._phase = phase
+                self._state("lanes/phase", t_s, phase)
+
+    def _decisions(self, directives: pa.Table) -> None:
+        """Log each change of what a link carries, in words; a drone's lane shows the highest rung of its links."""
+        changes = []
+        for change in transitions(directives, self._carried):
+            changes.append(change)
+            self._lane(change["t_s"], change["drone"])
+        if changes:
+            columns = rr.TextLog.columns(
+                text=[in_words(x) for x in changes],
+                level=["INFO"] * len(changes),
+                color=[c.drone_colour(x["drone"]) for x in changes],
+            )
+            self._canvas.columns("log/decisions", np.array([x["t_s"] for x in changes]), columns)
+
+    def _lane(self, t_s: float, drone: int) -> None:
+        """Show what the drone sends on its best link."""
+        levels = [level for (sender, _), level in self._carried.items() if sender == drone]
+        best = max(levels, key=lambda level: RUNGS.index(level.split(" ")[0]))
+        if self._lanes.get(drone) == best:
+            return
+        self._lanes[drone] = best
+        path, colours = f"lanes/drone_{drone}", self._lane_colours[drone]
+        if best not in colours:
+            colours[best] = _level_colour(best)
+            self._canvas.static(path, rr.StateConfiguration(values=list(colours), colors=list(colours.values())))
+        self._state(path, t_s, best)
+
+    def _state(self, path: str, t_s: float, state: str) -> None:
+        self._canvas.columns(path, np.array([t_s]), rr.StateChange.columns(state=[state]))
+
+    def _events(self, events: pa.Table) -> None:
+        rows = events.to_pylist()
+        if rows:
+            texts = [f"{'fleet' if r['drone'] < 0 else 'drone ' + str(r['drone'])}: {r['text']}" for r in rows]
+            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[c.WARNING] * len(rows))
+            self._canvas.columns("log/events", np.array([r["t_s"] for r in rows]), columns)
+
+
+def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
+    """Changes of what a link carries (a disc that moves is none); links of a drone that change alike in one entry.
+
+    The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
+    brought up to date. Each entry comes before the next one's changes are in `carried`.
+    """
+    entry: dict[str, Any] | None = None
+    for row in directives.to_pylist():
+        link, level = (row["drone"], row["peer"]), describe(row)
+        before = carried.get(link, "nothing")
+        if level == before:
+            continue
+        change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
+        if entry is not None and all(entry[k] == v for k, v in change.items()):
+            entry["peers"].append(row["peer"])
+        else:
+            if entry is not None:
+                yield entry
+            entry = {**change, "peers": [row["peer"]]}
+        carried[link] = level
+    if entry is not None:
+        yield entry
+
+
+def in_words(change: dict[str, Any]) -> str:
+    """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz (goodput 3.1 < 5 Mb/s)`."""
+    peers = ", ".join(str(p) for p in change["peers"])
+    why = f" ({change['reason']})" if change["reason"] else ""
+    return f"drone {change['drone']} → {peers}: {change['to']}{why}"
+
+
+def _level_colour(level: str) -> c.Rgba:
+    """The representation's colour, darker at lower rates."""
+    colour = c.SENT[level.split(" ")[0]]
+    rate = re.search(r"at ([\d.]+) Hz", level)
+    light = 1.0 if rate is None else 0.55 + 0.45 * min(1.0, float(rate[1]) / 10.0)
+    r, g, b = (round(light * part) for part in colour[:3])
+    return r, g, b, 255

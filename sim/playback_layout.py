@@ -1,0 +1,122 @@
+"""How a playback is laid out, so that it tells the sortie's story without a click, and how to read it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from fleet.coverage import footprint_radius_m
+from fleet.formation import slots
+from scenarios.schema import Scenario
+from sim.playback_canvas import SIM_TIME, SPAN_M
+
+SEEN = """
+**Boxes**: what drone {ego} makes of the scene from its own view and what it was sent: green, a car found;
+yellow, missed; red, a false alarm. The other drones' boxes can be switched on under `world/seen`.
+"""
+
+EGO = 0
+"""Whose detections are shown until another's are switched on."""
+MAX_LANES = 8
+"""Lanes of more drones than this would push the plots out."""
+
+LEGEND = """
+Each drone has one colour, here and in the plots; its label is its number and its charge, and the **ring** on the
+ground what its camera sees straight below. Drones are drawn {span:.0f} m wide.
+
+**Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
+red 1 or less; grey: nothing is sent. The **pink ring** is the mission disc around the target.
+{seen}
+"""
+
+
+def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
+    """Scene and decisions on the left, causes and costs over time on the right."""
+    n, altitude_m = scenario.fleet.drones, scenario.fleet.formation.altitude_m
+    offsets = slots(scenario.fleet.formation.shape, n, scenario.fleet.formation.spacing_m)
+    reach_m = float(np.abs(offsets).max()) + footprint_radius_m(altitude_m)
+    accuracy = scenario.perception.detector != "none"
+    hidden: dict[str | rr.encodings.EntityPath, Any] = {
+        f"world/seen/{i}": rrb.EntityBehavior(visible=False) for i in range(n) if i != EGO
+    }
+    scene = rrb.Spatial3DView(
+        name="the fleet over the town",
+        origin="world/fleet",  # the eye flies along with the fleet
+        contents="/world/**",
+        overrides=hidden,
+        background=(20, 24, 30, 255),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(-1.4 * reach_m, -1.0 * reach_m, altitude_m + 0.95 * reach_m),
+            look_target=(0.0, -0.1 * reach_m, 0.3 * altitude_m),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+    )
+    log = rrb.TextLogView(
+        name="who decided what, and why",
+        contents=["/log/**"],
+        columns=rrb.TextLogColumns(
+            timeline_columns=[rrb.encodings.TimelineColumn(SIM_TIME)], text_log_columns=["Body"]
+        ),
+    )
+    legend = rrb.TextDocumentView(name="how to read this", contents=["/about"])
+    n_lanes = min(n, MAX_LANES)
+    lanes = ["/lanes/phase", *(f"/lanes/drone_{i}" for i in range(n_lanes))]
+    axis = rrb.TimeAxis(
+        link="Independent",
+        view_range=rrb.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seconds=0.0),
+            end=rrb.TimeRangeBoundary.absolute(seconds=scenario.duration_s),
+        ),
+    )
+
+    def plot(
+        name: str, folder: str, y: tuple[float, float] | None = None, *, legend: bool = True
+    ) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            name=name,
+            contents=[f"/plots/{folder}/**"],
+            axis_x=axis,
+            axis_y=None if y is None else rrb.ScalarAxis(range=y),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        )
+
+    plots: list[rrb.View | rrb.Container] = [
+        rrb.StateTimelineView(name="phase, and what each drone sends on its best link", contents=lanes, time_view=axis),
+        plot("battery, %", "battery", legend=False),
+        plot("goodput, mean of a drone's links, Mb/s", "goodput", legend=False),
+        plot("traffic by representation and fate, Mb/s", "traffic"),
+        rrb.Horizontal(
+            plot("age of descriptors, 99th percentile, ms", "age", legend=False),
+            plot("channel busy, %", "medium", (0.0, 100.0), legend=False),
+        ),
+    ]
+    shares = [0.5 + 0.26 * (n_lanes + 1), 1.0, 1.0, 1.2, 0.8]
+    if accuracy:
+        plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
+        shares.insert(1, 1.2)
+    left = rrb.Vertical(scene, rrb.Horizontal(log, legend, column_shares=[3, 2]), row_shares=[3, 1])
+    return rrb.Blueprint(
+        rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2]),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline=SIM_TIME,
+            playback_speed=1.0 if live else 2.0,
+            play_state="following" if live else "playing",
+            loop_mode="off",
+        ),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def legend(scenario: Scenario) -> rr.TextDocument:
+    """How to read the playback, for someone who has never seen one."""
+    seen = "" if scenario.perception.detector == "none" else SEEN.format(ego=EGO)
+    return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen).strip(), media_type=rr.MediaType.MARKDOWN)

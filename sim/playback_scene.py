@@ -1,0 +1,371 @@
+"""The 3-D scene of a playback: the town, its cars, the drones and their links, and what an ego saw.
+
+World frame ENU, metres; radii are metres where positive and widths on the screen where negative (Rerun's own sign). Everything takes tables, so that the whole record and one second of it are drawn alike;
+what a slice needs from before it (trails, goodput, recent bytes) is kept here. A row at time t shows what was
+known before t, which is why slices of whole seconds draw the same as the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from fleet.coverage import footprint_radius_m
+from perception.scene import SceneModel
+from perception.town import KERB_M, LANE_M, PAVEMENT_M
+from perception.traffic import Cars
+from perception.types import Boxes
+from scenarios.schema import Scenario
+from sim import playback_canvas as c
+from sim.playback_canvas import SPAN_M, Canvas, Floats
+from sim.sightings import Sighting
+
+TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
+RECENT_S = 1.0
+CARS_WITHIN_M = 160.0
+"""Moving cars are drawn up to this far from the middle of the fleet."""
+MANY_DRONES = 8
+"""In fleets above this, links that carry nothing are left out."""
+GROUND_M = 1.0
+BOX_HEIGHT_M = 1.8
+CIRCLE = np.array([(np.cos(a), np.sin(a), 0.0) for a in np.linspace(0, 2 * np.pi, 49)])
+
+
+class Drawing:
+    """Draws the scene of one sortie; `begin` once, then `add` with the tables in order of time."""
+
+    def __init__(self, canvas: Canvas, scenario: Scenario, scene: SceneModel) -> None:
+        self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
+        self._rate_hz, self._has_target = scenario.context.rate_hz, scenario.mission.target is not None
+        n = self._n
+        pairs = np.argwhere(~np.eye(n, dtype=bool))
+        self._senders, self._receivers = pairs[:, 0], pairs[:, 1]
+        self._history: NDArray[np.float64] = np.zeros((0, n, 3))
+        self._frames = 0
+        self._resting: dict[int, Floats] = {}
+        self._goodput: Floats = np.zeros((n, n))
+        self._recent: Floats = np.zeros((0, 3))
+        self._disc_shown = False
+
+    # --- what holds at all times -----------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Draw the town and the drones' bodies."""
+        canvas = self._canvas
+        canvas.static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._town()
+        for i in range(self._n):
+            colour = c.drone_colour(i)
+            _drone(canvas, f"world/drones/{i}", colour)
+            ring = rr.LineStrips3D([CIRCLE], colors=[(*colour[:3], 200)], radii=[-1.5])
+            canvas.static(f"world/footprints/{i}", ring)
+            canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
+            for name, colour, width in (("found", c.FOUND, 2.0), ("missed", c.MISSED, 1.5), ("false", c.FALSE, 1.5)):
+                looks = rr.Boxes3D.from_fields(colors=[colour], radii=[-width])
+                canvas.static(f"world/seen/{i}/{name}", looks)
+        disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
+        canvas.static("world/mission/disc", disc)
+        if self._has_target:
+            pin = rr.Arrows3D(
+                vectors=[(0, 0, -12)], origins=[(0, 0, 15)], radii=[0.6], colors=[c.TARGET], labels=["target"]
+            )
+            canvas.static("world/target/pin", pin)
+
+    def _town(self) -> None:
+        canvas, (x0, y0, x1, y1) = self._canvas, self._scene.rect
+        ground = ground_image(self._scene.rect, self._scene.config.block_m)
+        canvas.static(
+            "world/town/ground",
+            rr.GridMap(
+                data=ground[::-1].tobytes(),  # its first row is the north edge
+                format=rr.components.ImageFormat(
+                    width=ground.shape[1], height=ground.shape[0], color_model="RGB", channel_datatype="U8"
+                ),
+                cell_size=GROUND_M,
+                translation=[x0, y0, 0.0],
+            ),
+        )
+        blocks = self._scene.town.blocks(x0, y0, x1, y1)
+        houses = np.concatenate([b.buildings for b in blocks])
+        houses = houses[_inside(houses[:, :2], self._scene.rect) & _inside(houses[:, 2:4], self._scene.rect)]
+        if len(houses):
+            low, high, top = houses[:, :2], houses[:, 2:4], houses[:, 4]
+            tone = _mix((150, 112, 98), (186, 184, 180), houses[:, 5])
+            canvas.static(
+                "world/town/buildings",
+                rr.Boxes3D(
+                    centers=np.column_stack([(low + high) / 2, top / 2]),
+                    half_sizes=np.column_stack([(high - low) / 2, top / 2]),
+                    colors=tone, fill_mode="solid",
+                ),
+            )  # fmt: skip
+        trees = np.concatenate([b.trees for b in blocks])
+        trees = trees[_inside(trees[:, :2], self._scene.rect)]
+        if len(trees):
+            crowns = np.column_stack([trees[:, :2], np.maximum(trees[:, 3] - trees[:, 2], trees[:, 2])])
+            tone = _mix((48, 92, 44), (86, 122, 56), trees[:, 4])
+            canvas.static("world/town/trees", rr.Points3D(crowns, radii=trees[:, 2], colors=tone))  # spheres, cheaply
+        parked = self._scene.parked_cars
+        if len(parked):
+            canvas.static("world/cars/parked", rr.Boxes3D(**_car_boxes(parked), fill_mode="solid"))
+
+    # --- what changes ----------------------------------------------------------------------------
+
+    def add(self, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
+        """Draw new rows: `states`, `mission`, `descriptors`, `transmissions`, and the fusions seen."""
+        n = self._n
+        column = {k: new["states"][k].to_numpy() for k in new["states"].column_names}
+        t_s = column["t_s"][::n]
+        position = np.column_stack([column[k] for k in ("x_m", "y_m", "z_m")]).reshape(-1, n, 3)
+        attitude = np.column_stack([column[k] for k in ("qx", "qy", "qz", "qw")]).reshape(-1, n, 4)
+        airborne = column["airborne"].reshape(-1, n)
+        self._land(t_s, position, attitude, airborne)
+        self._drones(t_s, position, attitude, column["soc"].reshape(-1, n), airborne)
+        self._links(t_s, position, airborne, new)
+        self._cars(t_s, position)
+        self._mission(new["mission"])
+        self._seen(list(seen))
+
+    def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
+        """Put drones that are down on the ground where they came down (the record lets them fly on), in place."""
+        for i in np.flatnonzero(~airborne.all(axis=0)).tolist():
+            first = int(np.argmin(airborne[:, i]))
+            if i not in self._resting:
+                before = position[first - 1, i] if first else self._last_position(i, position)
+                self._resting[i] = np.array([before[0], before[1], 0.3])
+                nothing = Boxes.empty()
+                self._sighting_rows(i, t_s[first : first + 1], [nothing], [nothing], [nothing])
+                grey = rr.Boxes3D.columns(colors=[c.FALLEN] * 4).partition([4])
+                self._canvas.columns(f"world/drones/{i}/body", t_s[first : first + 1], grey)
+            position[first:, i] = self._resting[i]
+            attitude[first:, i] = (0.0, 0.0, 0.0, 1.0)
+
+    def _last_position(self, drone: int, position: Floats) -> Floats:
+        return np.asarray(self._history[-1, drone] if len(self._history) else position[0, drone])
+
+    def _drones(
+        self, t_s: Floats, position: Floats, attitude: Floats, soc: Floats, airborne: NDArray[np.bool_]
+    ) -> None:
+        canvas, step = self._canvas, max(1, round(TRAIL_STEP_S * self._rate_hz))
+        beads = round(TRAIL_S / TRAIL_STEP_S)
+        track = np.concatenate([self._history, position])
+        base = self._frames - len(self._history)  # the frame that track[0] is
+        frames = self._frames + np.arange(len(t_s))
+        # Beads stand at whole half seconds, so that they stay where they are while the drone flies on.
+        bead_frames = (frames // step)[:, None] * step - step * np.arange(beads)[None, :]
+        kept = bead_frames >= 0
+        lengths = kept.sum(axis=1)
+        second = np.flatnonzero(np.floor(t_s + 1e-6) > np.floor(t_s - 1.0 / self._rate_hz + 1e-6))
+        for i in range(self._n):
+            moves = rr.Transform3D.columns(translation=position[:, i], quaternion=attitude[:, i])
+            canvas.columns(f"world/drones/{i}", t_s, moves)
+            names = [
+                f"{i} · {s:.0%}" if up else f"{i} · down"
+                for s, up in zip(soc[second, i], airborne[second, i], strict=True)
+            ]
+            canvas.columns(f"world/drones/{i}/name", t_s[second], rr.Points3D.columns(labels=names))
+            radius = np.maximum(1e-3, [footprint_radius_m(z) for z in position[:, i, 2].tolist()])
+            centre = np.column_stack([position[:, i, :2], np.full(len(t_s), 0.4)])
+            scale = np.column_stack([radius, radius, np.ones(len(t_s))])
+            canvas.columns(f"world/footprints/{i}", t_s, rr.Transform3D.columns(translation=centre, scale=scale))
+            trail = track[:, i][(bead_frames - base)[kept]]
+            canvas.columns(f"world/trails/{i}", t_s, rr.Points3D.columns(positions=trail).partition(lengths))
+        middle = position.mean(axis=1) * (1.0, 1.0, 0.0)
+        canvas.columns("world/fleet", t_s, rr.Transform3D.columns(translation=middle))
+        self._frames += len(t_s)
+        self._history = track[-(step * beads + 1) :]
+
+    def _links(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], new: Mapping[str, pa.Table]) -> None:
+        """Links as arrows, their colour the sender's goodput, their width the traffic of the last second."""
+        if self._n < 2:
+            return
+        goodput = self._goodput_at(t_s, new["descriptors"])
+        mbps = self._recent_mbps(t_s, new["transmissions"])
+        i, j = self._senders, self._receivers
+        begin, end = position[:, i], position[:, j]
+        way = end - begin
+        length = np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
+        ahead = way / length
+        right = np.cross(ahead, (0.0, 0.0, 1.0))
+        # Both directions of a link side by side, as lanes, and clear of the drones.
+        begin = begin + 0.9 * right + np.minimum(SPAN_M * 0.7, 0.2 * length) * ahead
+        end = end + 0.9 * right - np.minimum(SPAN_M * 0.7, 0.2 * length) * ahead
+        busy = mbps[:, i, j] > 0
+        shown = airborne[:, i] & airborne[:, j]
+        if self._n > MANY_DRONES:
+            shown = shown & busy
+        colours = np.where(busy[..., None], c.goodput_colours(goodput[:, i, j]), np.array(c.IDLE, np.uint8))
+        width = np.where(busy, 1.5 + 1.0 * np.log2(1.0 + mbps[:, i, j]), 0.75)
+        links = rr.Arrows3D.columns(
+            origins=begin[shown], vectors=(end - begin)[shown], colors=_packed(colours[shown]), radii=-width[shown]
+        )
+        self._canvas.columns("world/links", t_s, links.partition(shown.sum(axis=1)))
+
+    def _goodput_at(self, t_s: Floats, descriptors: pa.Table) -> Floats:
+        """Goodput [frame, sender, receiver] in each sender's latest descriptor before the frame, Mb/s."""
+        n = self._n
+        out = np.zeros((len(t_s), n, n))
+        sent_s, sender = descriptors["t_s"].to_numpy(), descriptors["drone"].to_numpy()
+        values = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, n - 1))
+        for i in range(n):
+            mine = sender == i
+            peers = [k for k in range(n) if k != i]
+            known = np.concatenate([self._goodput[i, peers][None], values[mine]])
+            out[:, i, peers] = known[np.searchsorted(sent_s[mine], t_s, side="left")]
+            self._goodput[i, peers] = known[-1]
+        return out
+
+    def _recent_mbps(self, t_s: Floats, transmissions: pa.Table) -> Floats:
+        """Traffic [frame, sender, receiver] handed to the radio and settled in the second before the frame, Mb/s."""
+        n, window = self._n, max(1, round(RECENT_S * self._rate_hz))
+        names = ("t_done_s", "drone", "peer", "payload_bytes")
+        rows = np.column_stack([transmissions[k].to_numpy().astype(float) for k in names])
+        rows = rows[~np.isnan(rows[:, 0])]
+        rows = np.concatenate([self._recent.reshape(-1, 4), rows])
+        out = np.zeros((len(t_s), n, n))
+        if len(t_s) == 0:
+            self._recent = rows
+            return out
+        first = self._frames - len(t_s) - window
+        frame = np.floor(rows[:, 0] * self._rate_hz + 1e-6).astype(int) - first
+        bins = np.zeros((len(t_s) + window, n, n))
+        now = (frame >= 0) & (frame < len(bins))
+        np.add.at(bins, (frame[now], rows[now, 1].astype(int), rows[now, 2].astype(int)), rows[now, 3])
+        total = np.cumsum(np.concatenate([np.zeros((1, n, n)), bins]), axis=0)
+        self._recent = rows[frame >= len(t_s)]
+        return np.asarray((total[window:-1] - total[: len(t_s)]) * 8e-6 / RECENT_S)
+
+    def _cars(self, t_s: Floats, position: Floats) -> None:
+        near, lengths = [], []
+        for t, (x, y) in zip(t_s.tolist(), position[..., :2].mean(axis=1).tolist(), strict=True):
+            cars = self._scene.moving_cars(t)
+            cars = cars.where((cars.x_m - x) ** 2 + (cars.y_m - y) ** 2 <= CARS_WITHIN_M**2)
+            near.append(cars)
+            lengths.append(len(cars))
+        if near:
+            every = Cars(*(np.concatenate([getattr(k, f) for k in near]) for f in Cars.__slots__))
+            boxes = rr.Boxes3D.columns(**_car_boxes(every)).partition(lengths)
+            self._canvas.columns("world/cars/moving", t_s, boxes)
+
+    def _mission(self, mission: pa.Table) -> None:
+        t_s = mission["t_s"].to_numpy()
+        x, y, radius, tx, ty = (
+            mission[k].to_numpy() for k in ("region_x_m", "region_y_m", "region_radius_m", "target_x_m", "target_y_m")
+        )
+        there = ~np.isnan(radius)
+        before = np.concatenate([[self._disc_shown], there])[: len(there)]
+        for k in np.flatnonzero(there != before).tolist():
+            ring = [CIRCLE] if there[k] else []
+            strips = rr.LineStrips3D.columns(strips=ring).partition([len(ring)])
+            self._canvas.columns("world/mission/disc", t_s[k : k + 1], strips)
+        if len(there):
+            self._disc_shown = bool(there[-1])
+        centre = np.column_stack([x, y, np.full(len(x), 0.6)])[there]
+        scale = np.column_stack([radius, radius, np.ones(len(x))])[there]
+        self._canvas.columns("world/mission", t_s[there], rr.Transform3D.columns(translation=centre, scale=scale))
+        if self._has_target:
+            self._canvas.columns(
+                "world/target", t_s, rr.Transform3D.columns(translation=np.column_stack([tx, ty, np.zeros(len(tx))]))
+            )
+
+    def _seen(self, seen: list[Sighting]) -> None:
+        for i in sorted({s.drone for s in seen}):
+            own = [s for s in seen if s.drone == i]
+            t_s = np.array([s.t_s for s in own])
+            self._sighting_rows(i, t_s, [s.found for s in own], [s.missed for s in own], [s.false for s in own])
+
+    def _sighting_rows(
+        self, drone: int, t_s: Floats, found: list[Boxes], missed: list[Boxes], false: list[Boxes]
+    ) -> None:
+        for name, several in (("found", found), ("missed", missed), ("false", false)):
+            boxes = Boxes.join(several)
+            columns = _flat_boxes(boxes)
+            lengths = [len(b) for b in several]
+            self._canvas.columns(f"world/seen/{drone}/{name}", t_s, rr.Boxes3D.columns(**columns).partition(lengths))
+
+
+# --- shapes ----------------------------------------------------------------------------------------
+
+
+def ground_image(rect: tuple[float, float, float, float], block_m: float) -> NDArray[np.uint8]:
+    """Roads, kerbs, pavements and lots [row = y, column = x, 3] at 1 m; its first row is the south edge."""
+    x0, y0, x1, y1 = rect
+    x = x0 + GROUND_M * (np.arange(int((x1 - x0) / GROUND_M)) + 0.5)
+    y = y0 + GROUND_M * (np.arange(int((y1 - y0) / GROUND_M)) + 0.5)
+    across_x, across_y = (np.abs((v / block_m + 0.5) % 1.0 - 0.5) * block_m for v in (x, y))
+    near = np.minimum(across_x[None, :], across_y[:, None])
+    image = np.empty((len(y), len(x), 3), np.uint8)
+    image[...] = (70, 84, 58)
+    image[near < PAVEMENT_M] = (104, 102, 98)
+    image[near < KERB_M] = (64, 64, 67)
+    image[near < LANE_M] = (54, 54, 58)
+    return image
+
+
+def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
+    """A quadrotor: nose, body and two crossed arms, four rotors."""
+    arm = SPAN_M / 2 * np.sqrt(0.5)
+    diagonal = [(0.0, 0.0, np.sin(a / 2), np.cos(a / 2)) for a in (np.pi / 4, -np.pi / 4)]
+    level = (0.0, 0.0, 0.0, 1.0)
+    canvas.static(
+        f"{path}/body",
+        rr.Boxes3D(
+            centers=[(0, 0, 0), (0, 0, 0), (0, 0, 0.1), (1.1, 0, 0.1)],
+            half_sizes=[(SPAN_M / 2, 0.18, 0.12), (SPAN_M / 2, 0.18, 0.12), (0.9, 0.6, 0.45), (0.5, 0.25, 0.2)],
+            quaternions=[*diagonal, level, level],
+            fill_mode="solid",
+        ),
+    )
+    # Not static, because a drone that comes down goes grey; a static colour would win over that.
+    colours = [(230, 230, 235, 255)] * 2 + [colour, (255, 255, 255, 255)]
+    canvas.columns(f"{path}/body", np.zeros(1), rr.Boxes3D.columns(colors=colours).partition([4]))
+    rotors = rr.Cylinders3D(
+        lengths=[0.12] * 4, radii=[1.05] * 4, centers=[(x, y, 0.35) for x in (arm, -arm) for y in (arm, -arm)],
+        colors=[(*colour[:3], 255)] * 4, fill_mode="solid",
+    )  # fmt: skip
+    canvas.static(f"{path}/rotors", rotors)
+    canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))
+
+
+def _car_boxes(cars: Cars) -> dict[str, Any]:
+    half = np.column_stack([cars.length_m, cars.width_m, cars.height_m]) / 2
+    return {
+        "centers": np.column_stack([cars.x_m, cars.y_m, half[:, 2]]),
+        "half_sizes": half,
+        "quaternions": _about_z(cars.yaw_rad),
+        "colors": _packed(np.column_stack([cars.colour, np.full(len(cars), 255, np.uint8)])),
+    }
+
+
+def _flat_boxes(boxes: Boxes) -> dict[str, Any]:
+    half = np.column_stack([boxes.size_m / 2, np.full(len(boxes), BOX_HEIGHT_M / 2)])
+    return {
+        "centers": np.column_stack([boxes.xy_m, half[:, 2]]),
+        "half_sizes": half,
+        "quaternions": _about_z(boxes.yaw_rad),
+    }
+
+
+def _about_z(yaw_rad: np.ndarray) -> Floats:
+    zero = np.zeros(len(yaw_rad))
+    return np.column_stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)])
+
+
+def _packed(rgba: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Colours [n, 4] as 0xRRGGBBAA [n], which columns partition without guessing."""
+    r, g, b, a = (rgba[:, k].astype(np.uint32) for k in range(4))
+    return np.asarray(r << 24 | g << 16 | b << 8 | a, np.uint32)
+
+
+def _inside(xy: Floats, rect: tuple[float, float, float, float]) -> NDArray[np.bool_]:
+    x0, y0, x1, y1 = rect
+    return np.asarray((xy[:, 0] >= x0) & (xy[:, 0] <= x1) & (xy[:, 1] >= y0) & (xy[:, 1] <= y1))
+
+
+def _mix(a: tuple[int, int, int], b: tuple[int, int, int], part: Floats) -> NDArray[np.uint8]:
+    return (np.array(a) * (1 - part[:, None]) + np.array(b) * part[:, None]).astype(np.uint8)

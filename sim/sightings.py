@@ -1,0 +1,73 @@
+"""What each scored fusion saw: its detections judged against the cars that were there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from perception.ap import Matched, match
+from perception.types import Boxes
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One ego's fusion: `found` are cars as detected, `false` detections without a car, `missed` cars without one.
+
+    `full` and `mission` are the matches behind AP; `mission` is None while there is no mission disc.
+    """
+
+    t_s: float
+    drone: int
+    found: Boxes
+    false: Boxes
+    missed: Boxes
+    full: Matched
+    mission: Matched | None
+
+
+def sightings(
+    tables: Mapping[str, pa.Table], disc_t_s: NDArray[np.float64], discs: NDArray[np.float64]
+) -> Iterator[Sighting]:
+    """Judge every fusion in `tables["fusions"]`, whose boxes stand in the box tables in the same order.
+
+    Args:
+        tables: `fusions`, `detections` and `truths`, whole or a slice of whole fusions.
+        disc_t_s, discs: [n] times, and [n, 3] x, y, radius of the mission disc from each on; NaN where there is none.
+    """
+    fusions = tables["fusions"]
+    found, truths = _boxes(tables["detections"]), _boxes(tables["truths"])
+    at, truth_at = 0, 0
+    rows = zip(*(fusions[c].to_pylist() for c in ("t_s", "drone", "detections", "truths")), strict=True)
+    for t_s, drone, count, truth_count in rows:
+        own = found.take(np.arange(at, at + count))
+        truth = truths.take(np.arange(truth_at, truth_at + truth_count))
+        at, truth_at = at + count, truth_at + truth_count
+        full = match(own, truth)
+        own = own.take(np.argsort(-own.score, kind="stable"))  # the order of full.hit
+        hits = own.take(full.hit)
+        disc = discs[np.searchsorted(disc_t_s, t_s, side="right") - 1]
+        mission = None if np.isnan(disc[2]) else match(own, truth, (float(disc[0]), float(disc[1]), float(disc[2])))
+        yield Sighting(t_s, drone, hits, own.take(~full.hit), truth.take(_uncovered(truth, hits)), full, mission)
+
+
+def _uncovered(truth: Boxes, hits: Boxes) -> NDArray[np.bool_]:
+    """Which cars no hit stands for; each hit stands for one car, together at the least distance."""
+    away = ((truth.xy_m[:, None, :] - hits.xy_m[None, :, :]) ** 2).sum(axis=-1)
+    left = np.ones(len(truth), bool)
+    left[linear_sum_assignment(away)[0]] = False
+    return left
+
+
+def _boxes(table: pa.Table) -> Boxes:
+    column = {c: table[c].to_numpy() for c in table.column_names}
+    return Boxes(
+        np.column_stack([column["x_m"], column["y_m"]]),
+        np.column_stack([column["length_m"], column["width_m"]]),
+        column["yaw_rad"],
+        column.get("score", np.ones(table.num_rows)),
+    )
