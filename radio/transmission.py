@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import exp, log1p
 
-from scipy.stats import binom
+import numpy as np
+from scipy.special import bdtr
 
 
 class Status(StrEnum):
@@ -71,7 +72,7 @@ def losses(u: float, count: int, q: float) -> int:
     if u < none:
         return 0
     if none < 1e-200:  # far from both ends; rare
-        return max(0, int(binom.ppf(u, count, q)))
+        return min(count, int(np.searchsorted(bdtr(np.arange(count), count, q), u, side="right")))
     k, term, total = 0, none, none
     odds = q / (1.0 - q)
     while total <= u and k < count:

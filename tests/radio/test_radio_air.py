@@ -123,6 +123,7 @@ def test_best_effort_delivers_the_power_of_its_fragments(q: float, payload: int)
 
 
 @example(0.0, 1075, 0.5)
+@example(2.3e-308, 805, 0.625)
 @given(st.floats(0, 1, exclude_max=True), st.integers(1, 2000), st.floats(0, 1))
 def test_losses_invert_the_binomial(u: float, count: int, q: float) -> None:
     k = losses(u, count, q)
