@@ -62,7 +62,8 @@ def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[
     x, y = c * dx + s * dy, c * dy - s * dx
     inside = (np.abs(x) < HALF_EXTENT_M) & (np.abs(y) < HALF_EXTENT_M)
     local: NDArray[np.float64] = np.stack([x, y, cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
-    return local[inside]
+    kept: NDArray[np.float64] = local[inside]
+    return kept
 
 
 def targets(
