@@ -10,6 +10,9 @@ OVERLAP_STEP = 0.1
 """Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""
 
 
+_IDS = 256  # agent_id is a byte
+
+
 def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> float:
     """Area shared by two discs over the area of the smaller one, 0 … 1.
 
@@ -35,9 +38,15 @@ def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
 
 
 def peers_by_overlap(view: FleetView) -> list[int]:
-    """Peers by falling footprint overlap with the ego, in steps of `OVERLAP_STEP`; ties by ascending id."""
+    """Peers by falling footprint overlap with the ego, in steps of `OVERLAP_STEP`.
+
+    Ties go round by id, beginning after the ego, so that drones in one place do not all choose the same peers.
+    """
     me = view.me
     if me is None:
         return []
-    ranked = [(-round(footprint_overlap(me, view.descriptors[p]) / OVERLAP_STEP), p) for p in view.peers]
-    return [p for _, p in sorted(ranked)]
+    ranked = [
+        (-round(footprint_overlap(me, view.descriptors[p]) / OVERLAP_STEP), (p - view.ego) % _IDS, p)
+        for p in view.peers
+    ]
+    return [p for _, _, p in sorted(ranked)]

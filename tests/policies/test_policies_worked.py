@@ -8,7 +8,7 @@ import pytest
 from policies_examples import fleet_of
 
 from policies.contract import Directive, Disc, FleetView, PolicyError, Representation, TaskPhase, check_directives
-from policies.geometry import circle_overlap
+from policies.geometry import circle_overlap, peers_by_overlap
 from policies.registry import parameters, resolve
 from policies.worked import worked
 
@@ -61,7 +61,14 @@ def test_jitter_of_a_metre_does_not_reorder_peers() -> None:
     near[3] = replace(near[3], position_m=(15.0, 0.5, 60.0))
     near[2] = replace(near[2], position_m=(15.5, 0.0, 60.0))
     sent = [d.destination for d in worked(FleetView(0, 0.1, near, view.age_s)) if d.rate_hz]
-    assert sent == [1, 2], "overlaps within a step tie, and ties go to the lower id"
+    assert sent == [1, 2], "overlaps within a step tie, and ties go round by id"
+
+
+def test_drones_in_one_place_do_not_all_choose_the_same_peers() -> None:
+    view = fleet_of(5)
+    here = {i: replace(d, position_m=(0.0, 0.0, 60.0)) for i, d in view.descriptors.items()}
+    chosen = {i: peers_by_overlap(FleetView(i, 0.1, here, view.age_s))[:2] for i in here}
+    assert chosen == {0: [1, 2], 1: [2, 3], 2: [3, 4], 3: [4, 0], 4: [0, 1]}
 
 
 @pytest.mark.parametrize(
