@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
-.PHONY: help sortie test quick check format bench clean
+
+.PHONY: help sortie test quick lint check format bench clean
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
@@ -26,11 +27,12 @@ test: $(STAMP) ## run the whole test suite
 quick: $(STAMP) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' -x
 
-check: $(STAMP) ## lint, types, tests
+lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+
+check: lint test ## lint, types, tests
 
 format: $(STAMP) ## format and fix what can be fixed
 	$(BIN)/ruff check --fix .

@@ -168,7 +168,7 @@ class Agent:
         if self.sensed:
             self.latest = capture
             done = self.env.timeout(self._rules.compute_delay_s)
-            done.callbacks.append(lambda _event: self._send(capture))  # type: ignore[union-attr]
+            done.callbacks.append(lambda _event: self._send(capture))
 
     # --- the context plane ---------------------------------------------------------------------
 

@@ -19,7 +19,6 @@ DIRECTIVE_BYTES = 36
 """The directive rides along, so that the receiver knows rung, ROI and fusion weight."""
 RAW_BYTES = 5 * 800 * 450 * 3
 """Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
-MAX_TRACKS = 12
 
 _EPSILON_S = 1e-6
 
@@ -67,7 +66,7 @@ def make_payload(
     else:
         boxes = count_boxes(directive.roi)
         if rung == Representation.TRACKS:
-            boxes = min(boxes, MAX_TRACKS)
+            boxes = min(boxes, budget.MAX_TRACKS)
             content = boxes * budget.TRACK_BYTES
         else:
             content = boxes * budget.DETECTION_BYTES

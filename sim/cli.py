@@ -179,19 +179,38 @@ def list_(
 
 @app.command()
 def train(
-    out_file: Annotated[Path, typer.Option("--out", help="Where the weights go (safetensors).")] = Path(
-        "runs/train/disconet.safetensors"
-    ),
+    out_file: Annotated[
+        Path, typer.Option("--out", help="Where the weights go (safetensors); their card lies beside.")
+    ] = Path("runs/train/disconet.safetensors"),
+    frames: Annotated[int, typer.Option(help="Fleet-frames to render and learn from.", min=12)] = 1200,
+    steps: Annotated[int, typer.Option(help="Optimiser steps of four frames.", min=1)] = 700,
     minutes: Annotated[float | None, typer.Option(help="Stop after this much wall time.", min=0.1)] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", min=1)] = None,
     seed: Annotated[int, typer.Option(help="Seed of data and weights.", min=0)] = 0,
+    warm_start: Annotated[Path | None, typer.Option(help="Begin from these weights.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
 ) -> None:
-    """Train the detector with full sharing on procedural scenes; resumable."""
+    """Train the detector with full sharing on procedural scenes; a run that was cut off goes on where it was."""
     from perception.train import train as train_detector
 
     with _progress() as bar:
-        result = train_detector(out_file, steps=steps, minutes=minutes, seed=seed, resume=resume, bar=bar)
+        bars: dict[str, Callable[[float], None]] = {}
+
+        def progress(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                bars[stage] = bar(stage, of)
+            bars[stage](done)
+
+        result = train_detector(
+            out_file,
+            frames=frames,
+            steps=steps,
+            minutes=minutes,
+            seed=seed,
+            warm_start=warm_start,
+            resume=resume,
+            work=out_file.parent,
+            progress=progress,
+        )
     out.print(tables.training_table(result))
 
 

@@ -12,7 +12,7 @@ from fleet.agent import Agent, Received
 from fleet.auth import Dropped, DropReason, Opened, open_datagram
 from fleet.gate import Payload
 from perception.types import Capture
-from radio.air import Air, Status, Transmission
+from radio import Air, Status, Transmission
 from sim.record import Recorder
 
 NAN = float("nan")
@@ -39,7 +39,7 @@ class Ether:
         """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
         self.last_datagram[drone] = datagram
         opened = open_datagram(datagram, self._keys)
-        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard))
+        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard.tolist()))
 
     def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
         """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""

@@ -12,7 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perception.ap import Boxes, Matched, average_precision, match
+from perception.ap import Matched, average_precision, match
+from perception.types import Boxes
 from sim.record import SortieRecord
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")

@@ -20,7 +20,7 @@ from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
 from policies.registry import resolve
-from radio.air import Air
+from radio import Air
 from scenarios.schema import Scenario
 from scenarios.streams import stream
 from sim.adversity import group_key, schedule

@@ -19,7 +19,7 @@ from fleet.motion import Motion
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc
-from radio.air import Air
+from radio import Air
 from radio.topology import link_graph
 from scenarios.schema import Scenario
 from sim.mission import MissionPlan
@@ -34,7 +34,7 @@ USABLE_SNR_DB = 0.0
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
     """Call `act` at simulated time `t_s`."""
     event = env.timeout(max(0.0, t_s - env.now))
-    event.callbacks.append(lambda _event: act())  # type: ignore[union-attr]
+    event.callbacks.append(lambda _event: act())
 
 
 class World:
