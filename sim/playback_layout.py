@@ -92,10 +92,10 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         plot("traffic by representation and fate, Mb/s", "traffic"),
         rrb.Horizontal(
             plot("age of descriptors, 99th percentile, ms", "age", legend=False),
-            plot("channel busy, %", "medium", (0.0, 100.0), legend=False),
+            plot("channel busy, %", "medium", (0.0, 104.0), legend=False),
         ),
     ]
-    shares = [0.5 + 0.26 * (n_lanes + 1), 1.0, 1.0, 1.2, 0.8]
+    shares = [0.3 + 0.235 * (n_lanes + 1), 1.0, 1.0, 1.2, 0.9]
     if accuracy:
         plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
         shares.insert(1, 1.2)

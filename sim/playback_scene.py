@@ -68,6 +68,7 @@ class Drawing:
             for name, colour, width in (("found", c.FOUND, 2.0), ("missed", c.MISSED, 1.5), ("false", c.FALSE, 1.5)):
                 looks = rr.Boxes3D.from_fields(colors=[colour], radii=[-width])
                 canvas.static(f"world/seen/{i}/{name}", looks)
+        canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
         disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
         canvas.static("world/mission/disc", disc)
         if self._has_target:
