@@ -19,7 +19,7 @@ from fleet.gate import Gate, Payload, make_payload
 from fleet.staleness import LinkHealth, cap_by_age, health
 from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from perception.types import Capture
-from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives
+from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
 from policies.damping import LinkState, damp
 
 COVERAGE_PERIOD_S = 1.0
@@ -141,8 +141,14 @@ class Agent:
     def hear(self, descriptor: Descriptor) -> None:
         """A peer's descriptor, already checked, replaces the one held (keep-last-1)."""
         if self.airborne and descriptor.agent_id != self.drone:
-            self._known[descriptor.agent_id] = descriptor
-            self._heard_at_s[descriptor.agent_id] = self.env.now
+            self._hold(descriptor)
+
+    def _hold(self, descriptor: Descriptor) -> None:
+        sender = descriptor.agent_id
+        if sender not in self._known:  # by ascending id, so that the order of hearing decides nothing
+            self._known = dict(sorted([*self._known.items(), (sender, descriptor)]))
+        self._known[sender] = descriptor
+        self._heard_at_s[sender] = self.env.now
 
     def receive(self, received: Received) -> None:
         """A peer's payload arrived; the freshest capture is kept, late ones do not replace newer ones."""
@@ -161,7 +167,7 @@ class Agent:
 
     def _tick(self, frame: int) -> None:
         capture = self._senses.capture(frame)
-        self._known[self.drone] = self._publish(frame, capture)
+        self._hold(self._publish(frame, capture))
         self._decide()
         duty = self.gate.duty_percent
         self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
@@ -205,38 +211,42 @@ class Agent:
         self._log.descriptor(now_s, descriptor, len(datagram))
         return decode_descriptor(payload)
 
-    def _age_s(self, peer: int) -> float:
-        """Age of a descriptor by this drone's clock, and never less than the time since it came in."""
+    def _ages_s(self) -> dict[int, float]:
+        """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
         now_s = self.env.now
-        by_stamp_s = now_s + self.clock_skew_s - self._known[peer].stamp_ns * 1e-9
-        return max(by_stamp_s, now_s - self._heard_at_s.get(peer, now_s))
+        clock_s, heard_at_s = now_s + self.clock_skew_s, self._heard_at_s
+        ages_s = {}
+        for i, descriptor in self._known.items():
+            by_stamp_s, by_arrival_s = clock_s - descriptor.stamp_ns * 1e-9, now_s - heard_at_s[i]
+            ages_s[i] = by_stamp_s if by_stamp_s > by_arrival_s else by_arrival_s
+        return ages_s
 
     def _decide(self) -> None:
-        rules, now_s = self._rules, self.env.now
-        ages_s = {i: self._age_s(i) for i in sorted(self._known)}
-        view = FleetView(self.drone, rules.period_s, {i: self._known[i] for i in ages_s}, ages_s)
+        now_s, me = self.env.now, self.drone
+        ages_s = self._ages_s()
+        view = FleetView(me, self._rules.period_s, dict(self._known), ages_s)
         begin_ns = time.perf_counter_ns()
         directives = self.policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         check_directives(directives, view)
-        self._log.decision(now_s, self.drone, elapsed_ns, [a for i, a in ages_s.items() if i != self.drone])
+        self._log.decision(now_s, me, elapsed_ns, [age_s for i, age_s in ages_s.items() if i != me])
         by_peer = {d.destination: d for d in directives}
-        for peer in ages_s:
-            if peer != self.drone:
-                asked = by_peer.get(peer) or Directive(self.drone, peer, reason="the policy gave no directive")
-                self._enforce(asked, ages_s[peer], now_s)
+        for peer, age_s in ages_s.items():
+            if peer != me:
+                asked = by_peer.get(peer) or nothing(me, peer, "the policy gave no directive")
+                self._enforce(peer, asked, age_s, now_s)
 
-    def _enforce(self, asked: Directive, age_s: float, now_s: float) -> None:
+    def _enforce(self, peer: int, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
-        rules, peer = self._rules, asked.destination
+        rules = self._rules
         link = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
-        capped = cap_by_age(asked, link, age_s)
-        before = self._links.get(peer) or LinkState(Directive(self.drone, peer))
+        capped = asked if link == LinkHealth.FRESH else cap_by_age(asked, link, age_s)
+        before = self._links.get(peer) or LinkState(nothing(self.drone, peer, ""))
         after = damp(before, capped, now_s, rules.dwell_s)
         if after is before:
             return
         self._links[peer] = after
-        if after.enforced != before.enforced:
+        if after.enforced is not before.enforced and after.enforced != before.enforced:
             enforced = decode_directive(encode_directive(after.enforced))
             self.gate.enforce(enforced)
             self._log.directive(now_s, asked, enforced, link, after.enforced.reason)

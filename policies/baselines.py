@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
-from policies.contract import Directive, FleetView, Representation
+from policies.contract import Directive, FleetView, Representation, nothing
 from policies.geometry import peers_by_overlap
 
 RATE_HZ = 10.0
@@ -22,7 +22,7 @@ def _share_with(view: FleetView, chosen: Sequence[int], rho: float, why: str) ->
     return [
         Directive(view.ego, p, Representation.FEATURES, per_link, None, RATE_HZ, reason=why)
         if p in chosen
-        else Directive(view.ego, p, reason=f"fixed: not {why.removeprefix('fixed: ')}")
+        else nothing(view.ego, p, f"fixed: not {why.removeprefix('fixed: ')}")
         for p in view.peers
     ]
 
@@ -53,4 +53,4 @@ def random_k(view: FleetView, *, k: int = 2, rho: float = 1.0, salt: int = 0) ->
 
 def silence(view: FleetView) -> list[Directive]:
     """Nothing to anyone: five single drones."""
-    return [Directive(view.ego, p, reason="fixed: silence") for p in view.peers]
+    return [nothing(view.ego, p, "fixed: silence") for p in view.peers]

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 from policies.contract import Directive, Disc, Representation
 
+SAME_DISC_M = 1.6
+"""A disc that moved less, half a feature cell, is the same disc: it would select almost the same cells."""
 EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
@@ -38,10 +40,11 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
         directive is `proposed`, or the lower of both in every part while an upgrade waits.
     """
     current = state.enforced
-    if proposed == current:
+    if proposed is current or proposed == current:
         return state if state.asking_since_s is None else LinkState(current)
     if state.asking_since_s is None and _level(proposed) == _level(current):
-        return LinkState(proposed)  # a disc that follows its target, a deadline: no step on the ladder
+        # A disc that follows its target, a deadline: no step on the ladder.
+        return state if _hardly_moved(proposed, current) else LinkState(proposed)
     lower = _lower_of(current, proposed)
     if lower == proposed:
         return LinkState(proposed)
@@ -77,6 +80,14 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
         return current
     # A disc that moved while an upgrade waits is not that upgrade's doing: its reason would mislead.
     return replace(reduced, reason=current.reason) if _level(reduced) == _level(current) else reduced
+
+
+def _hardly_moved(proposed: Directive, current: Directive) -> bool:
+    """Whether two directives of one level differ by a small step of their disc alone."""
+    a, b = proposed.roi, current.roi
+    if a is None or b is None or proposed.deadline_s != current.deadline_s:
+        return False
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) < SAME_DISC_M
 
 
 def _level(d: Directive) -> tuple[float, ...]:

@@ -18,23 +18,23 @@ def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> f
 
     Source: the lens formula (Weisstein, "Circle-Circle Intersection").
     """
-    small, large = sorted((radius_a_m, radius_b_m))
+    small, large = (radius_a_m, radius_b_m) if radius_a_m <= radius_b_m else (radius_b_m, radius_a_m)
     if small <= 0 or distance_m >= small + large:
         return 0.0
     if distance_m <= large - small:
         return 1.0
-    d = distance_m
-    # Rounding can push the cosines past ±1 when the circles barely touch.
-    alpha = math.acos(max(-1.0, min(1.0, (d * d + small * small - large * large) / (2 * d * small))))
-    beta = math.acos(max(-1.0, min(1.0, (d * d + large * large - small * small) / (2 * d * large))))
-    lens = small * small * (alpha - math.sin(2 * alpha) / 2) + large * large * (beta - math.sin(2 * beta) / 2)
-    return min(1.0, max(0.0, lens / (math.pi * small * small)))
+    d, r2, s2 = distance_m * distance_m, small * small, large * large
+    # Rounding can push the cosines past 1 when the circles barely touch.
+    alpha = math.acos(max(-1.0, min(1.0, (d + r2 - s2) / (2 * distance_m * small))))
+    beta = math.acos(max(-1.0, min(1.0, (d + s2 - r2) / (2 * distance_m * large))))
+    lens = r2 * (alpha - math.sin(2 * alpha) / 2) + s2 * (beta - math.sin(2 * beta) / 2)
+    return min(1.0, max(0.0, lens / (math.pi * r2)))
 
 
 def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
     """Overlap of two drones' nadir footprints, 0 … 1, of the smaller footprint."""
-    distance_m = math.hypot(a.position_m[0] - b.position_m[0], a.position_m[1] - b.position_m[1])
-    return circle_overlap(distance_m, a.footprint_radius_m, b.footprint_radius_m)
+    (ax, ay, _), (bx, by, _) = a.position_m, b.position_m
+    return circle_overlap(math.hypot(ax - bx, ay - by), a.footprint_radius_m, b.footprint_radius_m)
 
 
 def peers_by_overlap(view: FleetView) -> list[int]:

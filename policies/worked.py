@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from policies.contract import Directive, FleetView, Representation, TaskPhase
+from policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
 from policies.geometry import peers_by_overlap
 
 HIGH_BATTERY = 0.60
@@ -10,6 +10,7 @@ LOW_BATTERY = 0.30
 FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
 MIN_GOODPUT_MBPS = 5.0
 TOP_PEERS = 2
+NOT_CHOSEN = f"not among the {TOP_PEERS} most overlapping peers"
 
 
 def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
@@ -38,15 +39,12 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     directives = []
     for peer in view.peers:
         if peer not in chosen:
-            directives.append(Directive(view.ego, peer, reason=f"not among the {TOP_PEERS} most overlapping peers"))
-            continue
-        link_rung, link_rate_hz, link_why = rung, rate_hz, why
-        if me.goodput_to(peer) < MIN_GOODPUT_MBPS:
-            link_rung = min(rung, Representation.DETECTIONS)
-            link_rate_hz = min(rate_hz, SLOW_RATE_HZ)
-            link_why = f"goodput {me.goodput_to(peer):.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
-        features = link_rung == Representation.FEATURES
-        directives.append(
-            Directive(view.ego, peer, link_rung, rho if features else 0.0, roi, link_rate_hz, reason=link_why)
-        )
+            directives.append(nothing(view.ego, peer, NOT_CHOSEN))
+        elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
+            weak = f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+            low = min(rung, Representation.DETECTIONS)
+            directives.append(Directive(view.ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
+        else:
+            budget = rho if rung == Representation.FEATURES else 0.0
+            directives.append(Directive(view.ego, peer, rung, budget, roi, rate_hz, reason=why))
     return directives

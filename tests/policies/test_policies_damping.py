@@ -114,3 +114,10 @@ def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
     assert [d.duty_percent for d in run(resting, [NOTHING] * 11)] == [20] * 10 + [100]
     (first,) = run(NOTHING, [replace(FULL, duty_percent=20)])
     assert (first.representation, first.duty_percent) == (Representation.NONE, 20)
+
+
+def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
+    state = LinkState(replace(FULL, roi=Disc(0, 0, 32)))
+    assert damp(state, replace(FULL, roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
+    assert damp(state, replace(FULL, roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
+    assert damp(state, replace(FULL, roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)

@@ -1,0 +1,31 @@
+"""How long a whole sortie takes: with the detector, without it, and what each part of that is.
+
+`make bench` prints them; a 120 s, five-drone sortie should take less than 120 s with the detector at 2 Hz, and
+less than 2 s without, on two cores.
+"""
+
+from __future__ import annotations
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from scenarios.load import load
+from sim.sortie import run_sortie
+
+
+@pytest.mark.benchmark(group="sortie of 120 s, five drones, no detector")
+@pytest.mark.parametrize("policy", ["worked", "all-4", "silence"])
+def test_traffic_alone(benchmark: BenchmarkFixture, policy: str) -> None:
+    scenario = load("track_target", ["perception.detector=none"])
+    record = benchmark.pedantic(run_sortie, (scenario, policy), rounds=3, warmup_rounds=1)
+    assert record.tables["descriptors"].num_rows == 6000
+
+
+@pytest.mark.slow
+@pytest.mark.benchmark(group="sortie of 120 s, five drones, torch detector at 2 Hz")
+@pytest.mark.parametrize("policy", ["worked", "silence"])
+def test_with_the_detector(benchmark: BenchmarkFixture, policy: str, request: pytest.FixtureRequest) -> None:
+    seconds = 120 if request.config.getoption("--benchmark-enable") else 5  # a benchmark that is off is a smoke test
+    scenario = load("track_target", [f"duration_s={seconds}", "mission.phases=[{at_s: 0, phase: search}]"])
+    record = benchmark.pedantic(run_sortie, (scenario, policy), rounds=1)
+    assert record.tables["fusions"].num_rows == seconds * 2 * 5
