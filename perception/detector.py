@@ -8,9 +8,11 @@ network call has the same shapes whatever else is asked for, so the same capture
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +22,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from perception import budget
 from perception.ap import suppress
 from perception.bev import HALF_EXTENT_M, lift
-from perception.model import CELLS, decode, load_weights, warp
+from perception.model import CELLS, decode, folded, load_weights, warp
 from perception.render import Renderer
 from perception.scene import SceneModel
 from perception.town import Bytes
@@ -30,6 +32,8 @@ from scenarios.schema import Perception
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "disconet.safetensors"
 NMS_IOU = 0.15
 KEPT_CAPTURES = 64
+MAPS, LATE = ("features", "raw"), ("detections", "tracks")
+R = TypeVar("R")
 
 __all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth"]
 
@@ -79,23 +83,29 @@ class TorchDetector:
     Raises:
         ValueError: weights that are missing or do not fit, naming file and tensor.
 
-    It computes on the CPU with as many threads as torch is set to (`torch.set_num_threads`), and sets none itself.
+    One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
+    side as torch has threads when the detector is made (`torch.set_num_threads`). The numbers do not depend on it.
     """
 
     def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
         self._scene, self._config = scene, config
-        self._net = load_weights(SHIPPED_WEIGHTS if weights is None else weights)
+        self._net = folded(load_weights(SHIPPED_WEIGHTS if weights is None else weights))
         self._renderer = Renderer(scene, seed)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
+        self._pool = ThreadPoolExecutor(
+            torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)
+        )
 
     def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
         """Each ego's boxes from its own features and what it was sent, ENU, best first.
 
         A late share is used as it is: the sender's pose at its capture places it, what has moved since lags.
         """
-        with torch.inference_mode():
-            self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
-            return [self._fuse(ego, shares) for ego, shares in jobs]
+        self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
+        alone = [s.capture for _, shares in jobs for s in shares if self._needs_head(s)]
+        alone += [ego for ego, shares in jobs if not any(s.representation in MAPS for s in shares)]
+        self._each(self._look_alone, dict.fromkeys(alone))
+        return self._each(lambda job: self._fuse(*job), jobs)
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
@@ -103,38 +113,58 @@ class TorchDetector:
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
-        with torch.inference_mode():
-            self._encode([capture])
-            return len(self._alone(capture).inside(roi))
+        self._encode([capture])
+        self._each(self._look_alone, [capture])
+        return len(self._alone(capture).inside(roi))
 
     def camera_views(self, capture: Capture) -> Bytes:
         """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
         views: Bytes = self._renderer.render([capture])[0]
         return views
 
+    def _each(self, do: Callable[[Any], R], over: Iterable[Any]) -> list[R]:
+        """Run a task over its arguments side by side, each in one thread; results in order."""
+
+        def task(what: Any) -> R:
+            with torch.inference_mode():
+                return do(what)
+
+        return list(self._pool.map(task, over))
+
     def _encode(self, captures: Iterable[Capture]) -> None:
         """Render and encode what is not kept yet; then drop the oldest beyond the limit."""
         wanted = list(dict.fromkeys(captures))
         missing = [c for c in wanted if c not in self._kept]
-        images = lift(self._renderer.render(missing), missing)
-        for capture, image in zip(missing, images, strict=True):
-            self._kept[capture] = _Encoded(self._net.encoder(image[None])[0])
+        views = self._renderer.render(missing, self._pool.map)
+
+        def one(i: int) -> Tensor:
+            features: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
+            return features
+
+        for capture, features in zip(missing, self._each(one, range(len(missing))), strict=True):
+            self._kept[capture] = _Encoded(features)
         for capture in wanted:
             self._kept.move_to_end(capture)
         while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
             self._kept.popitem(last=False)
 
-    def _alone(self, capture: Capture) -> Boxes:
-        """The capture's own single-drone boxes."""
+    def _needs_head(self, share: Share) -> bool:
+        """Whether the sender's own head is needed: to rank its cells, or for the boxes it sends."""
+        if share.representation == "features":
+            return self._config.cells_by == "confidence" and not (share.rho >= 1.0 and share.roi is None)
+        return share.representation in LATE
+
+    def _look_alone(self, capture: Capture) -> None:
+        """Work out what the capture shows without peers, once."""
         kept = self._kept[capture]
         if kept.boxes is None:
-            kept.boxes = self._place(self._head_alone(kept), capture)
-        return kept.boxes
-
-    def _head_alone(self, kept: _Encoded) -> Tensor:
-        if kept.out is None:
             kept.out = self._net.head(kept.features[None])[0]
-        return kept.out
+            kept.boxes = self._place(kept.out, capture)
+
+    def _alone(self, capture: Capture) -> Boxes:
+        boxes = self._kept[capture].boxes
+        assert boxes is not None  # noqa: S101 (looked at before)
+        return boxes
 
     def _place(self, out: Tensor, capture: Capture) -> Boxes:
         local = decode(out, self._config.score_threshold).numpy()
@@ -150,11 +180,12 @@ class TorchDetector:
         elif self._config.cells_by == "norm":
             rank = kept.features.norm(dim=0).numpy()
         else:
-            rank = F.max_pool2d(self._head_alone(kept)[:1], 2)[0].numpy()
+            assert kept.out is not None  # noqa: S101 (looked at before)
+            rank = F.max_pool2d(kept.out[:1], 2)[0].numpy()
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose))[None]
 
     def _fuse(self, ego: Capture, shares: Sequence[Share]) -> Boxes:
-        maps = [s for s in shares if s.representation in ("features", "raw")]
+        maps = [s for s in shares if s.representation in MAPS]
         if not maps:
             own = self._alone(ego)
         else:
@@ -168,7 +199,7 @@ class TorchDetector:
             own_map = self._kept[ego].features[None]
             fused = self._net.fuse(own_map, warped, arrived, inside, weight, self._config.unsent_cells)
             own = self._place(self._net.head(fused)[0], ego)
-        late = [self._sent_boxes(s) for s in shares if s.representation in ("detections", "tracks")]
+        late = [self._sent_boxes(s) for s in shares if s.representation in LATE]
         return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own
 
     def _sent_boxes(self, share: Share) -> Boxes:

@@ -27,6 +27,8 @@ from scenarios.streams import stream
 
 DRONES = 5
 TRAIN_SEED, VALIDATION_SEED = 1_000_000, 2_000_000
+PER_SCENE = 12
+"""Training frames from each town."""
 AREA_M = 60.0
 POSE_ERROR_M, HEADING_ERROR_DEG = 0.2, 0.5
 """As the schema's defaults of fleet.motion."""

@@ -10,13 +10,15 @@ one logit per agent and cell from the ego's features beside the agent's, a softm
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from perception.bev import HALF_EXTENT_M, ground_points
 
@@ -74,8 +76,8 @@ class EdgeWeights(nn.Module):
     def forward(self, ego: Tensor, agent: Tensor) -> Tensor:
         """[n, 80, h, w] each → [n, 1, h, w]. `ego` may be [1, …] for many agents: its half is computed once."""
         half_ego = F.conv2d(ego, self.first.weight[:, :CHANNELS])
-        half_agent = F.conv2d(agent, self.first.weight[:, CHANNELS:])
-        out: Tensor = self.rest(F.relu(self.norm(half_ego + half_agent)))
+        half_agent = F.conv2d(agent, self.first.weight[:, CHANNELS:], self.first.bias)
+        out: Tensor = self.rest(F.relu(self.norm(half_agent.add_(half_ego)), inplace=True))
         return out
 
 
@@ -147,23 +149,39 @@ def warp(features: Tensor, sent: Tensor, ego_pose: Tensor, peer_pose: Tensor) ->
         features [k, c, 64, 64] (zero where not sent), sent [k, 1, 64, 64] bool, inside [k, 1, 64, 64] bool. A cell
         counts as sent where at least half of its bilinear support was; its value is the mean of what was sent.
     """
+    k, channels = features.shape[:2]
     delta = ego_pose - peer_pose
     c, s = torch.cos(peer_pose[:, 2]), torch.sin(peer_pose[:, 2])
     tx, ty = c * delta[:, 0] + s * delta[:, 1], c * delta[:, 1] - s * delta[:, 0]
     cd, sd = torch.cos(delta[:, 2]), torch.sin(delta[:, 2])
-    # a point (x, y) of the ego's grid lies at R(Δψ)(x, y) + t in the peer's; the sampler's first coordinate is the column, y
-    tx, ty = tx / HALF_EXTENT_M, ty / HALF_EXTENT_M
-    theta = torch.stack([torch.stack([cd, sd, ty], -1), torch.stack([-sd, cd, tx], -1)], dim=1)
-    k = len(features)
-    grid = F.affine_grid(theta, [k, 1, CELLS, CELLS], align_corners=False)
-    inside = (grid.abs() <= 1).all(dim=-1)[:, None]
-    mask = sent.to(features.dtype)
-    both = F.grid_sample(
-        torch.cat([features * mask, mask], dim=1), grid, mode="bilinear", padding_mode="zeros", align_corners=False
+    # a point (x, y) of the ego's grid lies at R(Δψ)(x, y) + t in the peer's; in cells, from the centre of cell (0, 0)
+    middle = (CELLS - 1) / 2
+    axis = torch.arange(CELLS, device=features.device) - middle
+    x, y = (plane[None] for plane in torch.meshgrid(axis, axis, indexing="ij"))
+    cd, sd, tx, ty = (v[:, None, None] for v in (cd, sd, tx / CELL_M + middle, ty / CELL_M + middle))
+    row, column = cd * x - sd * y + tx, sd * x + cd * y + ty
+    half = CELLS - 0.5
+    inside = (row >= -0.5) & (row <= half) & (column >= -0.5) & (column <= half)
+    taps, weights = [], []
+    base = torch.arange(k, device=features.device)[:, None, None] * CELLS**2
+    mask = sent.flatten()
+    for i in (row.floor(), row.floor() + 1):
+        for j in (column.floor(), column.floor() + 1):
+            there = (i >= 0) & (i < CELLS) & (j >= 0) & (j < CELLS)
+            cell = (i.clamp(0, CELLS - 1) * CELLS + j.clamp(0, CELLS - 1)).long() + base
+            taps.append(cell)
+            weights.append((1 - (row - i).abs()) * (1 - (column - j).abs()) * (there & mask[cell]))
+    support = torch.stack(weights, dim=-1)
+    share = support.sum(dim=-1, keepdim=True)
+    arrived = (share[..., 0] >= 0.5) & inside
+    support = support / share.clamp_min(0.5) * arrived[..., None]
+    # a weighted sum of four rows of the peer's table of cells, per cell: what embedding_bag is fast at
+    table = features.permute(0, 2, 3, 1).reshape(k * CELLS**2, channels)
+    moved = F.embedding_bag(
+        torch.stack(taps, dim=-1).view(-1, 4), table, mode="sum", per_sample_weights=support.view(-1, 4)
     )
-    share = both[:, -1:]
-    arrived = (share >= 0.5) & inside
-    return both[:, :-1] / share.clamp_min(0.5) * arrived, arrived, inside
+    moved = moved.view(k, CELLS, CELLS, channels).permute(0, 3, 1, 2)
+    return moved, arrived[:, None], inside[:, None]
 
 
 def decode(out: Tensor, threshold: float, limit: int = 200) -> Tensor:
@@ -186,6 +204,19 @@ def decode(out: Tensor, threshold: float, limit: int = 200) -> Tensor:
     return torch.stack([x, y, *size, yaw, score], dim=1)
 
 
+def folded(net: CarNet) -> CarNet:
+    """A copy for inference, its batch norms folded into the convolutions before them (a seventh faster, equal to rounding)."""
+    net = copy.deepcopy(net).eval()
+    for layer in list(net.modules()):
+        if isinstance(layer, nn.Sequential) and len(layer) > 1 and isinstance(layer[1], nn.BatchNorm2d):
+            conv: Any = layer[0]
+            layer[0] = fuse_conv_bn_eval(conv, layer[1], transpose=isinstance(conv, nn.ConvTranspose2d))
+            layer[1] = nn.Identity()
+    net.edge.first = fuse_conv_bn_eval(net.edge.first, net.edge.norm)
+    net.edge.norm = nn.Identity()  # type: ignore[assignment]
+    return net
+
+
 def save_weights(net: CarNet, path: Path, metadata: dict[str, str]) -> None:
     """Write every tensor of `net` to a safetensors file, under a temporary name first."""
     from safetensors.torch import save_file
@@ -195,6 +226,7 @@ def save_weights(net: CarNet, path: Path, metadata: dict[str, str]) -> None:
     save_file(
         {k: v.contiguous() for k, v in net.state_dict().items() if v.dtype.is_floating_point}, part, metadata=metadata
     )
+    part.chmod(0o644)  # the library makes it private
     part.replace(path)
 
 

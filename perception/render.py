@@ -9,7 +9,7 @@ maximum map says that nothing is in reach, and walked in fine steps where someth
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -168,19 +168,27 @@ class Renderer:
         self._window: Window | None = None
         self._span: tuple[range, range] = (range(0), range(0))
 
-    def render(self, captures: Sequence[Capture]) -> Bytes:
-        """Camera images of all captures, uint8 [n, 5, 90, 160, 3], in the order of `CAMERAS`."""
+    def render(self, captures: Sequence[Capture], each: Callable[..., Iterable[None]] = map) -> Bytes:
+        """Camera images of all captures, uint8 [n, 5, 90, 160, 3], in the order of `CAMERAS`.
+
+        `each` runs a function over captures, `map` or a pool's `map`; the images are the same.
+        """
         out = np.empty((len(captures), len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3), np.uint8)
         if not captures:
             return out
         window = self._window_over(captures)
         for t_s in dict.fromkeys(c.t_s for c in captures):
             here = [i for i, c in enumerate(captures) if c.t_s == t_s]
-            with window.with_cars(self.scene.moving_cars(t_s)), torch.inference_mode():
-                for i in here:
-                    image = _cast(window, captures[i])
-                    image = (image + _noise(self.seed, captures[i], image.numel()).view_as(image)).clamp_(0, 255)
-                    out[i] = image.to(torch.uint8).view(out.shape[1:]).numpy()
+            with window.with_cars(self.scene.moving_cars(t_s)):
+
+                def one(i: int) -> None:
+                    with torch.inference_mode():
+                        image = _cast(window, captures[i])
+                        image = image + _noise(self.seed, captures[i], image.numel()).view_as(image)
+                        out[i] = image.clamp_(0, 255).to(torch.uint8).view(out.shape[1:]).numpy()
+
+                for _ in each(one, here):
+                    pass
         return out
 
     def _window_over(self, captures: Sequence[Capture]) -> Window:

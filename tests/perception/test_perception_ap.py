@@ -70,7 +70,9 @@ def some_frames(seed: int, count: int = 6) -> list[tuple[Boxes, Boxes]]:
             np.round(rng.random(len(k) + wild), 1),  # so that scores tie
         )
         # ties inside a frame would make the greedy order a matter of taste, so part them there
-        frames.append((Boxes(found.xy_m, found.size_m, found.yaw_rad, found.score + 1e-6 * np.arange(len(found))), truth))
+        frames.append(
+            (Boxes(found.xy_m, found.size_m, found.yaw_rad, found.score + 1e-6 * np.arange(len(found))), truth)
+        )
     return frames
 
 
@@ -126,7 +128,9 @@ def test_tied_scores_are_one_point_of_the_curve() -> None:
 def test_each_truth_is_matched_once_and_to_the_best_remaining() -> None:
     size = np.array([(4.0, 2.0)])
     truth = Boxes(np.array([(0.0, 0.0), (0.8, 0.0)]), size.repeat(2, 0), np.zeros(2), np.ones(2))
-    found = Boxes(np.array([(0.5, 0.0), (0.6, 0.0), (0.7, 0.0)]), size.repeat(3, 0), np.zeros(3), np.array([0.9, 0.8, 0.7]))
+    found = Boxes(
+        np.array([(0.5, 0.0), (0.6, 0.0), (0.7, 0.0)]), size.repeat(3, 0), np.zeros(3), np.array([0.9, 0.8, 0.7])
+    )
     # the first is nearest to the second truth, the second takes what remains, the third finds nothing
     assert match(found, truth).hit.tolist() == [True, True, False]
 

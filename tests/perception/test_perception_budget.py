@@ -48,9 +48,11 @@ def test_count_and_selection_agree_with_brute_force(
         for j in range(64):
             f, s = (i + 0.5 - 32) * 3.2, (j + 0.5 - 32) * 3.2
             wx, wy = x + math.cos(yaw) * f - math.sin(yaw) * s, y + math.sin(yaw) * f + math.cos(yaw) * s
-            if roi is None or abs(math.hypot(wx - roi[0], wy - roi[1]) - roi[2]) < 1e-6:
-                inside.append((i, j))
-            elif math.hypot(wx - roi[0], wy - roi[1]) < roi[2]:
+            if (
+                roi is None
+                or abs(math.hypot(wx - roi[0], wy - roi[1]) - roi[2]) < 1e-6
+                or math.hypot(wx - roi[0], wy - roi[1]) < roi[2]
+            ):
                 inside.append((i, j))
     count = min(math.floor(rho * 4096 + 1e-9), len(inside))
     assert budget.cells_sent(rho, roi, x, y, yaw) == pytest.approx(count, abs=0)

@@ -125,7 +125,7 @@ def test_decoding_inverts_the_targets() -> None:
 def test_the_loss_knows_right_from_wrong() -> None:
     cars = np.array([(10.3, -20.1, 4.4, 1.8, 0.3), (-60.0, 60.0, 5.5, 2.0, 1.5)])
     right = loss_of(perfect(cars)[None], [cars])
-    shifted = cars + [1.6, 0, 0, 0, 0]
+    shifted = cars + np.array([1.6, 0, 0, 0, 0])
     assert right < 0.6
     assert loss_of(perfect(shifted)[None], [cars]) > right + 1
     assert loss_of(perfect(cars * [1, 1, 1.2, 1, 1])[None], [cars]) > right + 0.03

@@ -1,0 +1,175 @@
+"""The detector over one scene, with the shipped weights: what shares do, what age does, what repeats."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perception_examples import capture, cross
+
+from perception.ap import match
+from perception.detector import TorchDetector, ground_truth
+from perception.scene import SceneModel
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception, Scene, Target
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneModel:
+    return SceneModel(Scene(), Target(waypoints_m=((0, 0), (100, 0))), (-50, -50, 50, 50))
+
+
+@pytest.fixture(scope="module")
+def detector(scene: SceneModel) -> TorchDetector:
+    return TorchDetector(scene, Perception(), seed=1)
+
+
+@pytest.fixture(scope="module")
+def fleet() -> list[Capture]:
+    return cross(10.0, 20.0, 0.3)
+
+
+def share(c: Capture, representation: str = "features", rho: float = 1.0, weight: float = 1.0, roi: tuple[float, float, float] | None = None) -> Share:  # fmt: skip
+    return Share(c, representation, rho, roi, weight)
+
+
+def same(a: Boxes, b: Boxes) -> bool:
+    return len(a) == len(b) and all(np.array_equal(getattr(a, f), getattr(b, f)) for f in Boxes.__slots__)
+
+
+def test_boxes_look_like_cars_and_come_best_first(detector: TorchDetector, fleet: list[Capture]) -> None:
+    found = detector.detect([(fleet[0], [share(c) for c in fleet[1:]])])[0]
+    assert len(found) > 5
+    assert (np.diff(found.score) <= 0).all()
+    assert (found.score >= 0.1).all()
+    assert 3.5 < np.median(found.size_m[:, 0]) < 5.5
+    assert 1.5 < np.median(found.size_m[:, 1]) < 2.3
+    truth = detector.truth(5.0, fleet[0])
+    assert match(found.take(found.score > 0.5), truth).hit.mean() > 0.5
+
+
+def test_the_same_question_has_the_same_answer_whatever_is_asked_beside_it(
+    scene: SceneModel, detector: TorchDetector, fleet: list[Capture]
+) -> None:
+    jobs = [(c, [share(p) for p in fleet if p is not c]) for c in fleet]
+    together = detector.detect(jobs)
+    alone = TorchDetector(scene, Perception(), seed=1).detect(jobs[3:4])
+    assert same(together[3], alone[0])
+
+
+PROGRAM = """
+import hashlib, sys
+sys.path.insert(0, {tests!r})
+from perception_examples import cross
+from perception.detector import TorchDetector
+from perception.scene import SceneModel
+from perception.types import Share
+from scenarios.schema import Perception, Scene
+fleet = cross(10.0, 20.0, 0.3)
+detector = TorchDetector(SceneModel(Scene(), None, (-50, -50, 50, 50)), Perception(), seed=1)
+found = detector.detect([(fleet[0], [Share(c, "features", 0.1, None, 1.0) for c in fleet[1:]])])[0]
+digest = hashlib.sha256(b"".join(getattr(found, f).tobytes() for f in found.__slots__)).hexdigest()
+sys.stdout.write(digest)
+"""
+
+
+def test_boxes_are_equal_across_processes() -> None:
+    from pathlib import Path
+
+    program = PROGRAM.format(tests=str(Path(__file__).parent))
+    runs = [
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in range(2)
+    ]
+    assert len(runs[0].stdout) == 64
+    assert runs[0].stdout == runs[1].stdout
+
+
+def test_nothing_sent_and_nothing_trusted_is_a_single_drone(detector: TorchDetector, fleet: list[Capture]) -> None:
+    jobs = [
+        (fleet[0], []),
+        (fleet[0], [share(fleet[1], rho=0.0)]),
+        (fleet[0], [share(fleet[1], roi=(5000.0, 0.0, 32.0))]),
+        (fleet[0], [share(fleet[1], weight=0.0)]),
+        (fleet[0], [share(fleet[1], "detections", weight=0.0)]),
+    ]
+    single, *others = detector.detect(jobs)
+    for other in others:
+        assert len(other) == len(single)
+        assert other.xy_m == pytest.approx(single.xy_m, abs=1e-2)
+
+
+def test_raw_is_every_feature(detector: TorchDetector, fleet: list[Capture]) -> None:
+    raw, full = detector.detect([(fleet[0], [share(fleet[1], "raw", rho=0.0)]), (fleet[0], [share(fleet[1])])])
+    assert same(raw, full)
+
+
+def test_a_budget_an_roi_and_the_two_masks_matter(
+    scene: SceneModel, detector: TorchDetector, fleet: list[Capture]
+) -> None:
+    shares = [share(c, rho=0.1) for c in fleet[1:]]
+    full, tenth, disc = detector.detect(
+        [
+            (fleet[0], [share(c) for c in fleet[1:]]),
+            (fleet[0], shares),
+            (fleet[0], [replace(s, roi=(10.0, 20.0, 32.0)) for s in shares]),
+        ]
+    )
+    zero = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1).detect([(fleet[0], shares)])[0]
+    norm = TorchDetector(scene, Perception(cells_by="norm"), seed=1).detect([(fleet[0], shares)])[0]
+    answers = [full, tenth, disc, zero, norm]
+    assert not any(same(a, b) for k, a in enumerate(answers) for b in answers[:k])
+
+
+def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
+    detector: TorchDetector, fleet: list[Capture]
+) -> None:
+    roi = (10.0, 20.0, 60.0)
+    single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
+    assert len(joined) >= len(single)
+    assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
+    tracks = detector._sent_boxes(share(fleet[2], "tracks", roi=roi))
+    assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
+    assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
+
+
+def test_a_late_share_is_rendered_as_it_was(detector: TorchDetector, fleet: list[Capture]) -> None:
+    now = [(fleet[0], [share(c) for c in fleet[1:]])]
+    late = [(fleet[0], [share(replace(c, t_s=c.t_s - 2.0)) for c in fleet[1:]])]
+    assert not same(detector.detect(now)[0], detector.detect(late)[0])
+
+
+def test_threshold_cuts(scene: SceneModel, fleet: list[Capture]) -> None:
+    low, high = (
+        TorchDetector(scene, Perception(score_threshold=t), seed=1).detect([(fleet[0], [])])[0] for t in (0.05, 0.6)
+    )
+    assert len(high) < len(low)
+    assert (high.score >= 0.6).all()
+
+
+def test_a_sortie_far_from_the_origin_sees_the_same_way(fleet: list[Capture]) -> None:
+    there = SceneModel(Scene(), None, (3150, -4050, 3250, -3950))
+    captures = cross(3210.0, -3980.0, 0.3)
+    found = TorchDetector(there, Perception(), seed=1).detect([(captures[0], [share(c) for c in captures[1:]])])[0]
+    truth = ground_truth(there, 5.0, (3210.0, -3980.0), yaw_rad=0.3)
+    assert match(found.take(found.score > 0.5), truth).hit.mean() > 0.5
+
+
+def test_ground_truth_is_every_car_in_the_turned_square(scene: SceneModel) -> None:
+    cars = scene.cars_at(5.0)
+    for yaw in (0.0, 0.6):
+        truth = ground_truth(scene, 5.0, (10.0, 20.0), 60.0, yaw)
+        count = 0
+        for x, y in zip(cars.x_m, cars.y_m, strict=True):
+            forward = np.cos(yaw) * (x - 10) + np.sin(yaw) * (y - 20)
+            left = np.cos(yaw) * (y - 20) - np.sin(yaw) * (x - 10)
+            count += abs(forward) < 60 and abs(left) < 60
+        assert len(truth) == count > 5
+    assert (truth.score == 1).all()
+
+
+def test_camera_views_are_what_the_detector_saw(detector: TorchDetector) -> None:
+    views = detector.camera_views(capture(t_s=2.0))
+    assert views.shape == (5, 90, 160, 3)
+    assert views.dtype == np.uint8
+    assert views.std() > 20

@@ -1,0 +1,46 @@
+"""The shipped weights earn their place: cooperation beats a single drone in towns that nobody has seen before."""
+
+import numpy as np
+import pytest
+
+from perception.ap import Matched, compare, match
+from perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
+from perception.frames import random_captures, random_scene
+from perception.scene import SceneModel
+from perception.types import Share
+from scenarios.schema import Perception
+
+SEEDS = range(3_000_000, 3_000_006)
+"""Neither the training's seeds (from 1,000,000) nor its validation's (from 2,000,000)."""
+
+
+@pytest.mark.slow
+def test_cooperation_beats_a_single_drone_on_held_out_towns() -> None:
+    single: list[Matched] = []
+    full: list[Matched] = []
+    towns: list[int] = []
+    for seed in SEEDS:
+        scene = SceneModel(random_scene(seed), None, (-60, -60, 60, 60))
+        detector = TorchDetector(scene, Perception(), seed=seed)
+        for frame in range(2):
+            fleet = random_captures(seed, frame)
+            jobs = [(ego, [Share(c, "features", 1.0, None, 1.0) for c in fleet if c is not ego]) for ego in fleet[:3]]
+            together = detector.detect(jobs)
+            alone = detector.detect([(ego, []) for ego, _ in jobs])
+            for (ego, _), one, all_five in zip(jobs, alone, together, strict=True):
+                truth = ground_truth(scene, ego.t_s, ego.position_m[:2], yaw_rad=ego.true_yaw_rad)
+                single.append(match(one, truth))
+                full.append(match(all_five, truth))
+                towns.append(seed)
+    gain = compare(single, full, towns, seed=1)
+    assert gain.low > 0, gain
+    assert gain.ap_b > 0.2, gain
+    assert gain.ap_b > 1.15 * gain.ap_a, gain
+    assert np.isfinite(gain.high)
+
+
+def test_the_weights_are_small_and_have_a_card() -> None:
+    assert SHIPPED_WEIGHTS.stat().st_size < 5_000_000
+    card = SHIPPED_WEIGHTS.with_name("README.md").read_text()
+    assert "sortie train" in card
+    assert "95 % interval" in card
