@@ -135,7 +135,7 @@ The detector's weights: encoder, DiscoNet-style edge network and centre head of 
 |---|---|---|---|---|
 {made}
 
-`sortie train` is the same command. **Data**: {frames} fleet-frames of five drones in {frames // PER_SCENE} procedural towns (scene seeds from
+`sortie train` runs the same. **Data**: {frames} fleet-frames of five drones in {frames // PER_SCENE} procedural towns (scene seeds from
 {TRAIN_SEED}), drawn and rendered by `perception/frames.py`; no outside data. **Learning**: {SHARDS * SHARD_FRAMES} frames a step, AdamW, one cycle; mirrored and
 turned by quarters. In each frame {EGOS} drones fuse everyone present (two to five) and one is alone, so a third of the supervised
 outputs are single-drone: the head works without peers.

@@ -15,7 +15,7 @@ from perception.train import learning_rate, train
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene_file(77, 3, tmp_path_factory.mktemp("frames") / "scene_77_3.npz")
+    return make_scene_file(77, 2, tmp_path_factory.mktemp("frames") / "scene_77_2.npz")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def frames(scene_file: Path) -> Frames:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, scene_file: Path) -> None:
-    """Training and validation on the three frames."""
+    """Training and validation on the two frames."""
     monkeypatch.setattr(training, "make_frames", lambda *_, **__: [scene_file])
     monkeypatch.setattr("perception.validation.LEVELS", ((1.0, 1.0),))
     monkeypatch.setattr("perception.learn.SHARD_FRAMES", 1)
@@ -38,7 +38,7 @@ def test_scenes_and_fleets_follow_from_their_seeds() -> None:
 
 def test_a_scene_file_is_made_once(scene_file: Path) -> None:
     before = scene_file.stat().st_mtime_ns
-    make_scene_file(77, 3, scene_file)
+    make_scene_file(77, 2, scene_file)
     assert scene_file.stat().st_mtime_ns == before
     assert [p.name for p in scene_file.parent.iterdir()] == [scene_file.name]
 
@@ -93,7 +93,7 @@ def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(
     def run(name: str, **more: float) -> Path:
         out = tmp_path / name / "w.safetensors"
         (tmp_path / name).mkdir(exist_ok=True)
-        train(out, frames=3, steps=3, work=tmp_path / name, device="cpu", **more)  # type: ignore[arg-type]
+        train(out, frames=3, steps=2, work=tmp_path / name, device="cpu", **more)  # type: ignore[arg-type]
         return out
 
     whole = load_file(run("whole"))
@@ -105,6 +105,6 @@ def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(
     net = load_weights(tmp_path / "whole" / "w.safetensors")
     assert sum(p.numel() for p in net.parameters()) < 600_000
     card = (tmp_path / "whole" / "README.md").read_text()
-    assert "perception.train --frames 12 --steps 3 --seed 0" in card
+    assert "perception.train --frames 12 --steps 2 --seed 0" in card
     assert (tmp_path / "whole" / "loss.csv").read_text().startswith("step,loss,lr\n")
     assert not list(tmp_path.glob("**/*.part"))
