@@ -15,7 +15,7 @@ from sim.playback_canvas import SIM_TIME, SPAN_M
 
 SEEN = """
 **Boxes**: what drone {ego} makes of the scene from its own view and what it was sent: green, a car found;
-yellow, missed; red, a false alarm. The other drones' boxes can be switched on under `world/seen`.
+yellow, missed; red, a false alarm; the darker, the less sure. The other drones' boxes can be switched on under `world/seen`.
 """
 
 EGO = 0
@@ -95,10 +95,12 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
             plot("channel busy, %", "medium", (0.0, 104.0), legend=False),
         ),
     ]
-    shares = [0.3 + 0.235 * (n_lanes + 1), 1.0, 1.0, 1.2, 0.9]
+    shares = [1.0, 1.0, 1.2, 0.9]
     if accuracy:
         plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
-        shares.insert(1, 1.2)
+        shares.insert(0, 1.2)
+    lanes_height = 0.05 + 0.042 * (n_lanes + 1)  # part of the window that shows every lane
+    shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
     left = rrb.Vertical(scene, rrb.Horizontal(log, legend, column_shares=[3, 2]), row_shares=[3, 1])
     return rrb.Blueprint(
         rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2]),

@@ -65,9 +65,8 @@ class Drawing:
             ring = rr.LineStrips3D([CIRCLE], colors=[(*colour[:3], 200)], radii=[-1.5])
             canvas.static(f"world/footprints/{i}", ring)
             canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
-            for name, colour, width in (("found", c.FOUND, 2.0), ("missed", c.MISSED, 1.5), ("false", c.FALSE, 1.5)):
-                looks = rr.Boxes3D.from_fields(colors=[colour], radii=[-width])
-                canvas.static(f"world/seen/{i}/{name}", looks)
+            for name, width in (("found", 2.0), ("missed", 1.5), ("false", 1.5)):
+                canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
         canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
         disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
         canvas.static("world/mission/disc", disc)
@@ -283,11 +282,17 @@ class Drawing:
     def _sighting_rows(
         self, drone: int, t_s: Floats, found: list[Boxes], missed: list[Boxes], false: list[Boxes]
     ) -> None:
-        for name, several in (("found", found), ("missed", missed), ("false", false)):
+        """Send boxes of these times, a list of them each; the less sure the drone was, the darker."""
+        for name, several, colour in (
+            ("found", found, c.FOUND),
+            ("missed", missed, c.MISSED),
+            ("false", false, c.FALSE),
+        ):
             boxes = Boxes.join(several)
-            columns = _flat_boxes(boxes)
-            lengths = [len(b) for b in several]
-            self._canvas.columns(f"world/seen/{drone}/{name}", t_s, rr.Boxes3D.columns(**columns).partition(lengths))
+            light = 0.25 + 0.75 * np.clip(boxes.score, 0.0, 1.0)[:, None]
+            shades = np.column_stack([light * np.array(colour[:3]), np.full(len(boxes), 255)]).astype(np.uint8)
+            columns = rr.Boxes3D.columns(**_flat_boxes(boxes), colors=_packed(shades))
+            self._canvas.columns(f"world/seen/{drone}/{name}", t_s, columns.partition([len(b) for b in several]))
 
 
 # --- shapes ----------------------------------------------------------------------------------------

@@ -302,6 +302,10 @@ def test_every_car_in_range_is_found_or_missed_and_every_box_is_a_car_or_false(
         assert counts["found"][key] + counts["false"][key] == fusion["detections"]
         assert counts["found"][key] == judged[fusion["t_s"], fusion["drone"]].hit.sum()
     assert sum(counts["missed"].values()) > 0
+    # a missed car is drawn in full yellow, a false alarm's red is as dark as its score is low
+    assert {x for _, _, v in rows["/world/seen/0/missed"]["Boxes3D:colors"] for x in v} == {0xFFC828FF}
+    reds = {x >> 24 for _, _, v in rows["/world/seen/0/false"]["Boxes3D:colors"] for x in v}
+    assert 0.25 * 255 < min(reds) < max(reds) < 0.75 * 255
 
 
 def test_accuracy_is_the_outcome_s_over_the_same_window(rows: Rows, record: SortieRecord) -> None:
