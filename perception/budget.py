@@ -58,6 +58,12 @@ def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y
     return min(budget, int(np.count_nonzero(_window(roi, x_m, y_m, yaw_rad)[2])))
 
 
+def must_choose(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
+    """Whether the budget is below the cells there are, so that they have to be ranked."""
+    candidates = CELLS if roi is None else cells_sent(1.0, roi, x_m, y_m, yaw_rad)
+    return math.floor(rho * CELLS + 1e-9) < candidates
+
+
 def _window(roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float) -> tuple[slice, slice, np.ndarray]:
     """The rows and columns that a disc can touch, and which of their cells have their centres in it."""
     dx, dy, radius_m = roi[0] - x_m, roi[1] - y_m, roi[2]

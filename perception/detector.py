@@ -102,9 +102,11 @@ class TorchDetector:
         A late share is used as it is: the sender's pose at its capture places it, what has moved since lags.
         """
         self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
-        alone = [s.capture for _, shares in jobs for s in shares if self._needs_head(s)]
+        shared = [s for _, shares in jobs for s in shares]
+        alone = [s.capture for s in shared if s.representation in LATE]
         alone += [ego for ego, shares in jobs if not any(s.representation in MAPS for s in shares)]
         self._each(self._look_alone, dict.fromkeys(alone))
+        self._each(self._head_alone, dict.fromkeys(s.capture for s in shared if self._must_rank(s)))
         return self._each(lambda job: self._fuse(*job), jobs)
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
@@ -148,18 +150,24 @@ class TorchDetector:
         while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
             self._kept.popitem(last=False)
 
-    def _needs_head(self, share: Share) -> bool:
-        """Whether the sender's own head is needed: to rank its cells, or for the boxes it sends."""
-        if share.representation == "features":
-            return self._config.cells_by == "confidence" and not (share.rho >= 1.0 and share.roi is None)
-        return share.representation in LATE
+    def _must_rank(self, share: Share) -> bool:
+        """Whether the sender's own head is needed to say which cells it sent."""
+        if share.representation != "features" or self._config.cells_by != "confidence":
+            return False
+        return budget.must_choose(share.rho, share.roi, *share.capture.est_pose)
+
+    def _head_alone(self, capture: Capture) -> Tensor:
+        """The head's output [7, 128, 128] without peers, worked out once."""
+        kept = self._kept[capture]
+        if kept.out is None:
+            kept.out = self._net.head(kept.features[None])[0]
+        return kept.out
 
     def _look_alone(self, capture: Capture) -> None:
         """Work out what the capture shows without peers, once."""
         kept = self._kept[capture]
         if kept.boxes is None:
-            kept.out = self._net.head(kept.features[None])[0]
-            kept.boxes = self._place(kept.out, capture)
+            kept.boxes = self._place(self._head_alone(capture), capture)
 
     def _alone(self, capture: Capture) -> Boxes:
         boxes = self._kept[capture].boxes
@@ -175,13 +183,12 @@ class TorchDetector:
         if share.representation == "raw":
             return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
         kept = self._kept[share.capture]
-        if share.rho >= 1.0 and share.roi is None:
+        if not budget.must_choose(share.rho, share.roi, *share.capture.est_pose):
             rank = np.zeros((CELLS, CELLS))
         elif self._config.cells_by == "norm":
             rank = kept.features.norm(dim=0).numpy()
         else:
-            assert kept.out is not None  # noqa: S101 (looked at before)
-            rank = F.max_pool2d(kept.out[:1], 2)[0].numpy()
+            rank = F.max_pool2d(self._head_alone(share.capture)[:1], 2)[0].numpy()
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose))[None]
 
     def _fuse(self, ego: Capture, shares: Sequence[Share]) -> Boxes:

@@ -129,13 +129,17 @@ class CarNet(nn.Module):
         """
         if not len(peers):
             return ego
-        every = torch.cat([ego, peers])
-        logit = self.edge(ego, every)
         takes_part = (inside if unsent == "zero" else sent) & (weight > 0)[:, None, None, None]
+        # Where no peer has a say the ego's features stay as they are: under a budget, most cells.
+        at = takes_part.any(dim=0).flatten().nonzero().squeeze(1)
+        if not len(at):
+            return ego
+        every = torch.cat([ego, peers]).flatten(2)[:, :, None, at]
+        logit = self.edge(every[:1], every)
         bias = torch.where(takes_part, weight.clamp_min(1e-12).log()[:, None, None, None], -math.inf)
-        logit = logit + torch.cat([torch.zeros_like(logit[:1]), bias])
-        fused: Tensor = (logit.softmax(dim=0) * every).sum(dim=0, keepdim=True)
-        return fused
+        logit[1:] += bias.flatten(2)[:, :, None, at]
+        mixed = (logit.softmax(dim=0) * every).sum(dim=0)
+        return ego.flatten(2).index_copy(2, at, mixed[:, 0][None]).view_as(ego)
 
 
 def warp(features: Tensor, sent: Tensor, ego_pose: Tensor, peer_pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -70,7 +70,10 @@ class Motion(Section):
         0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis."
     )
     heading_error_deg: float = Field(
-        0.5, ge=0, le=45, description="Standard deviation of the heading estimate's error."
+        0.2,
+        ge=0,
+        le=45,
+        description="Standard deviation of the heading estimate's error; 0.2° is a dual-antenna receiver, a magnetometer has degrees.",
     )
 
 
