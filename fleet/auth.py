@@ -22,6 +22,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
+from typing import NamedTuple
 
 from fleet.cdr import MalformedDatagram
 from fleet.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
@@ -45,8 +47,7 @@ class DropReason(StrEnum):
     REPLAYED = "replayed"
 
 
-@dataclass(frozen=True, slots=True)
-class Opened:
+class Opened(NamedTuple):
     """A datagram that is what it claims to be; whether it is fresh is each receiver's own question."""
 
     descriptor: Descriptor
@@ -63,6 +64,7 @@ class Dropped:
     detail: str
 
 
+@lru_cache(maxsize=256)  # its sender and whoever hears it compute the same one
 def tag(key: bytes, stamped: bytes) -> bytes:
     """HMAC-SHA256 (RFC 2104), truncated to its first 16 B (RFC 2104 §5 allows half the hash)."""
     return hmac.digest(key, stamped, "sha256")[:TAG_BYTES]

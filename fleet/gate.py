@@ -8,7 +8,7 @@ each payload carries a header with capture stamp and pose, and the directive it 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from perception import budget
 from policies.contract import Directive, Disc, Representation
@@ -26,8 +26,7 @@ CountBoxes = Callable[[Disc | None], int]
 """How many boxes the drone's own detector reports in a region right now."""
 
 
-@dataclass(frozen=True, slots=True)
-class Payload:
+class Payload(NamedTuple):
     """What goes on the air for one link and frame; the content is named, not carried."""
 
     representation: Representation
@@ -100,7 +99,7 @@ class Gate:
     @property
     def duty_percent(self) -> int:
         """The duty cycle asked for: the highest over the links, 100 where there is no link."""
-        return max((d.duty_percent for d in self._directives.values()), default=100)
+        return max([d.duty_percent for d in self._directives.values()], default=100)
 
     def due(self, now_s: float) -> list[Directive]:
         """Directives of the links that may send now, by ascending peer; marks them as sent."""
@@ -109,10 +108,11 @@ class Gate:
             directive = self._directives[peer]
             if directive.representation == Representation.NONE or directive.rate_hz <= 0:
                 continue
-            slot_s = self._last_slot_s.get(peer, -1e9) + 1.0 / directive.rate_hz
+            period_s = 1.0 / directive.rate_hz
+            slot_s = self._last_slot_s.get(peer, -1e9) + period_s
             if now_s < slot_s - _EPSILON_S:
                 continue
             # Slots advance by the period, so that 3 Hz on a 10 Hz clock is 3 Hz in the mean; a late slot starts anew.
-            self._last_slot_s[peer] = slot_s if now_s - slot_s < 1.0 / directive.rate_hz else now_s
+            self._last_slot_s[peer] = slot_s if now_s - slot_s < period_s else now_s
             ready.append(directive)
         return ready

@@ -8,6 +8,7 @@ frames travel alone at a basic rate and are never answered.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil
 
 from radio.contention import DIFS_S, SIFS_S, SLOT_S, Contention
@@ -45,12 +46,14 @@ def frame_bytes(payload_bytes: int, *, fragmented: bool = False, unicast: bool =
     return datagram_bytes(payload_bytes, fragmented=fragmented, unicast=unicast) + mac
 
 
+@lru_cache(maxsize=4096)
 def sample_wire_bytes(payload_bytes: int, fragment_bytes: int) -> int:
     """Every byte of a unicast sample's frames, each counted once."""
     k = fragments(payload_bytes, fragment_bytes)
     return payload_bytes + k * frame_bytes(0, fragmented=k > 1)
 
 
+@lru_cache(maxsize=4096)
 def repair_wire_bytes(lost: int) -> int:
     """A heartbeat and the ACKNACK that answers it with a bitmap of `lost` fragments (up to 256 bits), as frames."""
     around = 2 * (RTPS_HEADER + INFO_DST + UDP_IP + MAC_UNICAST)
@@ -69,6 +72,7 @@ def legacy_ppdu_s(psdu_bytes: int, rate_mbps: float) -> float:
     return LEGACY_PREAMBLE_S + LEGACY_SYMBOL_S * ceil((SERVICE_TAIL_BITS + 8 * psdu_bytes) / bits_per_symbol - 1e-9)
 
 
+@lru_cache(maxsize=4096)
 def group_frame_s(payload_bytes: int, rate_mbps: float) -> float:
     """Time of one group-addressed sample of a single fragment; 180 B at 6 Mb/s is 432 µs."""
     return legacy_ppdu_s(frame_bytes(payload_bytes, unicast=False), rate_mbps)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from math import exp, log1p
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import bdtr
@@ -19,8 +19,7 @@ class Status(StrEnum):
     IN_FLIGHT = "in_flight"
 
 
-@dataclass(frozen=True, slots=True)
-class Transmission:
+class Transmission(NamedTuple):
     """A unicast sample from its writing to its end.
 
     | field | meaning |
