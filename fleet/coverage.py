@@ -16,18 +16,20 @@ CELL_M = 12.8
 HALF_FIELD_OF_VIEW_DEG = 35.0
 """Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
 RANGE_M = 102.4
+_HALF_FIELD_OF_VIEW_TAN = math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
+_CELLS = np.arange(COVERAGE_CELLS)
+_PLACES = np.array([1, 4, 16, 64], np.uint8)
 NOVEL_FLAG, TARGET_FLAG = 1, 2
 
 
 def footprint_radius_m(height_m: float) -> float:
     """Radius of the nadir footprint at a height above ground."""
-    return max(0.0, height_m) * math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
+    return max(0.0, height_m) * _HALF_FIELD_OF_VIEW_TAN
 
 
 def pack_grid(states: np.ndarray) -> bytes:
     """16 × 16 coverage states (rows from south, columns from west) to 64 B, lowest bits first."""
-    quads = states.astype(np.uint8).reshape(-1, 4)
-    return bytes((quads << np.array([0, 2, 4, 6], np.uint8)).sum(axis=1, dtype=np.uint8))
+    return (states.astype(np.uint8).reshape(-1, 4) @ _PLACES).tobytes()
 
 
 def unpack_grid(grid: bytes) -> np.ndarray:
@@ -50,17 +52,14 @@ class CoverageMap:
             radius_m: its footprint radius.
         """
         half = COVERAGE_CELLS // 2
-        ix = math.floor(x_m / CELL_M) - half + np.arange(COVERAGE_CELLS)
-        iy = math.floor(y_m / CELL_M) - half + np.arange(COVERAGE_CELLS)
-        distance_m = np.hypot((ix + 0.5) * CELL_M - x_m, ((iy + 0.5) * CELL_M - y_m)[:, None])
-        states = np.full(distance_m.shape, Coverage.UNSEEN, np.uint8)
-        states[distance_m <= RANGE_M] = Coverage.POOR
-        rows, columns = np.nonzero(distance_m <= radius_m)
-        novel = False
-        for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
-            key = (int(ix[c]), int(iy[r]))
-            new = key not in self._seen_well
-            self._seen_well.add(key)
-            states[r, c] = Coverage.NOVEL if new else Coverage.WELL
-            novel |= new
-        return pack_grid(states), novel
+        west, south = math.floor(x_m / CELL_M) - half, math.floor(y_m / CELL_M) - half
+        distance_m = np.hypot((west + _CELLS + 0.5) * CELL_M - x_m, ((south + _CELLS + 0.5) * CELL_M - y_m)[:, None])
+        well = distance_m <= radius_m
+        states = (distance_m <= RANGE_M).astype(np.uint8)  # UNSEEN or POOR
+        states[well] = Coverage.WELL
+        seen = self._seen_well
+        new = [(r, c) for r, c in np.argwhere(well).tolist() if (west + c, south + r) not in seen]
+        for r, c in new:
+            states[r, c] = Coverage.NOVEL
+            seen.add((west + c, south + r))
+        return pack_grid(states), bool(new)

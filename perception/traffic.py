@@ -8,6 +8,7 @@ giving way, so two crossing cars may touch there for a moment (about one crossin
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,10 +111,11 @@ def lanes(scene: Scene, rect: tuple[float, float, float, float]) -> Lanes:
 
 @dataclass(frozen=True, slots=True)
 class TargetPath:
-    """The target's path by arc length: `at_s_m` [k] distances of `points_m` [k, 2]."""
+    """The target's path by arc length: `at_s_m` [k] distances of `points_m` [k] (x, y), `yaw_rad` [k − 1] of its legs."""
 
-    points_m: Floats
-    at_s_m: Floats
+    points_m: list[tuple[float, float]]
+    at_s_m: list[float]
+    yaw_rad: list[float]
     speed_mps: float
 
     @classmethod
@@ -122,20 +124,20 @@ class TargetPath:
         steps = np.hypot(*np.diff(points, axis=0).T)
         keep = np.concatenate([[True], steps > 1e-9])  # a waypoint given twice is passed once
         points = points[keep]
-        at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        return cls(points, at, target.speed_mps)
+        dx, dy = np.diff(points, axis=0).T
+        at = np.concatenate([[0.0], np.cumsum(np.hypot(dx, dy))])
+        return cls([(x, y) for x, y in points.tolist()], at.tolist(), np.arctan2(dy, dx).tolist(), target.speed_mps)
 
     def pose(self, t_s: float) -> tuple[float, float, float]:
         """x, y and yaw at `t_s`; before the begin and after the end it stands."""
         points, at = self.points_m, self.at_s_m
         if len(points) == 1:
-            return float(points[0, 0]), float(points[0, 1]), 0.0
-        s = min(max(self.speed_mps * t_s, 0.0), float(at[-1]))
-        leg = min(int(np.searchsorted(at, s, side="right")), len(points) - 1)
-        a, b = points[leg - 1], points[leg]
+            return *points[0], 0.0
+        s = min(max(self.speed_mps * t_s, 0.0), at[-1])
+        leg = min(bisect_right(at, s), len(points) - 1)
+        (ax, ay), (bx, by) = points[leg - 1], points[leg]
         part = (s - at[leg - 1]) / (at[leg] - at[leg - 1])
-        x, y = a + part * (b - a)
-        return float(x), float(y), float(np.arctan2(b[1] - a[1], b[0] - a[0]))
+        return ax + part * (bx - ax), ay + part * (by - ay), self.yaw_rad[leg - 1]
 
 
 def parked(town: Town, rect: tuple[float, float, float, float]) -> tuple[Floats, Floats, Bytes]:
