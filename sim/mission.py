@@ -10,6 +10,8 @@ from perception.traffic import TARGET_ID, TargetPath
 from policies.contract import Disc, TaskPhase
 from scenarios.schema import Mission
 
+_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
+
 
 @dataclass(frozen=True, slots=True)
 class MissionNow:
@@ -26,7 +28,7 @@ class MissionNow:
             dx_m, dy_m = self.target_xy[0] - own_xy_m[0], self.target_xy[1] - own_xy_m[1]
             if dx_m * dx_m + dy_m * dy_m <= footprint_m * footprint_m:
                 targets = (TARGET_ID,)
-        return Task(TaskPhase[self.phase.upper()], self.region, targets)
+        return Task(_PHASES[self.phase], self.region, targets)
 
 
 class MissionPlan:

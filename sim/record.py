@@ -16,11 +16,15 @@ import numpy as np
 import pyarrow as pa
 
 from fleet.staleness import LinkHealth
-from policies.contract import Descriptor, Directive
+from policies.contract import Descriptor, Directive, Representation, TaskPhase
 from scenarios.schema import Scenario
 
 NAN = float("nan")
 DIRECTIVE_WIRE_BYTES = 36
+REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
+"""Names as the tables have them."""
+_PHASES = {phase: phase.name.lower() for phase in TaskPhase}
+_LINKS = {link: link.name.lower() for link in LinkHealth}
 F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
 
 TABLES: dict[str, dict[str, pa.DataType]] = {
@@ -152,7 +156,7 @@ class AgentNotes:
         self._rows["descriptors"].append(
             (
                 t_s, d.agent_id, d.stamp_ns, wire_bytes, d.battery_soc, d.cpu_headroom, d.gpu_headroom,
-                d.peer_goodput_mbps, d.task_phase.name.lower(), *region, d.novelty_flags, d.coverage_grid,
+                d.peer_goodput_mbps, _PHASES[d.task_phase], *region, d.novelty_flags, d.coverage_grid,
             )
         )  # fmt: skip
 
@@ -162,16 +166,16 @@ class AgentNotes:
         roi = (NAN, NAN, NAN) if enforced.roi is None else (enforced.roi.x_m, enforced.roi.y_m, enforced.roi.radius_m)
         self._rows["directives"].append(
             (
-                t_s, enforced.source, enforced.destination, enforced.representation.name.lower(), enforced.rho, *roi,
+                t_s, enforced.source, enforced.destination, REPRESENTATIONS[enforced.representation], enforced.rho, *roi,
                 enforced.rate_hz, enforced.deadline_s, enforced.fusion_weight, enforced.duty_percent,
-                asked.representation.name.lower(), asked.rate_hz, link.name.lower(), reason,
+                REPRESENTATIONS[asked.representation], asked.rate_hz, _LINKS[link], reason,
             )
         )  # fmt: skip
 
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None:
         """A policy decided, reading peers' descriptors of these ages."""
         self._eval_ns.append(elapsed_ns)
-        self._rows["ages"].extend((t_s, drone, age_s) for age_s in peer_ages_s)
+        self._rows["ages"] += [(t_s, drone, age_s) for age_s in peer_ages_s]
 
     def totals(self) -> dict[str, float]:
         """Context-plane bytes: descriptors on the air, directives to the gates."""

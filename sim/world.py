@@ -27,6 +27,8 @@ from sim.record import Recorder
 
 NAN = float("nan")
 SECOND_S = 1.0
+TRUE_STATE = 13
+"""Columns of a drone's state before what it believes: position, attitude, velocity, body rates."""
 USABLE_SNR_DB = 0.0
 """Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
 
@@ -64,11 +66,12 @@ class World:
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         rotor_w = rotor_power_w(motion.air_speed_mps) + climb_power_w(motion.velocity_mps[..., 2])
         self._rotor_w: list[list[float]] = rotor_w.tolist()
-        self._positions: list[list[list[float]]] = motion.position_m.tolist()
-        columns = (motion.position_m, motion.orientation_xyzw, motion.velocity_mps, motion.body_rates_radps)
+        columns = (
+            motion.position_m, motion.orientation_xyzw, motion.velocity_mps, motion.body_rates_radps,
+            motion.est_position_m, motion.est_yaw_rad[..., None],
+        )  # fmt: skip
         self._states: list[list[list[float]]] = np.concatenate(columns, axis=-1).tolist()
-        self._est_position = motion.est_position_m.tolist()
-        self._est_yaw = motion.est_yaw_rad.tolist()
+        self._busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
@@ -110,8 +113,7 @@ class World:
 
     def duty(self, agent: Agent) -> float:
         """Share of a frame in which the drone's computer runs perception: its compute delay, when it senses."""
-        busy = min(1.0, self._scenario.perception.compute_delay_s * self._scenario.context.rate_hz)
-        return busy if agent.sensed else 0.0
+        return self._busy_sensing if agent.sensed else 0.0
 
     def ground_landed(self) -> None:
         """Take drones whose battery gave out off the plane and the air."""
@@ -145,7 +147,7 @@ class World:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
         rows["states"].extend(
             (
-                now_s, agent.drone, *self._states[frame][agent.drone], batteries.soc[agent.drone],
+                now_s, agent.drone, *self._states[frame][agent.drone][:TRUE_STATE], batteries.soc[agent.drone],
                 batteries.voltage_v[agent.drone], batteries.current_a[agent.drone], agent.airborne,
             )
             for agent in self.agents
@@ -169,15 +171,9 @@ class _OwnSenses:
 
     def capture(self, frame: int) -> Capture:
         world, i = self._world, self._drone
-        state = world._states[frame][i]
-        return Capture(
-            drone=i,
-            t_s=frame * world._scenario.frame_s,  # sensors trigger with the frame, the drone's phase comes after
-            position_m=(state[0], state[1], state[2]),
-            orientation_xyzw=(state[3], state[4], state[5], state[6]),
-            est_position_m=tuple(world._est_position[frame][i]),
-            est_yaw_rad=world._est_yaw[frame][i],
-        )
+        x, y, z, qx, qy, qz, qw, _, _, _, _, _, _, est_x, est_y, est_z, est_yaw = world._states[frame][i]
+        t_s = frame * world._scenario.frame_s  # sensors trigger with the frame, the drone's phase comes after
+        return Capture(i, t_s, (x, y, z), (qx, qy, qz, qw), (est_x, est_y, est_z), est_yaw)
 
     def velocity_mps(self, frame: int) -> tuple[float, float, float]:
         state = self._world._states[frame][self._drone]
@@ -190,7 +186,7 @@ class _OwnSenses:
 
     def task(self) -> Task:
         world = self._world
-        x_m, y_m, z_m = world._positions[world._frame][self._drone]
+        x_m, y_m, z_m = world._states[world._frame][self._drone][:3]
         return world.now.task((x_m, y_m), footprint_radius_m(z_m))
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
