@@ -12,127 +12,24 @@ sender, receiver and kind replaces an older one that is not through (history dep
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import isnan, nan
+from math import nan
 from typing import cast
 
-import numpy as np
 import simpy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from radio.airtime import (
-    ACK_S,
-    Exchanges,
-    ampdu_frames,
-    fragments,
-    frame_bytes,
-    frames_exchanges,
-    group_frame_s,
-    repair_wire_bytes,
-    residual_loss,
-    sample_exchanges,
-    sample_wire_bytes,
-    tries,
-)
+from radio.airtime import fragments, frame_bytes, repair_wire_bytes, sample_wire_bytes
+from radio.broadcasts import Broadcast, Broadcasts, OnHeard
 from radio.channel import Channel, FloatArray, Jammer, SampleLuck
-from radio.contention import contention
+from radio.counters import Counters
 from radio.goodput import Goodput
-from radio.medium import CW_CONTEXT, End, GroupFrame, Job, Medium
-from radio.rates import RATES_MBPS, rate_table, rescale
+from radio.medium import End, Job, Medium
+from radio.sample import Sample, Service
 from radio.transmission import Status, Transmission, losses
 from scenarios.schema import Radio
-from scenarios.streams import stream
 
-Ids = NDArray[np.intp]
-MAX_GROUP_PAYLOAD_BYTES = 2200
-"""A group-addressed sample is one 802.11 frame."""
 _WINDOW_S = 1e-3
 """A goodput measurement that is still going on counts once it is this old."""
-_GOLDEN = 0.6180339887498949
-
-
-class _Sample(Job):
-    """A unicast sample on its way."""
-
-    __slots__ = (
-        "drained_bits",
-        "fragments",
-        "full_mbps",
-        "kind",
-        "left",
-        "loss_probability",
-        "loss_share",
-        "lost",
-        "luck",
-        "mark_bits",
-        "mark_left",
-        "mark_s",
-        "mcs",
-        "on_done",
-        "pass_bytes",
-        "payload_bytes",
-        "receiver",
-        "reliable",
-        "repairs",
-        "snr_db",
-        "t_first_s",
-        "t_sent_s",
-        "unreachable",
-        "wire_bytes",
-    )
-    receiver: int
-    kind: str
-    payload_bytes: int
-    reliable: bool
-    on_done: Callable[[Transmission], None]
-    t_sent_s: float
-    t_first_s: float
-    fragments: int
-    left: int  # fragments of this pass
-    pass_bytes: int  # on the wire in this pass
-    lost: int
-    repairs: int
-    luck: list[float]
-    mcs: int
-    snr_db: float
-    loss_probability: float  # of a fragment, after all MAC retries
-    loss_share: float  # loss_probability so far, weighted by the part of the pass that it held for
-    unreachable: str  # '' or the reason
-    wire_bytes: float
-    full_mbps: float  # payload rate of full A-MPDUs, alone, at the MCS in use
-    mark_s: float  # begin of the goodput measurement
-    mark_left: float  # `remaining` when progress was last booked
-    mark_bits: float  # acknowledged since mark_s, as goodput counts them
-    drained_bits: float  # what the sender had got through when this was written
-
-
-class _Broadcast(GroupFrame):
-    """A context frame with its length and who wants to know."""
-
-    __slots__ = ("mpdu_bytes", "on_heard", "residual")
-    mpdu_bytes: int
-    on_heard: Callable[[Ids], None]
-    residual: float
-
-
-@dataclass(slots=True)
-class Counters:
-    """Totals so far. Data bytes are payload: sent = delivered + lost + expired + in flight."""
-
-    data_sent_bytes: int = 0
-    data_delivered_bytes: int = 0
-    data_lost_bytes: int = 0
-    data_expired_bytes: int = 0
-    data_wire_bytes: int = 0
-    context_sent_bytes: int = 0
-    context_wire_bytes: int = 0
-    broadcasts: int = 0
-    receptions: int = 0
-    """Broadcasts heard, counted per receiver."""
-    missed: int = 0
-    """Broadcasts that a living drone did not hear."""
-    collided: int = 0
-    """Broadcasts lost to a collision with another."""
 
 
 class Air:
@@ -168,31 +65,22 @@ class Air:
         self._config = config
         self._n = n_drones
         self.channel = Channel(config, n_drones, seed, replication, frame_s)
-        self.medium = Medium(env, n_drones, self._begin, self._end, self._group_end)
         self.counters = Counters()
-        self._frame_bytes = frame_bytes(config.fragment_bytes, fragmented=True)
-        self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes)
-        self._full_mbps = tuple(self._full_goodput(rate) for rate in RATES_MBPS[config.bandwidth_mhz])
-        lowest = RATES_MBPS[config.bandwidth_mhz][0]
-        probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, lowest, 1, ACK_S)
-        self._probe = probe.scaled(config.retry_limit + 1.0)
-        self._demands: dict[tuple[int, int, bool], Exchanges] = {}
+        self._gone: set[int] = set()
+        self._broadcasts = Broadcasts(
+            config, self.channel, self.counters, self._gone,
+            seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
+        )  # fmt: skip
+        self.medium = Medium(env, n_drones, self._begin, self._end, self._broadcasts.end)
+        self._service = Service(config)
         self._luck = SampleLuck(seed, replication)
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._snr_rows: list[list[float]] = []
         self._known_rows: list[list[float]] = []
-        self._gone: set[int] = set()
-        self._in_flight: dict[int, _Sample] = {}
-        self._latest: dict[tuple[int, int, str], _Sample] = {}
+        self._in_flight: dict[int, Sample] = {}
+        self._latest: dict[tuple[int, int, str], Sample] = {}
         self._numbers = 0
-        self._access_streams = [stream(seed, replication, i, "access") for i in range(n_drones)]
-        self._access: list[list[list[float]]] = [[] for _ in range(n_drones)]
-        self._phase_s = [
-            float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s
-            for i in range(n_drones)
-        ]
-        self._heard_frame = [(-1, 0)] * n_drones
 
     # --- once a frame ----------------------------------------------------------------------------
 
@@ -206,6 +94,7 @@ class Air:
         before = self._snr_rows
         self._snr_rows = self.channel.advance(positions_m, extra_loss_db, jammers).tolist()
         self._known_rows = before or self._snr_rows
+        self._broadcasts.advance()
         self.medium.retune()
 
     @property
@@ -215,7 +104,7 @@ class Air:
 
     # --- context ---------------------------------------------------------------------------------
 
-    def broadcast(self, sender: int, payload_bytes: int, on_heard: Callable[[Ids], None]) -> None:
+    def broadcast(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> None:
         """Put one group-addressed frame on the air: no ack, no retry, basic rate.
 
         Args:
@@ -227,55 +116,19 @@ class Air:
         Raises:
             ValueError: if an argument is out of its bounds.
         """
-        if not 0 <= sender < self._n:
-            raise ValueError(f"sender is {sender}, must be in [0, {self._n - 1}]")
-        if not 1 <= payload_bytes <= MAX_GROUP_PAYLOAD_BYTES:
-            raise ValueError(f"payload_bytes is {payload_bytes}, must be in [1, {MAX_GROUP_PAYLOAD_BYTES}]")
         if sender in self._gone:
             return
-        ready = self._access[sender]
-        if not ready:
-            ready.extend(self._access_streams[sender].random((256, 2)).tolist()[::-1])
-        slot_u, residual = ready.pop()
-        airtime_s = group_frame_s(payload_bytes, self._config.group_rate_mbps)
-        frame = _Broadcast(sender, airtime_s, int(slot_u * (CW_CONTEXT + 1)))
-        frame.mpdu_bytes = frame_bytes(payload_bytes, unicast=False)
-        frame.on_heard = on_heard
-        frame.residual = residual
-        self.counters.broadcasts += 1
-        self.counters.context_sent_bytes += payload_bytes
-        phase_s = self._phase_s[sender]
+        frame = self._broadcasts.frame(sender, payload_bytes, on_heard)
+        phase_s = self._broadcasts.phase_s[sender]
         if phase_s > 0.0:
             self._env.timeout(phase_s, frame).callbacks.append(self._announce)
         else:
-            self.medium.announce(frame, residual)
-
-    def _announce(self, event: simpy.Event) -> None:
-        frame = cast(_Broadcast, event.value)
-        if frame.sender not in self._gone:
             self.medium.announce(frame, frame.residual)
 
-    def _group_end(self, frame: GroupFrame, collided: bool) -> None:
-        frame = cast(_Broadcast, frame)
-        counters, sender = self.counters, frame.sender
-        counters.context_wire_bytes += frame.mpdu_bytes
-        living = self._n - 1 - len(self._gone - {sender})
-        if collided:
-            counters.collided += 1
-            counters.missed += living
-            frame.on_heard(_NOBODY)
-            return
-        index = self.channel.frame
-        seen, times = self._heard_frame[sender]
-        times = times + 1 if seen == index else 0
-        self._heard_frame[sender] = (index, times)
-        reach = self.channel.group_reach_bytes[sender] if times == 0 else self.channel.reach_again(sender, times)
-        heard = (reach >= frame.mpdu_bytes).nonzero()[0]
-        if self._gone:
-            heard = heard[[int(i) not in self._gone for i in heard]]
-        counters.receptions += len(heard)
-        counters.missed += living - len(heard)
-        frame.on_heard(heard)
+    def _announce(self, event: simpy.Event) -> None:
+        frame = cast(Broadcast, event.value)
+        if frame.sender not in self._gone:
+            self.medium.announce(frame, frame.residual)
 
     # --- data ------------------------------------------------------------------------------------
 
@@ -317,16 +170,14 @@ class Air:
         now = self._env.now
         number = self._numbers
         self._numbers = number + 1
-        s = _Sample(number, sender, now + deadline_s)
-        s.receiver, s.kind, s.payload_bytes, s.reliable, s.on_done = receiver, kind, payload_bytes, reliable, on_done
-        s.t_sent_s, s.t_first_s, s.mark_s = now, nan, now
-        s.fragments = s.left = fragments(payload_bytes, self._config.fragment_bytes)
-        s.pass_bytes = sample_wire_bytes(payload_bytes, self._config.fragment_bytes)
-        s.lost = s.repairs = 0
-        s.luck = self._luck.next(sender, receiver)
-        s.mcs, s.snr_db = -1, self._snr_rows[sender][receiver]
-        s.loss_probability, s.unreachable, s.full_mbps = 1.0, "", 0.0
-        s.wire_bytes, s.mark_left, s.mark_bits, s.loss_share = 0.0, 1.0, 0.0, 0.0
+        fragment_bytes = self._config.fragment_bytes
+        s = Sample(
+            number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
+            fragments=fragments(payload_bytes, fragment_bytes),
+            wire_bytes=sample_wire_bytes(payload_bytes, fragment_bytes),
+            luck=self._luck.next(sender, receiver),
+            snr_db=self._snr_rows[sender][receiver],
+        )  # fmt: skip
         s.drained_bits = self._drained(sender)
         self._in_flight[number] = s
         self.counters.data_sent_bytes += payload_bytes
@@ -366,69 +217,20 @@ class Air:
         self.medium.retune()
 
     def _refuse(self, event: simpy.Event) -> None:
-        s = cast(_Sample, event.value)
+        s = cast(Sample, event.value)
         if s.number in self._in_flight:
             self._close(s, Status.LOST, "sender_gone")
 
     def _begin(self, job: Job) -> None:
         """A sample comes to the head of its queue, or its link has changed while it is there."""
-        s = cast(_Sample, job)
-        now = self._env.now
+        s = cast(Sample, job)
         self._book(s)
-        fresh = s.t_start_s == now
-        if isnan(s.t_first_s):
-            s.t_first_s = now
-        s.snr_db = snr_db = self._snr_rows[s.sender][s.receiver]
-        mcs = self._table.mcs[self._table.index(self._known_rows[s.sender][s.receiver])]
-        reason = "receiver_gone" if s.receiver in self._gone else "no_link" if mcs < 0 else ""
-        if fresh or (-1 if reason else mcs) != s.mcs:
-            s.mark_s, s.mark_bits = now, 0.0
-        if reason:
-            if fresh or not s.unreachable:
-                self._restart(s)
-                s.demand(self._probe)
-                s.full_mbps = 0.0
-            s.unreachable, s.mcs = reason, -1
-            return
-        if s.unreachable:
-            s.unreachable = ""
-            self._restart(s)
-        s.mcs = mcs
-        limit = self._config.retry_limit
-        payload = s.payload_bytes if s.left == s.fragments else self._repair_payload(s)
-        per = self._table.all_per[mcs][self._table.index(snr_db)]
-        if s.fragments == 1:
-            per = rescale(per, frame_bytes(payload) / self._frame_bytes)
-        mean_tries = tries(per, limit)
-        s.loss_probability = residual_loss(per, limit)
-        s.full_mbps = self._full_mbps[mcs] / mean_tries * (1.0 - s.loss_probability)
-        key = (payload, mcs, s.reliable)
-        demand = self._demands.get(key)
-        if demand is None:
-            if len(self._demands) > 20_000:
-                self._demands.clear()
-            demand = self._demands[key] = self._demand(payload, mcs, s.reliable)
-        s.demand(demand, mean_tries)
-
-    def _demand(self, payload_bytes: int, mcs: int, reliable: bool) -> Exchanges:
-        c = self._config
-        rate = RATES_MBPS[c.bandwidth_mhz][mcs]
-        demand = sample_exchanges(payload_bytes, c.fragment_bytes, rate, c.max_ampdu_frames)
-        if reliable:  # heartbeat and ACKNACK, each an exchange of its own
-            length = repair_wire_bytes(1) // 2
-            demand = demand + frames_exchanges(1, length, length, rate, 1, ACK_S).scaled(2.0)
-        return demand
-
-    def _full_goodput(self, rate_mbps: float) -> float:
-        """Payload Mb/s of full A-MPDUs without loss, alone on the channel."""
-        c = self._config
-        m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames)
-        exchanges = frames_exchanges(m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames)
-        return m * c.fragment_bytes * 8e-6 / exchanges.channel_s(contention(1))
+        i, j = s.sender, s.receiver
+        self._service.begin(s, self._env.now, self._known_rows[i][j], self._snr_rows[i][j], j in self._gone)
 
     def _end(self, job: Job, how: End) -> None:
         """The medium is through with a sample's pass, or its deadline has passed."""
-        s = cast(_Sample, job)
+        s = cast(Sample, job)
         self._measure(s, how is not End.DEADLINE_QUEUED)
         if how is not End.SERVED:
             queued = how is End.DEADLINE_QUEUED and s.repairs == 0
@@ -441,7 +243,7 @@ class Air:
             return
         if s.reliable:
             s.wire_bytes += repair_wire_bytes(s.left)
-        lost = losses(self._round_luck(s), s.left, s.loss_share)
+        lost = losses(s.round_luck(), s.left, s.loss_share)
         s.lost += lost
         if lost == 0:
             self._close(s, Status.DELIVERED, "")
@@ -453,38 +255,25 @@ class Air:
             wait_s = max(0.0, min(wait_s, s.deadline_s - self._env.now))
             self._env.timeout(wait_s, s).callbacks.append(self._repair)
 
-    @staticmethod
-    def _round_luck(s: _Sample) -> float:
-        extra = s.repairs - len(s.luck) + 1
-        return s.luck[s.repairs] if extra <= 0 else (s.luck[-1] + extra * _GOLDEN) % 1.0
-
     def _repair(self, event: simpy.Event) -> None:
-        s = cast(_Sample, event.value)
+        s = cast(Sample, event.value)
         if s.number not in self._in_flight:
             return  # replaced or silenced meanwhile
         if self._env.now >= s.deadline_s - 1e-12:
             self._close(s, Status.EXPIRED, "deadline_in_service")
             return
         s.repairs += 1
-        self._restart(s)
-        s.pass_bytes = self._repair_payload(s) + s.left * frame_bytes(0, fragmented=s.fragments > 1)
+        s.restart()
+        s.pass_bytes = self._service.repair_payload(s) + s.left * frame_bytes(0, fragmented=s.fragments > 1)
         s.live = True
         self.medium.submit(s)
 
-    @staticmethod
-    def _restart(s: _Sample) -> None:
-        s.remaining = s.mark_left = 1.0
-        s.loss_share = 0.0
-
-    def _repair_payload(self, s: _Sample) -> int:
-        return min(s.payload_bytes, s.left * self._config.fragment_bytes)
-
-    def _close(self, s: _Sample, status: Status, reason: str) -> None:
+    def _close(self, s: Sample, status: Status, reason: str) -> None:
         del self._in_flight[s.number]
         key = (s.sender, s.receiver, s.kind)
         if self._latest.get(key) is s:
             del self._latest[key]
-        row = self._row(s, status, reason, self._env.now)
+        row = s.row(status, reason, self._env.now)
         c = self.counters
         c.data_wire_bytes += row.wire_bytes
         if status is Status.DELIVERED:
@@ -494,13 +283,6 @@ class Air:
         else:
             c.data_expired_bytes += s.payload_bytes
         s.on_done(row)
-
-    @staticmethod
-    def _row(s: _Sample, status: Status, reason: str, t_done_s: float) -> Transmission:
-        return Transmission(
-            s.number, s.sender, s.receiver, s.kind, s.payload_bytes, round(s.wire_bytes), s.t_sent_s, s.deadline_s,
-            s.t_first_s, t_done_s, status, reason, s.fragments, s.lost, s.repairs, s.mcs, s.snr_db, s.granted_s,
-        )  # fmt: skip
 
     # --- what senders know -----------------------------------------------------------------------
 
@@ -514,7 +296,7 @@ class Air:
             drained = self._drained(sender)
             now = self._env.now
             for job in self.medium.queued(sender):
-                s = cast(_Sample, job)
+                s = cast(Sample, job)
                 if job is self.medium.in_service(sender) and now - s.mark_s >= _WINDOW_S:
                     since, bits = s.mark_s, s.mark_bits
                 else:
@@ -524,26 +306,19 @@ class Air:
         del known[sender]
         return tuple(known)
 
-    def _book(self, s: _Sample) -> None:
+    def _book(self, s: Sample) -> None:
         """Count what was acknowledged since the last time."""
-        done = s.mark_left - s.remaining
-        if done > 0.0:
-            bits = done * s.alone_s * s.full_mbps * 1e6
-            s.mark_bits += bits
-            self._drained_bits[s.sender] += bits
-            s.wire_bytes += done * s.pass_bytes if not s.unreachable else 0.0
-            s.loss_share += done * s.loss_probability
-            s.mark_left = s.remaining
+        self._drained_bits[s.sender] += s.book()
 
     def _drained(self, sender: int) -> float:
         """What the sender has got through so far, bits as goodput counts them."""
         head = self.medium.in_service(sender)
         if head is not None:
             self.medium.sync()
-            self._book(cast(_Sample, head))
+            self._book(cast(Sample, head))
         return self._drained_bits[sender]
 
-    def _measure(self, s: _Sample, served: bool) -> None:
+    def _measure(self, s: Sample, served: bool) -> None:
         """Learn from a sample whose service, or whose wait for it, is over."""
         now = self._env.now
         if not served:
@@ -580,7 +355,4 @@ class Air:
         self.medium.sync()
         for s in self._in_flight.values():
             self._book(s)
-        return [self._row(s, Status.IN_FLIGHT, "", nan) for _, s in sorted(self._in_flight.items())]
-
-
-_NOBODY: Ids = np.empty(0, dtype=np.intp)
+        return [s.row(Status.IN_FLIGHT, "", nan) for _, s in sorted(self._in_flight.items())]

@@ -48,6 +48,11 @@ def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
     return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
 
 
+def _reach_at_1(luck: FloatArray) -> FloatArray:
+    """How long a frame may be, bytes, to arrive with this luck where −log s (see `Channel._reach`) is 1."""
+    return np.asarray(-REFERENCE_BYTES * np.log1p(-luck))
+
+
 class Channel:
     """The SNR of every link, frame by frame.
 
@@ -79,6 +84,7 @@ class Channel:
         self._group_gain_db = 10.0 * log10(config.bandwidth_mhz / 20.0)
         mcs = group_mcs(config.group_rate_mbps)
         self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
+        self._loss_1m_db = float(free_space_loss_db(1.0, config.carrier_ghz))
         self._keep = exp(-frame_s / config.shadowing_time_s)
         self._renew = sqrt(1.0 - self._keep**2)
         ids = range(n_drones)
@@ -89,6 +95,7 @@ class Channel:
         self._shadow_z: FloatArray
         self._fades: FloatArray
         self._luck: FloatArray
+        self._reach_at_1: FloatArray
 
     def advance(
         self, positions_m: ArrayLike, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()
@@ -115,16 +122,16 @@ class Channel:
         row = self.frame % self._block
         if row == 0:
             self._refill()
-        z = self._shadow_z[row]
-        self.shadow_db = (
-            self.config.shadowing_sigma_db * z
-            if self.frame == 0
-            else self._keep * self.shadow_db + self._renew * self.config.shadowing_sigma_db * z
-        )
         c = self.config
+        self.shadow_db = (
+            c.shadowing_sigma_db * self._shadow_z[row]
+            if self.frame == 0
+            else self._keep * self.shadow_db + self._renew * c.shadowing_sigma_db * self._shadow_z[row]
+        )
         delta = p[:, None, :] - p[None, :, :]
         distance = np.sqrt(np.einsum("ijk,ijk->ij", delta, delta))
-        snr = c.tx_power_dbm - self.noise_dbm - path_loss_db(distance, c.carrier_ghz, c.path_loss_exponent)
+        loss_db = self._loss_1m_db + 10.0 * c.path_loss_exponent * np.log10(np.maximum(distance, 1.0))
+        snr: FloatArray = c.tx_power_dbm - self.noise_dbm - loss_db
         snr += self.shadow_db
         if extra_loss_db is not None:
             extra = np.asarray(extra_loss_db, dtype=float)
@@ -134,7 +141,7 @@ class Channel:
         if jammers:
             snr -= self._noise_rise_db(p, jammers)
         self.fade_db = self._fades[row]
-        self.group_reach_bytes = self._reach(snr + self.fade_db, self._luck[row])
+        self.group_reach_bytes = self._reach(snr + self.fade_db, self._reach_at_1[row])
         snr.flat[:: self.n + 1] = np.nan
         self.snr_db = snr
         return snr
@@ -147,18 +154,14 @@ class Channel:
         luck = (self._luck[self.frame % self._block, sender] + times * 0.6180339887498949) % 1.0
         faded_db = self.snr_db[sender] + self.fade_db[sender]
         faded_db[sender] = 0.0
-        return self._reach(faded_db, luck, sender)
+        luck[sender] = np.nan
+        return self._reach(faded_db, _reach_at_1(luck))
 
-    def _reach(self, faded_db: FloatArray, luck: FloatArray, sender: int | None = None) -> FloatArray:
+    def _reach(self, faded_db: FloatArray, reach_at_1: FloatArray) -> FloatArray:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
         margin = faded_db + (self._group_gain_db - self._group_s50_db)
         minus_log_s = np.logaddexp(0.0, -self._group_slope * margin)
-        reach = -REFERENCE_BYTES * np.log1p(-luck) / np.maximum(minus_log_s, 1e-300)
-        if sender is None:
-            reach.flat[:: self.n + 1] = np.nan
-        else:
-            reach[sender] = np.nan
-        return np.asarray(reach)
+        return np.asarray(reach_at_1 / np.maximum(minus_log_s, 1e-300))
 
     def _noise_rise_db(self, positions_m: FloatArray, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
@@ -181,6 +184,8 @@ class Channel:
             self._scatter(x, h, f := self._fade_streams[h].standard_normal((b, 2, 2, h)), 0)
             self._scatter(y, h, f, 1)
             self._scatter(self._luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
+        self._luck[:, range(n), range(n)] = np.nan  # no drone hears itself
+        self._reach_at_1 = _reach_at_1(self._luck)
         self._fades = 10.0 * np.log10(np.maximum(rician_gain(x, y, self.config.rician_k_db), 1e-12))
 
     @staticmethod

@@ -217,10 +217,11 @@ class Medium:
         dt = now - self._last_s
         if dt <= 0.0:
             return
-        blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
-        if blocked > 0.0:
-            self.context_busy_s += blocked
-            dt -= blocked
+        if self._waiting:
+            blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
+            if blocked > 0.0:
+                self.context_busy_s += blocked
+                dt -= blocked
         self._last_s = now
         n = len(self._heads)
         if n == 0 or dt <= 0.0:
@@ -279,7 +280,8 @@ class Medium:
                 if n * job.remaining * (job.clean_s + job.count * idle + collisions * job.collided_s) <= _EPS_S:
                     job.remaining = 0.0
                     ended.append((job, End.SERVED))
-            ended.sort(key=_by_number)
+            if len(ended) > 1:
+                ended.sort(key=_by_number)
             for job, _ in ended:
                 self._remove(job)
         deadlines = self._deadlines
@@ -339,8 +341,8 @@ class Medium:
             self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
             self._context_timer = None
             return
-        fire = min(f.fire_s for f in waiting)
-        until = fire + max(f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2)
+        fire = min([f.fire_s for f in waiting])
+        until = fire + max([f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2])
         self._context_fire_s = fire
         if until != self._context_until_s or self._context_timer is None:
             self._context_until_s = until

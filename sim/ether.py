@@ -13,7 +13,7 @@ from fleet.auth import Dropped, DropReason, Opened, open_datagram
 from fleet.gate import Payload
 from perception.types import Capture
 from radio import Air, Status, Transmission
-from sim.record import Recorder
+from sim.record import REPRESENTATIONS, Recorder
 
 NAN = float("nan")
 
@@ -39,7 +39,7 @@ class Ether:
         """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
         self.last_datagram[drone] = datagram
         opened = open_datagram(datagram, self._keys)
-        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard.tolist()))
+        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard))
 
     def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
         """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""
@@ -63,7 +63,7 @@ class Ether:
             drone,
             peer,
             payload.size_bytes,
-            kind=payload.representation.name.lower(),
+            kind=REPRESENTATIONS[payload.representation],
             reliable=payload.reliable,
             deadline_s=deadline_s,
             on_done=self._done,
@@ -78,7 +78,7 @@ class Ether:
     def _done(self, transmission: Transmission) -> None:
         payload, capture = self._pending.pop(transmission.number)
         self._write(transmission, payload, capture)
-        if transmission.status == Status.DELIVERED:
+        if transmission.status is Status.DELIVERED:
             self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s))
 
     def _write(self, t: Transmission, payload: Payload, capture: Capture) -> None:

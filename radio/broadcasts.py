@@ -1,0 +1,107 @@
+"""Group-addressed frames: one frame on the air, heard by whom it reaches; no ack, no retry, basic rate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from typing import cast
+
+from radio.airtime import frame_bytes, group_frame_s
+from radio.channel import Channel
+from radio.counters import Counters
+from radio.medium import CW_CONTEXT, GroupFrame
+from scenarios.schema import Radio
+from scenarios.streams import stream
+
+MAX_GROUP_PAYLOAD_BYTES = 2200
+"""A group-addressed sample is one 802.11 frame."""
+
+OnHeard = Callable[[list[int]], None]
+
+
+class Broadcast(GroupFrame):
+    """A context frame with its length and who wants to know."""
+
+    __slots__ = ("mpdu_bytes", "on_heard", "residual")
+
+    def __init__(
+        self, sender: int, airtime_s: float, slots: int, residual: float, mpdu_bytes: int, on_heard: OnHeard
+    ) -> None:
+        super().__init__(sender, airtime_s, slots)
+        self.residual = residual
+        self.mpdu_bytes = mpdu_bytes
+        self.on_heard = on_heard
+
+
+class Broadcasts:
+    """The group-addressed half of the air; `Air` documents the arguments.
+
+    `gone` is the air's own set of silenced drones. `phase_s` is how long after the call each drone's frames reach
+    its radio.
+    """
+
+    def __init__(
+        self,
+        config: Radio,
+        channel: Channel,
+        counters: Counters,
+        gone: Set[int],
+        *,
+        seed: int,
+        replication: int,
+        frame_s: float,
+        publish_spread: float,
+    ) -> None:
+        self._rate_mbps = config.group_rate_mbps
+        self._channel = channel
+        self._counters = counters
+        self._gone = gone
+        self._n = n = channel.n
+        self._reach_bytes: list[list[float]] = []
+        self._access_streams = [stream(seed, replication, i, "access") for i in range(n)]
+        self._access: list[list[list[float]]] = [[] for _ in range(n)]
+        self.phase_s = [
+            float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
+        ]
+        self._heard_frame = [(-1, 0)] * n
+
+    def advance(self) -> None:
+        """The links have moved on by one frame."""
+        self._reach_bytes = self._channel.group_reach_bytes.tolist()
+
+    def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
+        """One more frame of a drone, its luck drawn; arguments and errors as for `Air.broadcast`."""
+        if not 0 <= sender < self._n:
+            raise ValueError(f"sender is {sender}, must be in [0, {self._n - 1}]")
+        if not 1 <= payload_bytes <= MAX_GROUP_PAYLOAD_BYTES:
+            raise ValueError(f"payload_bytes is {payload_bytes}, must be in [1, {MAX_GROUP_PAYLOAD_BYTES}]")
+        ready = self._access[sender]
+        if not ready:
+            ready.extend(self._access_streams[sender].random((256, 2)).tolist()[::-1])
+        slot_u, residual = ready.pop()
+        airtime_s = group_frame_s(payload_bytes, self._rate_mbps)
+        mpdu_bytes = frame_bytes(payload_bytes, unicast=False)
+        self._counters.broadcasts += 1
+        self._counters.context_sent_bytes += payload_bytes
+        return Broadcast(sender, airtime_s, int(slot_u * (CW_CONTEXT + 1)), residual, mpdu_bytes, on_heard)
+
+    def end(self, frame: GroupFrame, collided: bool) -> None:
+        """The medium is through with a frame."""
+        frame = cast(Broadcast, frame)
+        counters, sender, gone = self._counters, frame.sender, self._gone
+        counters.context_wire_bytes += frame.mpdu_bytes
+        living = self._n - 1 - len(gone - {sender})
+        if collided:
+            counters.collided += 1
+            counters.missed += living
+            frame.on_heard([])
+            return
+        index = self._channel.frame
+        seen, times = self._heard_frame[sender]
+        times = times + 1 if seen == index else 0
+        self._heard_frame[sender] = (index, times)
+        row = self._reach_bytes[sender] if times == 0 else self._channel.reach_again(sender, times).tolist()
+        length = frame.mpdu_bytes
+        heard = [i for i, reach in enumerate(row) if reach >= length and i not in gone]
+        counters.receptions += len(heard)
+        counters.missed += living - len(heard)
+        frame.on_heard(heard)

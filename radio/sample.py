@@ -1,0 +1,210 @@
+"""One unicast sample on its way: what it is, what has become of it so far, and what the medium must give it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isnan, nan
+
+from radio.airtime import (
+    ACK_S,
+    Exchanges,
+    ampdu_frames,
+    frame_bytes,
+    frames_exchanges,
+    repair_wire_bytes,
+    residual_loss,
+    sample_exchanges,
+    tries,
+)
+from radio.contention import contention
+from radio.medium import Job
+from radio.rates import RATES_MBPS, rate_table, rescale
+from radio.transmission import Status, Transmission
+from scenarios.schema import Radio
+
+_GOLDEN = 0.6180339887498949
+_MAX_DEMANDS = 20_000
+
+
+class Sample(Job):
+    """A sample, its current pass through the medium, and the goodput measurement that it carries."""
+
+    __slots__ = (
+        "drained_bits",
+        "fragments",
+        "full_mbps",
+        "kind",
+        "left",
+        "loss_probability",
+        "loss_share",
+        "lost",
+        "luck",
+        "mark_bits",
+        "mark_left",
+        "mark_s",
+        "mcs",
+        "on_done",
+        "pass_bytes",
+        "payload_bytes",
+        "receiver",
+        "reliable",
+        "repairs",
+        "snr_db",
+        "t_first_s",
+        "t_sent_s",
+        "unreachable",
+        "wire_bytes",
+    )
+
+    def __init__(
+        self,
+        number: int,
+        sender: int,
+        receiver: int,
+        kind: str,
+        payload_bytes: int,
+        reliable: bool,
+        t_sent_s: float,
+        deadline_s: float,
+        on_done: Callable[[Transmission], None],
+        *,
+        fragments: int,
+        wire_bytes: int,
+        luck: list[float],
+        snr_db: float,
+    ) -> None:
+        """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; the rest as in `Air.send`."""
+        super().__init__(number, sender, deadline_s)
+        self.receiver = receiver
+        self.kind = kind
+        self.payload_bytes = payload_bytes
+        self.reliable = reliable
+        self.on_done = on_done
+        self.t_sent_s = t_sent_s
+        self.t_first_s = nan
+        self.fragments = fragments
+        self.left = fragments  # fragments of this pass
+        self.pass_bytes = wire_bytes  # on the wire in this pass
+        self.lost = 0
+        self.repairs = 0
+        self.luck = luck
+        self.mcs = -1
+        self.snr_db = snr_db
+        self.loss_probability = 1.0  # of a fragment, after all MAC retries
+        self.loss_share = 0.0  # loss_probability so far, weighted by the part of the pass that it held for
+        self.unreachable = ""  # '' or the reason
+        self.wire_bytes = 0.0
+        self.full_mbps = 0.0  # payload rate of full A-MPDUs, alone, at the MCS in use
+        self.mark_s = t_sent_s  # begin of the goodput measurement
+        self.mark_left = 1.0  # `remaining` when progress was last booked
+        self.mark_bits = 0.0  # acknowledged since mark_s, as goodput counts them
+        self.drained_bits = 0.0  # what the sender had got through when this was written
+
+    def restart(self) -> None:
+        """Begin a pass anew."""
+        self.remaining = self.mark_left = 1.0
+        self.loss_share = 0.0
+
+    def book(self) -> float:
+        """Count what was acknowledged since the last time; returns it in bits as goodput counts them."""
+        done = self.mark_left - self.remaining
+        if done <= 0.0:
+            return 0.0
+        bits = done * self.alone_s * self.full_mbps * 1e6
+        self.mark_bits += bits
+        self.wire_bytes += done * self.pass_bytes if not self.unreachable else 0.0
+        self.loss_share += done * self.loss_probability
+        self.mark_left = self.remaining
+        return bits
+
+    def round_luck(self) -> float:
+        """The uniform number of the present pass; beyond those it was given, the last one shifted by golden ratios."""
+        extra = self.repairs - len(self.luck) + 1
+        return self.luck[self.repairs] if extra <= 0 else (self.luck[-1] + extra * _GOLDEN) % 1.0
+
+    def row(self, status: Status, reason: str, t_done_s: float) -> Transmission:
+        """Its row of the record."""
+        return Transmission(
+            self.number, self.sender, self.receiver, self.kind, self.payload_bytes, round(self.wire_bytes),
+            self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost,
+            self.repairs, self.mcs, self.snr_db, self.granted_s,
+        )  # fmt: skip
+
+
+class Service:
+    """What a link of a given quality asks of the medium for a sample: rate control, MAC retries, exchanges."""
+
+    def __init__(self, config: Radio) -> None:
+        self._config = config
+        self._frame_bytes = frame_bytes(config.fragment_bytes, fragmented=True)
+        self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes)
+        self._rates = RATES_MBPS[config.bandwidth_mhz]
+        self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
+        probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S)
+        self._probe = probe.scaled(config.retry_limit + 1.0)
+        self._demands: dict[tuple[int, int, bool], Exchanges] = {}
+
+    def begin(self, s: Sample, now_s: float, known_snr_db: float, snr_db: float, receiver_gone: bool) -> None:
+        """Set what a sample at the head of its queue asks for, its progress up to now being booked.
+
+        Args:
+            s: the sample.
+            now_s: the time.
+            known_snr_db: mean SNR that its sender knows and picks the MCS by.
+            snr_db: mean SNR as it is.
+            receiver_gone: whether nobody is there to answer.
+        """
+        fresh = s.t_start_s == now_s
+        if isnan(s.t_first_s):
+            s.t_first_s = now_s
+        s.snr_db = snr_db
+        table = self._table
+        mcs = table.mcs[table.index(known_snr_db)]
+        reason = "receiver_gone" if receiver_gone else "no_link" if mcs < 0 else ""
+        if fresh or (-1 if reason else mcs) != s.mcs:
+            s.mark_s, s.mark_bits = now_s, 0.0
+        if reason:
+            if fresh or not s.unreachable:
+                s.restart()
+                s.demand(self._probe)
+                s.full_mbps = 0.0
+            s.unreachable, s.mcs = reason, -1
+            return
+        if s.unreachable:
+            s.unreachable = ""
+            s.restart()
+        s.mcs = mcs
+        limit = self._config.retry_limit
+        payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
+        per = table.all_per[mcs][table.index(snr_db)]
+        if s.fragments == 1:
+            per = rescale(per, frame_bytes(payload) / self._frame_bytes)
+        mean_tries = tries(per, limit)
+        s.loss_probability = residual_loss(per, limit)
+        s.full_mbps = self._full_mbps[mcs] / mean_tries * (1.0 - s.loss_probability)
+        key = (payload, mcs, s.reliable)
+        demand = self._demands.get(key)
+        if demand is None:
+            if len(self._demands) > _MAX_DEMANDS:
+                self._demands.clear()
+            demand = self._demands[key] = self._demand(payload, mcs, s.reliable)
+        s.demand(demand, mean_tries)
+
+    def repair_payload(self, s: Sample) -> int:
+        """Payload bytes of the fragments that are left."""
+        return min(s.payload_bytes, s.left * self._config.fragment_bytes)
+
+    def _demand(self, payload_bytes: int, mcs: int, reliable: bool) -> Exchanges:
+        c, rate = self._config, self._rates[mcs]
+        demand = sample_exchanges(payload_bytes, c.fragment_bytes, rate, c.max_ampdu_frames)
+        if reliable:  # heartbeat and ACKNACK, each an exchange of its own
+            length = repair_wire_bytes(1) // 2
+            demand = demand + frames_exchanges(1, length, length, rate, 1, ACK_S).scaled(2.0)
+        return demand
+
+    def _full_goodput(self, rate_mbps: float) -> float:
+        """Payload Mb/s of full A-MPDUs without loss, alone on the channel."""
+        c = self._config
+        m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames)
+        exchanges = frames_exchanges(m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames)
+        return m * c.fragment_bytes * 8e-6 / exchanges.channel_s(contention(1))
