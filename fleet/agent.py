@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import simpy
 
@@ -26,8 +26,7 @@ COVERAGE_PERIOD_S = 1.0
 """The coverage grid is renewed this often: at 5 m/s a drone crosses a 12.8 m cell in 2.6 s."""
 
 
-@dataclass(frozen=True, slots=True)
-class Platform:
+class Platform(NamedTuple):
     """What a drone knows about its own body, fractions 0 … 1."""
 
     soc: float
@@ -35,8 +34,7 @@ class Platform:
     gpu_headroom: float
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
+class Task(NamedTuple):
     """What a drone is to do now."""
 
     phase: TaskPhase
@@ -56,8 +54,7 @@ class PlaneRules:
     compute_delay_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(NamedTuple):
     """One payload as it arrived: what it shows, and of when."""
 
     capture: Capture

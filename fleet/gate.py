@@ -85,27 +85,26 @@ class Gate:
     """One drone's gate: the directive in force on each link, and when the link last sent."""
 
     def __init__(self) -> None:
-        self._directives: dict[int, Directive] = {}
+        self._directives: dict[int, Directive] = {}  # by ascending peer
         self._last_slot_s: dict[int, float] = {}
+        self.duty_percent = 100
+        """The duty cycle asked for: the highest over the links, 100 where there is no link."""
 
     def enforce(self, directive: Directive) -> None:
         """Put a directive in force. Repeating one changes nothing: timers run from the last send, not from here."""
+        if directive.destination not in self._directives:
+            self._directives = dict(sorted([*self._directives.items(), (directive.destination, directive)]))
         self._directives[directive.destination] = directive
+        self.duty_percent = max([d.duty_percent for d in self._directives.values()])
 
     def in_force(self, peer: int) -> Directive | None:
         """The directive of a link, None before the first."""
         return self._directives.get(peer)
 
-    @property
-    def duty_percent(self) -> int:
-        """The duty cycle asked for: the highest over the links, 100 where there is no link."""
-        return max([d.duty_percent for d in self._directives.values()], default=100)
-
     def due(self, now_s: float) -> list[Directive]:
         """Directives of the links that may send now, by ascending peer; marks them as sent."""
         ready = []
-        for peer in sorted(self._directives):
-            directive = self._directives[peer]
+        for peer, directive in self._directives.items():
             if directive.representation == Representation.NONE or directive.rate_hz <= 0:
                 continue
             period_s = 1.0 / directive.rate_hz

@@ -105,7 +105,10 @@ class FleetView:
     @property
     def peers(self) -> tuple[int, ...]:
         """Ids of the other drones heard, ascending."""
-        return tuple(sorted(i for i in self.descriptors if i != self.ego))
+        ids = sorted(self.descriptors)
+        if self.ego in self.descriptors:
+            ids.remove(self.ego)
+        return tuple(ids)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> f
     if distance_m <= large - small:
         return 1.0
     d, r2, s2 = distance_m * distance_m, small * small, large * large
-    # Rounding can push the cosines past 1 when the circles barely touch.
-    alpha = math.acos(max(-1.0, min(1.0, (d + r2 - s2) / (2 * distance_m * small))))
-    beta = math.acos(max(-1.0, min(1.0, (d + s2 - r2) / (2 * distance_m * large))))
+    a, b = (d + r2 - s2) / (2 * distance_m * small), (d + s2 - r2) / (2 * distance_m * large)
+    # Rounding can push the cosines past ±1 when the circles barely touch.
+    alpha, beta = math.acos(a if -1.0 < a < 1.0 else math.copysign(1.0, a)), math.acos(b if b < 1.0 else 1.0)
     lens = r2 * (alpha - math.sin(2 * alpha) / 2) + s2 * (beta - math.sin(2 * beta) / 2)
     return min(1.0, max(0.0, lens / (math.pi * r2)))
 
@@ -45,8 +45,11 @@ def peers_by_overlap(view: FleetView) -> list[int]:
     me = view.me
     if me is None:
         return []
+    ego, descriptors = view.ego, view.descriptors
     ranked = [
-        (-round(footprint_overlap(me, view.descriptors[p]) / OVERLAP_STEP), (p - view.ego) % _IDS, p)
-        for p in view.peers
+        (-round(footprint_overlap(me, descriptors[p]) / OVERLAP_STEP), (p - ego) % _IDS, p)
+        for p in descriptors
+        if p != ego
     ]
-    return [p for _, _, p in sorted(ranked)]
+    ranked.sort()
+    return [p for _, _, p in ranked]
