@@ -29,7 +29,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     scenario = record.scenario
     minutes = scenario.duration_s / 60.0
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
-    transitions = list(_transitions(tables["directives"]))
+    changes = list(transitions(tables["directives"], {}))
     drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
     return {
         "scenario": scenario.name,
@@ -67,8 +67,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "battery": {d: v["soc"] for d, v in drones.items()},
         "drones": drones,
         "energy_j": _energy(tables["energy"]),
-        "switches": len(transitions) / (links * minutes) if links else None,
-        "transitions": transitions,
+        "switches": len(changes) / (links * minutes) if links else None,
+        "transitions": changes,
         "phases": [_phase(record, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
         "events": tables["events"].to_pylist(),
         "policy_eval_us": {
@@ -194,25 +194,28 @@ def describe(row: dict[str, Any]) -> str:
     return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
 
 
-def _transitions(directives: pa.Table) -> Iterator[dict[str, Any]]:
-    """Changes of what a link carries (a disc that moves is none), links of a drone that change alike in one entry."""
-    now: dict[tuple[int, int], str] = {}
-    open_entry: dict[str, Any] | None = None
+def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
+    """Changes of what a link carries (a disc that moves is none); links of a drone that change alike in one entry.
+
+    The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
+    brought up to date. Each entry comes before the next one's changes are in `carried`.
+    """
+    entry: dict[str, Any] | None = None
     for row in directives.to_pylist():
         link, level = (row["drone"], row["peer"]), describe(row)
-        before = now.get(link, "nothing")
+        before = carried.get(link, "nothing")
         if level == before:
             continue
-        now[link] = level
-        entry = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
-        if open_entry is not None and all(open_entry[k] == v for k, v in entry.items()):
-            open_entry["peers"].append(row["peer"])
-            continue
-        if open_entry is not None:
-            yield open_entry
-        open_entry = {**entry, "peers": [row["peer"]]}
-    if open_entry is not None:
-        yield open_entry
+        change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
+        if entry is not None and all(entry[k] == v for k, v in change.items()):
+            entry["peers"].append(row["peer"])
+        else:
+            if entry is not None:
+                yield entry
+            entry = {**change, "peers": [row["peer"]]}
+        carried[link] = level
+    if entry is not None:
+        yield entry
 
 
 def _phases(record: SortieRecord) -> Iterator[tuple[float, float, str]]:

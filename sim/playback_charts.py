@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ import rerun as rr
 from perception.ap import Matched, average_precision
 from scenarios.schema import Scenario
 from sim import playback_canvas as c
-from sim.outcome import describe
+from sim.outcome import transitions
 from sim.playback_canvas import Canvas, Floats, line
 from sim.sightings import Sighting
 
@@ -204,30 +204,6 @@ class Charts:
             texts = [f"{'fleet' if r['drone'] < 0 else 'drone ' + str(r['drone'])}: {r['text']}" for r in rows]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[c.WARNING] * len(rows))
             self._canvas.columns("log/events", np.array([r["t_s"] for r in rows]), columns)
-
-
-def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
-    """Changes of what a link carries (a disc that moves is none); links of a drone that change alike in one entry.
-
-    The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
-    brought up to date. Each entry comes before the next one's changes are in `carried`.
-    """
-    entry: dict[str, Any] | None = None
-    for row in directives.to_pylist():
-        link, level = (row["drone"], row["peer"]), describe(row)
-        before = carried.get(link, "nothing")
-        if level == before:
-            continue
-        change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
-        if entry is not None and all(entry[k] == v for k, v in change.items()):
-            entry["peers"].append(row["peer"])
-        else:
-            if entry is not None:
-                yield entry
-            entry = {**change, "peers": [row["peer"]]}
-        carried[link] = level
-    if entry is not None:
-        yield entry
 
 
 def in_words(change: dict[str, Any]) -> str:
