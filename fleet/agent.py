@@ -120,6 +120,7 @@ class Agent:
         self._log = log
         self._sealer = sealer
         self._phase_s = phase_s
+        self._fresh_s = rules.period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
         self._coverage = CoverageMap()
         self._grid, self._novel, self._grid_at_s = b"", False, -1e9
         self._known: dict[int, Descriptor] = {}
@@ -231,14 +232,17 @@ class Agent:
         for peer, age_s in ages_s.items():
             if peer != me:
                 asked = by_peer.get(peer) or nothing(me, peer, "the policy gave no directive")
-                self._enforce(peer, asked, age_s, now_s)
+                before = self._links.get(peer) or LinkState(nothing(me, peer, ""))
+                if age_s > self._fresh_s or asked is not before.enforced or before.asking_since_s is not None:
+                    self._enforce(before, asked, age_s, now_s)
 
-    def _enforce(self, peer: int, asked: Directive, age_s: float, now_s: float) -> None:
+    def _enforce(self, before: LinkState, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
-        rules = self._rules
-        link = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
-        capped = asked if link == LinkHealth.FRESH else cap_by_age(asked, link, age_s)
-        before = self._links.get(peer) or LinkState(nothing(self.drone, peer, ""))
+        rules, peer = self._rules, asked.destination
+        link, capped = LinkHealth.FRESH, asked
+        if age_s > self._fresh_s:
+            link = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            capped = cap_by_age(asked, link, age_s)
         after = damp(before, capped, now_s, rules.dwell_s)
         if after is before:
             return

@@ -135,7 +135,7 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
 
 def test_a_late_share_is_rendered_as_it_was(detector: TorchDetector, fleet: list[Capture]) -> None:
     now = [(fleet[0], [share(c) for c in fleet[1:]])]
-    late = [(fleet[0], [share(replace(c, t_s=c.t_s - 2.0)) for c in fleet[1:]])]
+    late = [(fleet[0], [share(c._replace(t_s=c.t_s - 2.0)) for c in fleet[1:]])]
     assert not same(detector.detect(now)[0], detector.detect(late)[0])
 
 
