@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from fleet.wire import DIRECTIVE_BYTES
 from perception import budget
 from policies.contract import Directive, Disc, Representation
 
 HEADER_BYTES = 40
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
-DIRECTIVE_BYTES = 36
-"""The directive rides along, so that the receiver knows rung, ROI and fusion weight."""
 RAW_BYTES = 5 * 800 * 450 * 3
 """Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
@@ -77,6 +76,7 @@ def make_payload(
         cells,
         boxes,
         index_bytes,
+        # the directive rides along, so that the receiver knows rung, ROI and fusion weight
         HEADER_BYTES + DIRECTIVE_BYTES + content,
     )
 

@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 
 from fleet.staleness import LinkHealth
+from fleet.wire import DIRECTIVE_BYTES
 from policies.contract import Descriptor, Directive, Representation, TaskPhase
 from scenarios.schema import Scenario
 
 NAN = float("nan")
-DIRECTIVE_WIRE_BYTES = 36
 REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
 """Names as the tables have them."""
 _PHASES = {phase: phase.name.lower() for phase in TaskPhase}
@@ -181,7 +181,7 @@ class AgentNotes:
         """Context-plane bytes: descriptors on the air, directives to the gates."""
         return {
             "context_descriptor_bytes": self._descriptor_bytes,
-            "context_directive_bytes": self._directives * DIRECTIVE_WIRE_BYTES,
+            "context_directive_bytes": self._directives * DIRECTIVE_BYTES,
             "directives": self._directives,
             "decisions": len(self._eval_ns),
         }

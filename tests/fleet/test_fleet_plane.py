@@ -14,6 +14,7 @@ from fleet import gate
 from fleet.coverage import CELL_M, CoverageMap, footprint_radius_m, pack_grid, unpack_grid
 from fleet.gate import Gate, make_payload
 from fleet.staleness import LinkHealth, cap_by_age, health
+from fleet.wire import DIRECTIVE_BYTES
 from policies.contract import Coverage, Directive, Disc, Representation
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
@@ -110,7 +111,7 @@ def test_duty_is_the_highest_asked_for() -> None:
     assert g.duty_percent == 50
 
 
-OVERHEAD = gate.HEADER_BYTES + gate.DIRECTIVE_BYTES
+OVERHEAD = gate.HEADER_BYTES + DIRECTIVE_BYTES
 
 
 @pytest.mark.parametrize(
