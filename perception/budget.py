@@ -12,10 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 
-GRID = 64
+from perception.geometry import CELLS as GRID
+from perception.geometry import CHANNELS, FULL
+
 CELLS = GRID * GRID
-CELL_M = 3.2
-CHANNELS = 80
+CELL_M = FULL.cell_m
+"""Sorties fly UAV3D's geometry; the smaller one is for the benchmark alone."""
 DETECTION_BYTES = 24
 """One detection: x, y, length, width, yaw, score as float32."""
 TRACK_BYTES = 20

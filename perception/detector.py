@@ -21,12 +21,17 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from perception import budget
 from perception.ap import suppress
-from perception.bev import HALF_EXTENT_M, lift
-from perception.model import CELLS, decode, folded, load_weights, warp
+from perception.bev import lift
+from perception.checkpoint import load_weights
+from perception.decode import decode
+from perception.fusion.base import takes_part
+from perception.geometry import CELLS, FULL
+from perception.model import folded
 from perception.render import Renderer
 from perception.scene import SceneModel
 from perception.town import Bytes
 from perception.types import Boxes, Capture, Share
+from perception.warp import warp
 from scenarios.schema import Perception
 
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "disconet.safetensors"
@@ -42,7 +47,7 @@ def ground_truth(
     scene: SceneModel,
     t_s: float,
     centre_xy: tuple[float, float],
-    half_extent: float = HALF_EXTENT_M,
+    half_extent: float = FULL.half_extent_m,
     yaw_rad: float = 0.0,
 ) -> Boxes:
     """The cars at `t_s` whose centres lie in the square about `centre_xy` (ENU, m) that is turned by `yaw_rad`.
@@ -89,7 +94,13 @@ class TorchDetector:
 
     def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
         self._scene, self._config = scene, config
-        self._net = folded(load_weights(SHIPPED_WEIGHTS if weights is None else weights))
+        path = SHIPPED_WEIGHTS if weights is None else weights
+        net = load_weights(path)
+        if net.config.geometry != FULL:
+            raise ValueError(
+                f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
+            )
+        self._net = folded(net)
         self._renderer = Renderer(scene, seed)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
         self._pool = ThreadPoolExecutor(
@@ -111,7 +122,7 @@ class TorchDetector:
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
-        return ground_truth(self._scene, t_s, ego.position_m[:2], HALF_EXTENT_M, ego.true_yaw_rad)
+        return ground_truth(self._scene, t_s, ego.position_m[:2], FULL.half_extent_m, ego.true_yaw_rad)
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
@@ -201,10 +212,12 @@ class TorchDetector:
             x, y, yaw = ego.est_pose
             poses = [(s.capture.est_pose[0] - x, s.capture.est_pose[1] - y, s.capture.est_pose[2]) for s in maps]
             sent = torch.stack([self._sent(s) for s in maps])
-            warped, arrived, inside = warp(features, sent, torch.tensor((0.0, 0.0, yaw)), torch.tensor(poses))
-            weight = torch.tensor([s.weight for s in maps])
-            own_map = self._kept[ego].features[None]
-            fused = self._net.fuse(own_map, warped, arrived, inside, weight, self._config.unsent_cells)
+            here = torch.tensor((0.0, 0.0, yaw))
+            warped, arrived, inside = warp(features, sent, here, torch.tensor(poses), FULL.cell_m)
+            weight = torch.tensor([[s.weight for s in maps]])
+            part = takes_part(arrived[None, :, 0], inside[None, :, 0], weight, self._config.unsent_cells)
+            agents = torch.cat([self._kept[ego].features[None], warped])[None]
+            fused = self._net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0))
             own = self._place(self._net.head(fused)[0], ego)
         late = [self._sent_boxes(s) for s in shares if s.representation in LATE]
         return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own

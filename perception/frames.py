@@ -18,7 +18,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from perception.bev import BEV_PX, lift
+from perception.bev import lift
+from perception.geometry import IMAGE_PX as BEV_PX
 from perception.render import Renderer
 from perception.scene import SceneModel
 from perception.types import Capture

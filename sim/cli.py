@@ -190,7 +190,7 @@ def train(
     resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
 ) -> None:
     """Train the detector with full sharing on procedural scenes; a run that was cut off goes on where it was."""
-    from perception.train import train as train_detector
+    from perception.training.train import train as train_detector
 
     with _progress() as bar:
         bars: dict[str, Callable[[float], None]] = {}

@@ -18,10 +18,13 @@ from perception.ap import corners, iou_pairs
 from perception.bev import lift
 from perception.budget import cells_sent
 from perception.detector import TorchDetector
-from perception.model import CarNet, warp
+from perception.fusion.base import takes_part
+from perception.geometry import FULL
+from perception.model import CarNet
 from perception.render import Renderer
 from perception.scene import SceneModel
 from perception.types import Share
+from perception.warp import warp
 from scenarios.schema import Perception, Scene
 
 FLEET = cross(10.0, 20.0, 0.3)
@@ -55,8 +58,9 @@ def test_forward_of_a_fleet_frame(benchmark: Any) -> None:
         features = torch.cat([net.encoder(image[None]) for image in images])
         for ego in range(5):
             peers = [k for k in range(5) if k != ego]
-            moved, sent, inside = warp(features[peers], everywhere, poses[ego], poses[peers])
-            out = net.head(net.fuse(features[ego : ego + 1], moved, sent, inside, torch.ones(4), "masked"))
+            moved, sent, inside = warp(features[peers], everywhere, poses[ego], poses[peers], FULL.cell_m)
+            part = takes_part(sent[None, :, 0], inside[None, :, 0], torch.ones(1, 4), "masked")
+            out = net.head(net.fusion(torch.cat([features[ego : ego + 1], moved])[None], part, torch.ones(1, 5)))
         return len(out)
 
     assert benchmark(forward) == 1

@@ -8,8 +8,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from perception.learn import loss_of, targets
-from perception.model import CELL_M, CELLS, CHANNELS, CarNet, decode, load_weights, save_weights, warp
+from perception.checkpoint import load_weights, save_weights
+from perception.decode import decode
+from perception.fusion.base import UnsentCells, takes_part
+from perception.geometry import CELLS, CHANNELS, FULL
+from perception.model import CarNet
+from perception.training.learn import loss_of, targets
+from perception.warp import warp as warp_by
+
+CELL_M = FULL.cell_m
 
 EVERYWHERE = torch.ones(1, 1, CELLS, CELLS, dtype=torch.bool)
 
@@ -18,6 +25,27 @@ EVERYWHERE = torch.ones(1, 1, CELLS, CELLS, dtype=torch.bool)
 def net() -> CarNet:
     torch.manual_seed(3)
     return CarNet().eval()
+
+
+def warp(
+    maps: torch.Tensor, sent: torch.Tensor, ego: torch.Tensor, peer: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return warp_by(maps, sent, ego, peer, CELL_M)
+
+
+def fuse(
+    net: CarNet,
+    ego: torch.Tensor,
+    peers: torch.Tensor,
+    sent: torch.Tensor,
+    inside: torch.Tensor,
+    weight: torch.Tensor,
+    unsent: UnsentCells,
+) -> torch.Tensor:
+    """One ego [1, 80, 64, 64] with k peers [k, 80, 64, 64]."""
+    part = takes_part(sent[None, :, 0], inside[None, :, 0], weight[None], unsent)
+    out: torch.Tensor = net.fusion(torch.cat([ego, peers])[None], part, torch.cat([torch.ones(1), weight])[None])
+    return out
 
 
 def features(seed: int, count: int) -> torch.Tensor:
@@ -58,11 +86,11 @@ def test_a_peer_that_is_absent_mute_or_weightless_changes_nothing(net: CarNet) -
     sent = EVERYWHERE.expand(2, -1, -1, -1)
     one = torch.ones(2)
     with torch.inference_mode():
-        assert torch.equal(net.fuse(ego, peers[:0], sent[:0], sent[:0], one[:0], "masked"), ego)
-        assert torch.allclose(net.fuse(ego, 0 * peers, ~sent, sent, one, "masked"), ego, atol=1e-6)
-        assert torch.allclose(net.fuse(ego, peers, sent, sent, 0 * one, "masked"), ego, atol=1e-6)
-        first = net.fuse(ego, peers[:1], sent[:1], sent[:1], one[:1], "masked")
-        both = net.fuse(ego, peers, sent, sent, torch.tensor([1.0, 0.0]), "masked")
+        assert torch.equal(fuse(net, ego, peers[:0], sent[:0], sent[:0], one[:0], "masked"), ego)
+        assert torch.allclose(fuse(net, ego, 0 * peers, ~sent, sent, one, "masked"), ego, atol=1e-6)
+        assert torch.allclose(fuse(net, ego, peers, sent, sent, 0 * one, "masked"), ego, atol=1e-6)
+        first = fuse(net, ego, peers[:1], sent[:1], sent[:1], one[:1], "masked")
+        both = fuse(net, ego, peers, sent, sent, torch.tensor([1.0, 0.0]), "masked")
     assert torch.allclose(first, both, atol=1e-6)
     assert not torch.allclose(first, ego, atol=1e-2)
 
@@ -73,10 +101,15 @@ def test_fusion_is_the_stated_formula_and_peers_have_no_order(net: CarNet) -> No
     peers = peers * sent
     weight = torch.tensor([0.5, 1.0, 0.25])
     with torch.inference_mode():
-        fused = net.fuse(ego, peers, sent, torch.ones_like(sent), weight, "masked")
-        back = net.fuse(ego, peers.flip(0), sent.flip(0), torch.ones_like(sent), weight.flip(0), "masked")
-        parts = [net.edge(ego, ego).exp()]
-        parts += [net.edge(ego, p[None]).exp() * w * s for p, w, s in zip(peers, weight, sent, strict=True)]
+        fused = fuse(net, ego, peers, sent, torch.ones_like(sent), weight, "masked")
+        back = fuse(net, ego, peers.flip(0), sent.flip(0), torch.ones_like(sent), weight.flip(0), "masked")
+        own = ego.flatten(2)[0].T  # [4096, 80]
+
+        def edge(agent: torch.Tensor) -> torch.Tensor:
+            return net.fusion.edge(torch.stack([own, agent.flatten(1).T], dim=1))[:, 1].view(1, 1, CELLS, CELLS)
+
+        parts = [edge(ego[0]).exp()]
+        parts += [edge(p).exp() * w * s for p, w, s in zip(peers, weight, sent, strict=True)]
         total = sum(parts)
         plain = (parts[0] * ego + sum(q * p for q, p in zip(parts[1:], peers, strict=True))) / total
     assert torch.allclose(fused, plain, atol=1e-4)
@@ -86,9 +119,9 @@ def test_fusion_is_the_stated_formula_and_peers_have_no_order(net: CarNet) -> No
 def test_zeros_dilute_where_a_mask_does_not(net: CarNet) -> None:
     ego, nothing = features(1, 1).abs(), torch.zeros(1, CHANNELS, CELLS, CELLS)
     with torch.inference_mode():
-        zero = net.fuse(ego, nothing, ~EVERYWHERE, EVERYWHERE, torch.ones(1), "zero")
+        zero = fuse(net, ego, nothing, ~EVERYWHERE, EVERYWHERE, torch.ones(1), "zero")
         full = features(4, 1)
-        same = [net.fuse(ego, full, EVERYWHERE, EVERYWHERE, torch.ones(1), u) for u in ("zero", "masked")]
+        same = [fuse(net, ego, full, EVERYWHERE, EVERYWHERE, torch.ones(1), u) for u in ("zero", "masked")]
     assert (zero < ego).float().mean() > 0.95
     assert torch.equal(*same)
 
@@ -134,7 +167,7 @@ def test_the_loss_knows_right_from_wrong() -> None:
 
 def test_weights_come_back_as_they_went(net: CarNet, tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
-    save_weights(net, path, {"sortie": "{}"})
+    save_weights(net, path, {"runs": []})
     again = load_weights(path)
     assert not again.training
     for name, value in net.state_dict().items():
@@ -152,7 +185,7 @@ def test_broken_weights_name_the_file_and_the_tensor(net: CarNet, tmp_path: Path
 
     assert refusal() == "PATH: no such weights file; `sortie train` makes one"
     path.write_bytes(b"\x80\x04K\x01.")
-    assert refusal().startswith("PATH: not a safetensors file (")
+    assert refusal().startswith("PATH: not a weights file of this project (")
     save_weights(net, path, {})
     whole = load_file(path)
     name = "head.out.weight"

@@ -5,7 +5,9 @@ import pytest
 from perception_examples import EMPTY, capture, cross, only_target
 from scipy.spatial.transform import Rotation
 
-from perception.bev import BEV_M, BEV_PX, HALF_EXTENT_M, lift
+from perception.bev import lift
+from perception.geometry import FULL
+from perception.geometry import IMAGE_PX as BEV_PX
 from perception.render import AXES, CAMERAS, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX, Renderer, rotation, tilt
 from perception.scene import SceneModel
 from perception.types import Capture
@@ -90,7 +92,10 @@ def test_the_lift_puts_what_is_flat_where_it_lies(
     rows, columns = np.nonzero(red(np.moveaxis(bev[:3], 0, -1)))
     if len(rows) == 0:
         pytest.skip("in the gap between two cameras")
-    forward, left = (rows + 0.5) * BEV_M - HALF_EXTENT_M, (columns + 0.5) * BEV_M - HALF_EXTENT_M
+    forward, left = (
+        (rows + 0.5) * FULL.image_m - FULL.half_extent_m,
+        (columns + 0.5) * FULL.image_m - FULL.half_extent_m,
+    )
     dx, dy = x - 8.0, y + 4.0
     true = np.array([np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx])
     assert np.array([forward.mean(), left.mean()]) == pytest.approx(true, abs=1.0)
@@ -102,7 +107,10 @@ def test_five_drones_agree_on_the_ground() -> None:
     found = []
     for c, bev in zip(captures, lift(Renderer(scene, 1).render(captures), captures).numpy(), strict=True):
         rows, columns = np.nonzero(red(np.moveaxis(bev[:3], 0, -1)))
-        f, s = (rows.mean() + 0.5) * BEV_M - HALF_EXTENT_M, (columns.mean() + 0.5) * BEV_M - HALF_EXTENT_M
+        f, s = (
+            (rows.mean() + 0.5) * FULL.image_m - FULL.half_extent_m,
+            (columns.mean() + 0.5) * FULL.image_m - FULL.half_extent_m,
+        )
         found.append(
             (
                 c.position_m[0] + np.cos(0.3) * f - np.sin(0.3) * s,

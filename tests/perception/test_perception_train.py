@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 
-from perception import train as training
+from perception.training import train as training
+from perception.checkpoint import load_weights
 from perception.frames import Frames, load_frames, make_scene_file, random_captures, random_scene
-from perception.learn import draw_batch, local_cars
-from perception.model import load_weights
-from perception.train import learning_rate, train
+from perception.training.learn import draw_batch, local_cars
+from perception.training.train import learning_rate, train
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,8 @@ def frames(scene_file: Path) -> Frames:
 def small(monkeypatch: pytest.MonkeyPatch, scene_file: Path) -> None:
     """Training and validation on the two frames."""
     monkeypatch.setattr(training, "make_frames", lambda *_, **__: [scene_file])
-    monkeypatch.setattr("perception.validation.LEVELS", ((1.0, 1.0),))
-    monkeypatch.setattr("perception.learn.SHARD_FRAMES", 1)
+    monkeypatch.setattr("perception.training.validation.LEVELS", ((1.0, 1.0),))
+    monkeypatch.setattr("perception.training.learn.SHARD_FRAMES", 1)
 
 
 def test_scenes_and_fleets_follow_from_their_seeds() -> None:
@@ -105,6 +105,6 @@ def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(
     net = load_weights(tmp_path / "whole" / "w.safetensors")
     assert sum(p.numel() for p in net.parameters()) < 600_000
     card = (tmp_path / "whole" / "README.md").read_text()
-    assert "perception.train --frames 12 --steps 2 --seed 0" in card
+    assert "perception.training.train --frames 12 --steps 2 --seed 0" in card
     assert (tmp_path / "whole" / "loss.csv").read_text().startswith("step,loss,lr\n")
     assert not list(tmp_path.glob("**/*.part"))

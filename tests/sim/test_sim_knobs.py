@@ -206,8 +206,8 @@ def other_weights(path):  # type: ignore[no-untyped-def]
     """The shipped weights with a more hesitant head."""
     import torch
 
+    from perception.checkpoint import load_weights, save_weights
     from perception.detector import SHIPPED_WEIGHTS
-    from perception.model import load_weights, save_weights
 
     net = load_weights(SHIPPED_WEIGHTS)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Train the detector: `sortie train`, or `python -m perception.train`.
+"""Train the detector: `sortie train`, or `python -m perception.training.train`.
 
 Scenes are drawn and rendered once (`frames.py`), then encoder, edge network and head learn together under
 full sharing; a third of the supervised outputs are single-drone, so that the head works without peers.
@@ -24,10 +24,11 @@ import torch
 from torch import Tensor
 
 from perception.ap import Difference
+from perception.checkpoint import load_weights
 from perception.frames import PER_SCENE, TRAIN_SEED, VALIDATION_SEED, load_frames, make_frames
-from perception.learn import SHARDS, apply, draw_batch, gradients
-from perception.model import CarNet, load_weights
-from perception.validation import history, publish, validate_all
+from perception.model import CarNet
+from perception.training.learn import SHARDS, apply, draw_batch, gradients
+from perception.training.validation import history, publish, validate_all
 from scenarios.streams import stream
 
 PEAK_LR = 2.5e-3
@@ -196,7 +197,7 @@ if __name__ == "__main__":
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "weights" / "disconet.safetensors")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "weights" / "disconet.safetensors")
     parser.add_argument("--work", type=Path, default=Path("runs/train"))
     parser.add_argument("--frames", type=int, default=1200)
     parser.add_argument("--steps", type=int, default=700)

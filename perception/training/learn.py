@@ -8,10 +8,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.bev import HALF_EXTENT_M
+from perception.decode import REFERENCE_SIZE_M
 from perception.frames import DRONES, Frames
-from perception.model import HEAD_M, HEAD_PX, REFERENCE_SIZE_M, CarNet, warp
+from perception.fusion.base import takes_part
+from perception.geometry import FULL, HEAD_PX, Geometry
+from perception.model import CarNet
+from perception.warp import warp
 from scenarios.streams import stream
 
 SHARDS = 2
@@ -54,27 +58,27 @@ def draw_batch(frames: Frames, seed: int, step: int, shard: int) -> Batch:
     return Batch(images, pose, est, cars)
 
 
-def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The cars [n, 5] inside a drone's ±102.4 m square, in its frame (x forward, y left)."""
+def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64], geometry: Geometry = FULL) -> NDArray[np.float64]:
+    """The cars [n, 5] inside a drone's square, in its frame (x forward, y left)."""
     cars = cars[~np.isnan(cars[:, 0])]
     c, s = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = cars[:, 0] - pose[0], cars[:, 1] - pose[1]
     x, y = c * dx + s * dy, c * dy - s * dx
-    inside = (np.abs(x) < HALF_EXTENT_M) & (np.abs(y) < HALF_EXTENT_M)
+    inside = (np.abs(x) < geometry.half_extent_m) & (np.abs(y) < geometry.half_extent_m)
     local: NDArray[np.float64] = np.stack([x, y, cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
     kept: NDArray[np.float64] = local[inside]
     return kept
 
 
 def targets(
-    cars: NDArray[np.float64],
+    cars: NDArray[np.float64], geometry: Geometry = FULL
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
     """What the head should say: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
 
     Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are asked for on the 3 × 3 cells around it.
     """
     heat = np.zeros((HEAD_PX, HEAD_PX), np.float32)
-    at = (cars[:, :2] + HALF_EXTENT_M) / HEAD_M - 0.5
+    at = (cars[:, :2] + geometry.half_extent_m) / geometry.head_m - 0.5
     nearest = np.round(at).astype(np.int64)
     cells, values, weights = [], [], []
     for di in range(-2, 3):
@@ -98,9 +102,9 @@ def targets(
     )
 
 
-def loss_of(out: Tensor, labels: list[NDArray[np.float64]]) -> Tensor:
+def loss_of(out: Tensor, labels: list[NDArray[np.float64]], geometry: Geometry = FULL) -> Tensor:
     """Centre-point focal loss plus weighted L1 regressions, per car. `out` [n, 7, 128, 128], `labels` n tables of cars."""
-    made = [targets(cars) for cars in labels]
+    made = [targets(cars, geometry) for cars in labels]
     heat = torch.from_numpy(np.stack([m[0] for m in made])).to(out.device)
     logit = out[:, 0]
     p = logit.sigmoid().clamp(1e-4, 1 - 1e-4)
@@ -144,22 +148,22 @@ def step_loss(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch
     b, k = batch.images.shape[:2]
     features = net.encoder(batch.images.flatten(0, 1).to(device))
     egos = np.stack([rng.permutation(k)[:EGOS] for _ in range(b)])
-    ego = (np.arange(b)[:, None] * k + egos).ravel().repeat(k)  # one row per (frame, ego, agent)
-    agent = (np.arange(b)[:, None, None] * k + np.arange(k)[None, None, :]).repeat(EGOS, axis=1).ravel()
+    first = np.arange(b)[:, None] * k
+    ego = (first + egos).ravel().repeat(k - 1)  # one row per (frame, ego, peer)
+    peers = np.array([[[i for i in range(k) if i != e] for e in row] for row in egos])
+    agent = (first[:, :, None] + peers).ravel()
     est = torch.from_numpy(batch.est.reshape(-1, 3))
-    own = torch.from_numpy(ego == agent).to(device)
     shape = (len(agent), 1, *features.shape[2:])
     delta = torch.stack([est[ego], est[agent]]).float()  # float64 poses are near the origin here
-    warped, sent, _ = warp(
-        features[agent], torch.ones(shape, dtype=torch.bool, device=device), delta[0].to(device), delta[1].to(device)
-    )
-    mine = own[:, None, None, None]
-    warped, sent = torch.where(mine, features[agent], warped), sent | mine
-    logit = net.edge(features[ego], warped).masked_fill(~sent, -torch.inf)
-    share = logit.view(b * EGOS, k, *logit.shape[1:]).softmax(dim=1)
-    fused = (share * warped.view(b * EGOS, k, *warped.shape[1:])).sum(dim=1)
+    everywhere = torch.ones(shape, dtype=torch.bool, device=device)
+    geometry = net.config.geometry
+    warped, sent, _ = warp(features[agent], everywhere, delta[0].to(device), delta[1].to(device), geometry.cell_m)
+    agents = torch.cat([features[ego[:: k - 1]][:, None], warped.view(b * EGOS, k - 1, *warped.shape[1:])], dim=1)
+    weight = torch.ones(b * EGOS, k - 1, device=device)
+    arrived = sent.view(b * EGOS, k - 1, *sent.shape[2:])
+    fused = net.fusion(agents, takes_part(arrived, arrived, weight, "masked"), F.pad(weight, (1, 0), value=1.0))
     alone = np.arange(b) * k + rng.integers(k, size=b)
     out = net.head(torch.cat([fused, features[alone]]))
     pose = batch.pose.reshape(-1, 3)
-    who = np.concatenate([ego[::k], alone])
-    return loss_of(out, [local_cars(batch.cars[i // k], pose[i]) for i in who])
+    who = np.concatenate([ego[:: k - 1], alone])
+    return loss_of(out, [local_cars(batch.cars[i // k], pose[i], geometry) for i in who], geometry)

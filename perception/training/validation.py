@@ -1,8 +1,7 @@
-"""What weights are worth on held-out towns, and the card that says so: `python -m perception.validation WEIGHTS FRAMES`."""
+"""What weights are worth on held-out towns, and the card that says so: `python -m perception.training.validation WEIGHTS FRAMES`."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,6 +11,8 @@ import numpy as np
 import torch
 
 from perception.ap import Difference, Matched, compare, match, suppress
+from perception.checkpoint import load_weights, read_facts, save_weights
+from perception.decode import decode
 from perception.frames import (
     DRONES,
     HEADING_ERROR_DEG,
@@ -22,9 +23,11 @@ from perception.frames import (
     Frames,
     load_frames,
 )
-from perception.learn import EGOS, SHARD_FRAMES, SHARDS, local_cars
-from perception.model import CarNet, decode, load_weights, save_weights, warp
+from perception.fusion.base import takes_part
+from perception.model import CarNet
+from perception.training.learn import EGOS, SHARD_FRAMES, SHARDS, local_cars
 from perception.types import Boxes
+from perception.warp import warp
 
 SCORE_THRESHOLD, NMS_IOU = 0.1, 0.15
 LEVELS = ((1.0, 1.0), (1.0, 0.4), (0.0, 0.0))
@@ -59,20 +62,22 @@ def validate(
     full: list[Matched] = []
     scenes: list[int] = []
     everywhere = torch.ones(DRONES - 1, 1, 64, 64, dtype=torch.bool, device=device)
-    ones = torch.ones(DRONES - 1, device=device)
+    ones = torch.ones(DRONES, device=device)
+    geometry = net.config.geometry
     for f in range(len(frames.images)):
         features = net.encoder(torch.from_numpy(frames.images[f]).to(device))
         est = torch.from_numpy(frames.est_pose[f]).float().to(device)
         for ego in range(egos):
             peers = [i for i in range(DRONES) if i != ego]
-            warped, sent, inside = warp(features[peers], everywhere, est[ego], est[peers])
-            fused = net.fuse(features[ego : ego + 1], warped, sent, inside, ones, "masked")
+            warped, sent, inside = warp(features[peers], everywhere, est[ego], est[peers], geometry.cell_m)
+            part = takes_part(sent[None, :, 0], inside[None, :, 0], ones[None, 1:], "masked")
+            fused = net.fusion(torch.cat([features[ego : ego + 1], warped])[None], part, ones[None])
             out = net.head(torch.cat([features[ego : ego + 1], fused])).cpu()
-            truth = local_cars(frames.cars[f], frames.true_pose[f, ego])
+            truth = local_cars(frames.cars[f], frames.true_pose[f, ego], geometry)
             local = np.concatenate([truth, np.ones((len(truth), 1))], axis=1)
             world = Boxes.placed(local, tuple(frames.true_pose[f, ego]))
             for one, into in zip(out, (single, full), strict=True):
-                found = Boxes.placed(decode(one, SCORE_THRESHOLD).numpy(), tuple(frames.est_pose[f, ego]))
+                found = Boxes.placed(decode(one, SCORE_THRESHOLD, geometry).numpy(), tuple(frames.est_pose[f, ego]))
                 into.append(match(suppress(found, NMS_IOU), world))
             scenes.append(int(frames.scene[f]))
     return single, full, scenes
@@ -93,19 +98,16 @@ def validate_all(
 
 def history(weights: Path | None) -> list[dict[str, Any]]:
     """The training runs that the weights say they come from; none for None."""
-    from safetensors import safe_open
-
     if weights is None:
         return []
-    with safe_open(weights, framework="pt") as file:
-        runs: list[dict[str, Any]] = json.loads((file.metadata() or {}).get("sortie", "{}")).get("runs", [])
+    runs: list[dict[str, Any]] = read_facts(weights).get("runs", [])
     return runs
 
 
 def publish(net: CarNet, path: Path, runs: list[dict[str, Any]], levels: list[Level]) -> None:
     """Write the weights with their history, and the card beside them."""
     facts = {"runs": runs, "validation": [asdict(level) for level in levels]}
-    save_weights(net, path, {"sortie": json.dumps(facts)})
+    save_weights(net, path, facts)
     part = path.with_name("README.md.part")
     part.write_text(card(path.name, runs, levels))
     part.replace(path.with_name("README.md"))
@@ -116,7 +118,7 @@ def card(name: str, runs: list[dict[str, Any]], levels: list[Level]) -> str:
 
     def command(r: dict[str, Any]) -> str:
         warm = f" --warm-start {r['warm_start']}" if r["warm_start"] else ""
-        return f"python -m perception.train --frames {r['frames']} --steps {r['steps']} --seed {r['seed']} --peak-lr {r['peak_lr']:g}{warm}"
+        return f"python -m perception.training.train --frames {r['frames']} --steps {r['steps']} --seed {r['seed']} --peak-lr {r['peak_lr']:g}{warm}"
 
     made = "\n".join(
         f"| {k} | `{command(r)}` | {r['done']} | {r['loss']:.3f} | {r['minutes']:.0f} |" for k, r in enumerate(runs, 1)

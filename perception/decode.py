@@ -1,0 +1,32 @@
+"""The head's output and the boxes that it means."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from perception.geometry import FULL, HEAD_PX, Geometry
+
+REFERENCE_SIZE_M = (4.5, 1.85)
+"""Length and width for which the size head says 0."""
+
+
+def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int = 200) -> Tensor:
+    """One head output [7, 128, 128] → boxes [m, 6] in the ego's frame: x forward, y left, length, width, yaw, score.
+
+    Peaks are local maxima of the heat map over 3 × 3 cells, at or above `threshold`, at most `limit`, best first.
+    """
+    heat = out[:1].sigmoid()
+    peak = (heat >= F.max_pool2d(heat[None], 3, 1, 1)[0]) & (heat >= threshold)
+    flat = peak[0].flatten().nonzero().squeeze(1)
+    score = heat.flatten()[flat]
+    order = score.argsort(descending=True, stable=True)[:limit]
+    flat, score = flat[order], score[order]
+    values = out[1:].flatten(1)[:, flat]
+    row, column = flat // HEAD_PX, flat % HEAD_PX
+    x = (row + 0.5 + values[0]) * geometry.head_m - geometry.half_extent_m
+    y = (column + 0.5 + values[1]) * geometry.head_m - geometry.half_extent_m
+    size = [REFERENCE_SIZE_M[i] * values[2 + i].clamp(-1, 1).exp() for i in (0, 1)]
+    yaw = 0.5 * torch.atan2(values[4], values[5])
+    return torch.stack([x, y, *size, yaw, score], dim=1)

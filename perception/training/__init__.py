@@ -1,0 +1,1 @@
+"""Learning: batches and losses, the run, what the weights are worth."""
