@@ -1,0 +1,113 @@
+"""One way of sharing, as the harness measures it. Free of torch.
+
+The paper's knobs, each defined in this folder's README: how much (ρ), from whom (peers), in which parts
+(allocation), which cells (rank, region of interest first), and what a cell that was not sent counts as.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields, replace
+from typing import Literal, get_args
+
+Allocation = Literal["uniform", "overlap"]
+CellsBy = Literal["confidence", "norm"]
+Unsent = Literal["zero", "masked"]
+_PEERS = re.compile(r"none|(all|best|worst|random)-([1-9]\d?)")
+_ALLOWED = {"allocation": get_args(Allocation), "cells_by": get_args(CellsBy), "unsent": get_args(Unsent)}
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What every ego of every frame is given.
+
+    Raises:
+        ValueError: naming the field, its value and what it must be.
+    """
+
+    rho: float
+    """Cells shared to each ego, as a fraction of full sharing (4 peers × 4096 cells in a fleet of five), 0 … 1."""
+    peers: str = "all-4"
+    """all-k, best-k, worst-k, random-k, or none: a drone alone. All of them share the same total of cells."""
+    allocation: Allocation = "uniform"
+    """How the total is parted among the peers: alike, or in proportion to their overlap with the ego."""
+    cells_by: CellsBy = "confidence"
+    """What ranks a sender's cells."""
+    unsent: Unsent = "zero"
+    """A cell that was not sent takes part in the fusion as zeros, or has no say (masked)."""
+    roi: bool = False
+    """Whether cells in the mission's disc come before all others."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.rho <= 1.0:
+            raise ValueError(f"rho is {self.rho}, must be 0 to 1")
+        if not _PEERS.fullmatch(self.peers):
+            raise ValueError(
+                f"peers is {self.peers!r}, must be none, or all-k, best-k, worst-k or random-k with k 1 to 99"
+            )
+        for name, allowed in _ALLOWED.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, must be {' or '.join(allowed)}")
+        if self.peers == "none" and self.rho != 0.0:
+            raise ValueError(f"rho is {self.rho} with no peers, must be 0")
+
+    @property
+    def rule(self) -> str:
+        """all, best, worst, random or none."""
+        return self.peers.split("-")[0]
+
+    @property
+    def k(self) -> int:
+        """How many peers share."""
+        return 0 if self.peers == "none" else int(self.peers.split("-")[1])
+
+    @property
+    def label(self) -> str:
+        """A short name, such as `best-2@0.02` or `all-4@0.1,overlap,norm,masked,roi`; `parse` reads it."""
+        if self.peers == "none":
+            return "single"
+        rho = f"{self.rho:g}" if float(f"{self.rho:g}") == self.rho else repr(self.rho)
+        marks = [str(getattr(self, f.name)) for f in fields(self)[2:5] if getattr(self, f.name) != f.default]
+        return ",".join([f"{self.peers}@{rho}", *marks, *(["roi"] if self.roi else [])])
+
+    @classmethod
+    def parse(cls, label: str) -> Condition:
+        """The condition that a label names.
+
+        Raises:
+            ValueError: a label that no condition has.
+        """
+        if label == "single":
+            return SINGLE
+        head, *marks = label.split(",")
+        peers, at, rho = head.partition("@")
+        known = {value: name for name, values in _ALLOWED.items() for value in values}
+        try:
+            if not at:
+                raise ValueError("no @ in it")
+            knobs: dict[str, str] = {known[m]: m for m in marks if m != "roi"}
+            return cls(float(rho), peers, roi="roi" in marks, **knobs)  # type: ignore[arg-type]
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"condition is {label!r}, must be like best-2@0.02,masked ({error})") from None
+
+    def plain(self, drones: int = 5) -> Condition:
+        """The simplest condition that gives the same boxes in a fleet of this size; what is equal is computed once.
+
+        Knobs that choose among cells say nothing when every cell goes, nor those that choose among peers when all
+        peers share.
+        """
+        others = drones - 1
+        out = self
+        if out.k == others:
+            out = replace(out, peers=f"all-{others}")
+        if out.k and out.rho * others >= out.k:
+            out = replace(out, allocation="uniform", cells_by="confidence", roi=False)
+        if out.rho == 0.0 and out.unsent == "masked":
+            return SINGLE
+        return out
+
+
+SINGLE = Condition(0.0, "none")
+"""A drone alone."""
+FULL_SHARING = Condition(1.0)
+"""Every peer sends every cell."""
