@@ -106,6 +106,11 @@ class Matched:
     hit: NDArray[np.bool_]
     truths: int
 
+    def at(self, tau: float) -> Matched:
+        """The same without the detections below `tau`: they took nothing from those above."""
+        keep = self.score >= tau
+        return Matched(self.score[keep], self.hit[keep], self.truths)
+
 
 def match(found: Boxes, truth: Boxes, disc: tuple[float, float, float] | None = None, iou: float = 0.5) -> Matched:
     """Match one frame's detections to its ground truth, best score first, each to the best remaining truth.
