@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from perception.ap import compare as bootstrap
+from perception.harness.statistics import compare as bootstrap
 from policies.registry import resolve
 from scenarios.schema import Scenario
 from sim.outcome import matched, outcome

@@ -23,9 +23,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perception.ap import Difference
 from perception.checkpoint import load_weights
 from perception.frames import PER_SCENE, TRAIN_SEED, VALIDATION_SEED, load_frames, make_frames
+from perception.harness.statistics import Difference
 from perception.model import CarNet
 from perception.training.learn import SHARDS, apply, draw_batch, gradients
 from perception.training.validation import history, publish, validate_all

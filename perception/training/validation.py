@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.ap import Difference, Matched, compare, match, suppress
+from perception.ap import Matched, match, suppress
 from perception.checkpoint import load_weights, read_facts, save_weights
 from perception.decode import decode
 from perception.frames import (
@@ -24,6 +24,7 @@ from perception.frames import (
     load_frames,
 )
 from perception.fusion.base import takes_part
+from perception.harness.statistics import Difference, compare
 from perception.model import CarNet
 from perception.training.learn import EGOS, SHARD_FRAMES, SHARDS, local_cars
 from perception.types import Boxes

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import affinity
 
-from perception.ap import Matched, average_precision, compare, iou_pairs, match, suppress
+from perception.ap import Matched, average_precision, iou_pairs, match, suppress
+from perception.harness.statistics import compare
 from perception.types import Boxes
 
 box = st.tuples(
@@ -101,7 +102,7 @@ def test_iou_equals_shapely(a: tuple[float, ...], b: tuple[float, ...]) -> None:
     ],
 )
 def test_iou_of_known_pairs(b: tuple[float, ...], expected: float) -> None:
-    assert iou_pairs(np.array([(0, 0, 4, 2, 0)], float), np.array([b], float))[0] == pytest.approx(expected, abs=1e-9)
+    assert iou_pairs(np.array([(0, 0, 4, 2, 0)], float), np.array([b], float))[0] == pytest.approx(expected, abs=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(12))

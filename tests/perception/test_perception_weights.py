@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from perception.ap import Matched, compare, match
+from perception.ap import Matched, match
 from perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
 from perception.frames import random_captures, random_scene
+from perception.harness.statistics import compare
 from perception.scene import SceneModel
 from perception.types import Share
 from scenarios.schema import Perception
