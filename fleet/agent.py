@@ -7,23 +7,22 @@ heard: it holds no other drone and no world. One SimPy process a drone, one wake
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from functools import partial
+from typing import Any, NamedTuple, Protocol, cast
 
 import simpy
 
-from fleet.auth import Inbox, Sealer
-from fleet.coverage import NOVEL_FLAG, TARGET_FLAG, CoverageMap, footprint_radius_m
+from fleet.auth import Dropped, DropReason, Inbox, Opened, Sealer
+from fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from fleet.gate import Gate, Payload, make_payload
+from fleet.senses import Sensed
 from fleet.staleness import LinkHealth, cap_by_age, health
 from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from perception.types import Capture
 from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
 from policies.damping import LinkState, damp
-
-COVERAGE_PERIOD_S = 1.0
-"""The coverage grid is renewed this often: at 5 m/s a drone crosses a 12.8 m cell in 2.6 s."""
 
 
 class Platform(NamedTuple):
@@ -65,8 +64,7 @@ class Received(NamedTuple):
 class Senses(Protocol):
     """A drone's own sensors and mission computer."""
 
-    def capture(self, frame: int) -> Capture: ...
-    def velocity_mps(self, frame: int) -> tuple[float, float, float]: ...
+    def sense(self, frame: int) -> Sensed: ...
     def platform(self) -> Platform: ...
     def task(self) -> Task: ...
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int: ...
@@ -85,7 +83,7 @@ class AgentLog(Protocol):
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None: ...
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None: ...
-    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None: ...
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
 
 
 class Agent:
@@ -121,8 +119,6 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._fresh_s = rules.period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
-        self._coverage = CoverageMap()
-        self._grid, self._novel, self._grid_at_s = b"", False, -1e9
         self._known: dict[int, Descriptor] = {}
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, LinkState] = {}
@@ -136,10 +132,18 @@ class Agent:
         """The drone leaves the plane for good."""
         self.airborne = False
 
-    def hear(self, descriptor: Descriptor) -> None:
-        """A peer's descriptor, already checked, replaces the one held (keep-last-1)."""
-        if self.airborne and descriptor.agent_id != self.drone:
-            self._hold(descriptor)
+    def hear(self, opened: Opened | Dropped) -> DropReason | None:
+        """A datagram came in: one that may be believed replaces the descriptor held of its sender (keep-last-1).
+
+        Returns:
+            Why it was refused, None where it was not.
+        """
+        heard = self.inbox.accept(opened)
+        if isinstance(heard, DropReason):
+            return heard
+        if heard.agent_id != self.drone:
+            self._hold(heard)
+        return None
 
     def _hold(self, descriptor: Descriptor) -> None:
         sender = descriptor.agent_id
@@ -164,49 +168,44 @@ class Agent:
             self._tick(frame)
 
     def _tick(self, frame: int) -> None:
-        capture = self._senses.capture(frame)
-        self._hold(self._publish(frame, capture))
+        sensed = self._senses.sense(frame)
+        self._hold(self._publish(sensed))
         self._decide()
         duty = self.gate.duty_percent
         self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
         if self.sensed:
-            self.latest = capture
-            done = self.env.timeout(self._rules.compute_delay_s)
-            done.callbacks.append(lambda _event: self._send(capture))
+            self.latest = capture = sensed.capture
+            self.env.timeout(self._rules.compute_delay_s, capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 
-    def _publish(self, frame: int, capture: Capture) -> Descriptor:
+    def _publish(self, sensed: Sensed) -> Descriptor:
         """Publish this frame's descriptor; returns it as every peer reads it, rounded by the wire."""
-        now_s = self.env.now
-        x_m, y_m, z_m = capture.est_position_m
-        radius_m = footprint_radius_m(z_m)
-        if now_s - self._grid_at_s >= COVERAGE_PERIOD_S:
-            self._grid, self._novel = self._coverage.look(x_m, y_m, radius_m)
-            self._grid_at_s = now_s
-        platform, task = self._senses.platform(), self._senses.task()
+        capture, velocity_mps, footprint_m, grid, novel = sensed
+        soc, cpu_headroom, gpu_headroom = self._senses.platform()
+        phase, region, target_ids = self._senses.task()
         descriptor = Descriptor(
             # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
             stamp_ns=round((capture.t_s + self.clock_skew_s) * 1e9),
             agent_id=self.drone,
             position_m=capture.est_position_m,
             orientation_xyzw=capture.orientation_xyzw,
-            velocity_mps=self._senses.velocity_mps(frame),
-            footprint_radius_m=radius_m,
-            battery_soc=platform.soc,
-            cpu_headroom=platform.cpu_headroom,
-            gpu_headroom=platform.gpu_headroom,
+            velocity_mps=velocity_mps,
+            footprint_radius_m=footprint_m,
+            battery_soc=soc,
+            cpu_headroom=cpu_headroom,
+            gpu_headroom=gpu_headroom,
             peer_goodput_mbps=self._modem.goodput_mbps(),
-            coverage_grid=self._grid,
-            novelty_flags=NOVEL_FLAG * self._novel + TARGET_FLAG * bool(task.target_ids),
-            task_phase=task.phase,
-            region=task.region,
-            priority_target_ids=task.target_ids,
+            coverage_grid=grid,
+            novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids),
+            task_phase=phase,
+            region=region,
+            priority_target_ids=target_ids,
         )
         payload = encode_descriptor(descriptor)
         datagram = payload if self._sealer is None else self._sealer.seal(payload)
         self._modem.broadcast(datagram)
-        self._log.descriptor(now_s, descriptor, len(datagram))
+        self._log.descriptor(self.env.now, descriptor, len(datagram))
         return decode_descriptor(payload)
 
     def _ages_s(self) -> dict[int, float]:
@@ -220,21 +219,24 @@ class Agent:
         return ages_s
 
     def _decide(self) -> None:
-        now_s, me = self.env.now, self.drone
+        now_s, me, links, fresh_s = self.env.now, self.drone, self._links, self._fresh_s
         ages_s = self._ages_s()
         view = FleetView(me, self._rules.period_s, dict(self._known), ages_s)
         begin_ns = time.perf_counter_ns()
         directives = self.policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         check_directives(directives, view)
-        self._log.decision(now_s, me, elapsed_ns, [age_s for i, age_s in ages_s.items() if i != me])
-        by_peer = {d.destination: d for d in directives}
+        asked_of = {d.destination: d for d in directives}
+        peer_ages_s = []
         for peer, age_s in ages_s.items():
-            if peer != me:
-                asked = by_peer.get(peer) or nothing(me, peer, "the policy gave no directive")
-                before = self._links.get(peer) or LinkState(nothing(me, peer, ""))
-                if age_s > self._fresh_s or asked is not before.enforced or before.asking_since_s is not None:
-                    self._enforce(before, asked, age_s, now_s)
+            if peer == me:
+                continue
+            peer_ages_s.append(age_s)
+            asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
+            before = links.get(peer) or LinkState(nothing(me, peer, ""))
+            if asked is not before.enforced or age_s > fresh_s or before.asking_since_s is not None:
+                self._enforce(before, asked, age_s, now_s)
+        self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
     def _enforce(self, before: LinkState, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
@@ -254,13 +256,13 @@ class Agent:
 
     # --- the data plane ------------------------------------------------------------------------
 
-    def _send(self, capture: Capture) -> None:
+    def _send(self, computed: simpy.Event) -> None:
+        """The capture's features are there: hand each link that is due what its directive allows."""
         if not self.airborne:
             return
-        x_m, y_m, _ = capture.est_position_m
+        capture = cast(Capture, computed.value)
+        pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
         for directive in self.gate.due(self.env.now):
-            payload = make_payload(
-                directive, x_m, y_m, capture.est_yaw_rad, lambda roi: self._senses.count_boxes(capture, roi)
-            )
+            payload = make_payload(directive, *pose, count_boxes)
             if payload is not None:
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)

@@ -67,7 +67,15 @@ class Dropped:
 @lru_cache(maxsize=256)  # its sender and whoever hears it compute the same one
 def tag(key: bytes, stamped: bytes) -> bytes:
     """HMAC-SHA256 (RFC 2104), truncated to its first 16 B (RFC 2104 §5 allows half the hash)."""
-    return hmac.digest(key, stamped, "sha256")[:TAG_BYTES]
+    mac = _keyed(key).copy()
+    mac.update(stamped)
+    return mac.digest()[:TAG_BYTES]
+
+
+@lru_cache(maxsize=16)
+def _keyed(key: bytes) -> hmac.HMAC:
+    """The key hashed in already: a copy of this and the message take half the time of both together."""
+    return hmac.new(key, digestmod="sha256")
 
 
 class Sealer:

@@ -7,59 +7,69 @@ grids can be compared cell by cell. It covers the ±102.4 m that the perception 
 from __future__ import annotations
 
 import math
+from typing import overload
 
 import numpy as np
+import numpy.typing as npt
 
 from policies.contract import COVERAGE_CELLS, Coverage
+
+Array = npt.NDArray[np.float64]
 
 CELL_M = 12.8
 HALF_FIELD_OF_VIEW_DEG = 35.0
 """Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
 RANGE_M = 102.4
+NOVEL_FLAG, TARGET_FLAG = 1, 2
 _HALF_FIELD_OF_VIEW_TAN = math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
+_HALF = COVERAGE_CELLS // 2
 _CELLS = np.arange(COVERAGE_CELLS)
 _PLACES = np.array([1, 4, 16, 64], np.uint8)
-NOVEL_FLAG, TARGET_FLAG = 1, 2
 
 
-def footprint_radius_m(height_m: float) -> float:
-    """Radius of the nadir footprint at a height above ground."""
-    return max(0.0, height_m) * _HALF_FIELD_OF_VIEW_TAN
+@overload
+def footprint_radius_m(height_m: float) -> float: ...
+@overload
+def footprint_radius_m(height_m: Array) -> Array: ...
+def footprint_radius_m(height_m: float | Array) -> float | Array:
+    """Radius of the nadir footprint at a height above ground, any shape."""
+    radius_m: Array = np.maximum(0.0, height_m) * _HALF_FIELD_OF_VIEW_TAN
+    return radius_m
 
 
-def pack_grid(states: np.ndarray) -> bytes:
+def pack_grid(states: npt.NDArray[np.uint8]) -> bytes:
     """16 × 16 coverage states (rows from south, columns from west) to 64 B, lowest bits first."""
     return (states.astype(np.uint8).reshape(-1, 4) @ _PLACES).tobytes()
 
 
-def unpack_grid(grid: bytes) -> np.ndarray:
+def unpack_grid(grid: bytes) -> npt.NDArray[np.uint8]:
     """The inverse of `pack_grid`: uint8 [16, 16]."""
     packed = np.frombuffer(grid, np.uint8)[:, None]
-    return ((packed >> np.array([0, 2, 4, 6], np.uint8)) & 3).reshape(COVERAGE_CELLS, COVERAGE_CELLS)
+    states: npt.NDArray[np.uint8] = (packed >> np.array([0, 2, 4, 6], np.uint8)) & np.uint8(3)
+    return states.reshape(COVERAGE_CELLS, COVERAGE_CELLS)
 
 
-class CoverageMap:
-    """One drone's coverage statement and its memory of what it has seen well."""
+def survey(x_m: npt.ArrayLike, y_m: npt.ArrayLike, radius_m: npt.ArrayLike) -> list[tuple[bytes, bool]]:
+    """One drone's coverage statements along its way, all at once.
 
-    def __init__(self) -> None:
-        self._seen_well: set[tuple[int, int]] = set()
+    Args:
+        x_m, y_m: [K] where it believes it is at each look, ENU, in the order of time.
+        radius_m: [K] its footprint radius.
 
-    def look(self, x_m: float, y_m: float, radius_m: float) -> tuple[bytes, bool]:
-        """The grid from here, and whether any cell is seen well for the first time.
-
-        Args:
-            x_m, y_m: where the drone believes it is, ENU.
-            radius_m: its footprint radius.
-        """
-        half = COVERAGE_CELLS // 2
-        west, south = math.floor(x_m / CELL_M) - half, math.floor(y_m / CELL_M) - half
-        distance_m = np.hypot((west + _CELLS + 0.5) * CELL_M - x_m, ((south + _CELLS + 0.5) * CELL_M - y_m)[:, None])
-        well = distance_m <= radius_m
-        states = (distance_m <= RANGE_M).astype(np.uint8)  # UNSEEN or POOR
-        states[well] = Coverage.WELL
-        seen = self._seen_well
-        new = [(r, c) for r, c in np.argwhere(well).tolist() if (west + c, south + r) not in seen]
-        for r, c in new:
-            states[r, c] = Coverage.NOVEL
-            seen.add((west + c, south + r))
-        return pack_grid(states), bool(new)
+    Returns:
+        At each look the grid, and whether any cell is seen well for the first time.
+    """
+    x, y, radius = (np.asarray(v, dtype=float)[:, None] for v in (x_m, y_m, radius_m))
+    columns = np.floor(x / CELL_M).astype(np.int64) - _HALF + _CELLS  # [K, 16] of the world's lattice
+    rows = np.floor(y / CELL_M).astype(np.int64) - _HALF + _CELLS
+    distance_m = np.hypot(((columns + 0.5) * CELL_M - x)[:, None, :], ((rows + 0.5) * CELL_M - y)[:, :, None])
+    well = distance_m <= radius[:, None]
+    states = (distance_m <= RANGE_M).astype(np.uint8)  # UNSEEN or POOR
+    states[well] = Coverage.WELL
+    look, row, column = np.nonzero(well)  # in the order of looks, so that a cell's first entry is its first sight
+    cell = np.stack([rows[look, row], columns[look, column]], axis=1)
+    _, first = np.unique(cell, axis=0, return_index=True)
+    states[look[first], row[first], column[first]] = Coverage.NOVEL
+    novel = np.zeros(len(states), bool)
+    novel[look[first]] = True
+    return list(zip(map(pack_grid, states), novel.tolist(), strict=True))

@@ -47,14 +47,12 @@ def make_payload(
     directive: Directive, est_x_m: float, est_y_m: float, est_yaw_rad: float, count_boxes: CountBoxes
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent."""
-    rung = directive.representation
+    rung, rho, roi = directive.representation, directive.rho, directive.roi
     cells = boxes = index_bytes = 0
     if rung == Representation.NONE:
         return None
     if rung == Representation.FEATURES:
-        roi = directive.roi
-        disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-        cells = budget.cells_sent(directive.rho, disc, est_x_m, est_y_m, est_yaw_rad)
+        cells = budget.cells_sent(rho, roi, est_x_m, est_y_m, est_yaw_rad)
         if cells == 0:
             return None
         index_bytes = budget.index_bytes(cells)
@@ -62,23 +60,15 @@ def make_payload(
     elif rung == Representation.RAW:
         content = RAW_BYTES
     else:
-        boxes = count_boxes(directive.roi)
+        boxes = count_boxes(roi)
         if rung == Representation.TRACKS:
             boxes = min(boxes, budget.MAX_TRACKS)
             content = boxes * budget.TRACK_BYTES
         else:
             content = boxes * budget.DETECTION_BYTES
-    return Payload(
-        rung,
-        directive.rho,
-        directive.roi,
-        directive.fusion_weight,
-        cells,
-        boxes,
-        index_bytes,
-        # the directive rides along, so that the receiver knows rung, ROI and fusion weight
-        HEADER_BYTES + DIRECTIVE_BYTES + content,
-    )
+    # the directive rides along, so that the receiver knows rung, ROI and fusion weight
+    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + content
+    return Payload(rung, rho, roi, directive.fusion_weight, cells, boxes, index_bytes, size_bytes)
 
 
 class Gate:
@@ -105,9 +95,10 @@ class Gate:
         """Directives of the links that may send now, by ascending peer; marks them as sent."""
         ready = []
         for peer, directive in self._directives.items():
-            if directive.representation == Representation.NONE or directive.rate_hz <= 0:
+            rate_hz = directive.rate_hz
+            if directive.representation == Representation.NONE or rate_hz <= 0:
                 continue
-            period_s = 1.0 / directive.rate_hz
+            period_s = 1.0 / rate_hz
             slot_s = self._last_slot_s.get(peer, -1e9) + period_s
             if now_s < slot_s - _EPSILON_S:
                 continue

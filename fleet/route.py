@@ -7,10 +7,8 @@ polyline: position is C³, exact on straight legs, and inside every corner. All 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -108,8 +106,3 @@ def _bend(since_s: Array, width_s: Array) -> Array:
     r = np.clip(since_s / knot_s + 1.5, 0.0, 3.0)
     bend: Array = (r - 3 * np.maximum(r - 1, 0.0) + 3 * np.maximum(r - 2, 0.0)) / knot_s**2
     return bend
-
-
-def route_time_s(waypoints_m: Sequence[tuple[float, float]], speed_mps: float) -> float:
-    """When the reference point reaches the last waypoint at constant speed, s (0 for a hover)."""
-    return math.fsum(math.dist(a, b) for a, b in pairwise(waypoints_m)) / speed_mps

@@ -6,7 +6,6 @@ A descriptor older than 3 periods degrades the link to its peer, one older than 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from enum import IntEnum
 
 from policies.contract import Directive, Representation
@@ -49,8 +48,7 @@ def cap_by_age(directive: Directive, link: LinkHealth, age_s: float | None) -> D
     if directive.representation <= Representation.DETECTIONS and directive.rate_hz <= DEGRADED_RATE_HZ:
         return directive
     features = directive.representation > Representation.DETECTIONS
-    return replace(
-        directive,
+    return directive._replace(
         representation=min(directive.representation, Representation.DETECTIONS),
         rho=0.0 if features else directive.rho,
         rate_hz=min(directive.rate_hz, DEGRADED_RATE_HZ),

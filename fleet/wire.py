@@ -7,9 +7,9 @@ at home. Decoding holds every length, count, enumeration and range to its bound 
 
 from __future__ import annotations
 
-import math
 import struct
 from functools import lru_cache
+from math import isfinite
 
 from fleet.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
 from policies.contract import (
@@ -155,18 +155,20 @@ def decode_descriptor(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"priority_target_ids claims {targets} entries, which does not fill {size} B exactly")
 
     values = _descriptor_layout(peers, targets).unpack(data)
-    _, second, nanosecond, agent_id, px, py, pz, qx, qy, qz, qw, vx, vy, vz, footprint, soc, cpu, gpu, _ = values[:19]
+    _, second, nanosecond, agent_id = values[:4]
+    orientation, (footprint, soc, cpu, gpu) = values[7:11], values[14:18]
     after = 19 + peers
     goodput = values[19:after]
-    grid, novelty, phase, x, y, radius, flag, _ = values[after : after + 8]
+    grid, novelty, phase = values[after : after + 3]
+    x, y, radius, flag = region = values[after + 3 : after + 7]
     # a sum of 32-bit floats in 64 bits cannot overflow: it is finite if and only if every one of them is
-    total = px + py + pz + qx + qy + qz + qw + vx + vy + vz + footprint + soc + cpu + gpu + x + y + radius + flag
-    if not math.isfinite(sum(goodput, total)):
+    if not isfinite(sum(values[4:18]) + sum(goodput) + sum(region)):
         raise MalformedDatagram("a float is not finite")
     if nanosecond >= 1_000_000_000:
         raise MalformedDatagram(f"stamp.nanosec is {nanosecond}, must be below 10⁹")
     if agent_id > MAX_AGENT_ID:
         raise MalformedDatagram(f"agent_id is {agent_id}, must be at most {MAX_AGENT_ID}")
+    qx, qy, qz, qw = orientation
     if not 0.999 < qx * qx + qy * qy + qz * qz + qw * qw < 1.001:
         raise MalformedDatagram("orientation is not a unit quaternion")
     if footprint < 0:
@@ -178,17 +180,17 @@ def decode_descriptor(data: bytes) -> Descriptor:
     if phase not in _PHASES:
         raise MalformedDatagram(f"task_phase is {phase}, must be at most {len(_PHASES) - 1}")
     if flag == 1 and radius > 0:
-        region = Disc(x, y, radius)
+        disc = Disc(x, y, radius)
     elif x == y == radius == flag == 0:
-        region = None
+        disc = None
     else:
         raise MalformedDatagram(f"region is ({x:g}, {y:g}, {radius:g}, {flag:g}), neither a disc nor none")
     return Descriptor(
         second * 1_000_000_000 + nanosecond,
         agent_id,
-        (px, py, pz),
-        (qx, qy, qz, qw),
-        (vx, vy, vz),
+        values[4:7],
+        orientation,
+        values[11:14],
         footprint,
         soc,
         cpu,
@@ -197,7 +199,7 @@ def decode_descriptor(data: bytes) -> Descriptor:
         grid,
         novelty,
         _PHASES[phase],
-        region,
+        disc,
         values[after + 8 :],
     )
 
@@ -236,7 +238,7 @@ def decode_directive(data: bytes) -> Directive:
         raise MalformedDatagram(f"{len(data)} B, must be {DIRECTIVE_BYTES}")
     header, source, destination, rung, duty, x, y, radius, rho, rate, deadline, weight = _DIRECTIVE.unpack(data)
     check_encapsulation(header)
-    if not math.isfinite(x + y + radius + rho + rate + deadline + weight):
+    if not isfinite(x + y + radius + rho + rate + deadline + weight):
         raise MalformedDatagram("a float is not finite")
     if source > MAX_AGENT_ID or destination > MAX_AGENT_ID or source == destination:
         raise MalformedDatagram(f"link {source}→{destination} is none")
@@ -252,14 +254,5 @@ def decode_directive(data: bytes) -> Directive:
         )
     if radius < 0 or (radius == 0 and not x == y == 0):
         raise MalformedDatagram(f"roi is ({x:g}, {y:g}, {radius:g}), neither a disc nor none")
-    return Directive(
-        source=source,
-        destination=destination,
-        representation=_RUNGS[rung],
-        rho=rho,
-        roi=Disc(x, y, radius) if radius > 0 else None,
-        rate_hz=rate,
-        deadline_s=deadline,
-        fusion_weight=weight,
-        duty_percent=duty,
-    )
+    roi = Disc(x, y, radius) if radius > 0 else None
+    return Directive(source, destination, _RUNGS[rung], rho, roi, rate, deadline, weight, duty)

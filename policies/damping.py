@@ -8,7 +8,7 @@ t seconds is at most 1 + t / dwell (average dwell time, FACTS §5).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from policies.contract import Directive, Disc, Representation
 
@@ -18,8 +18,7 @@ EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkState:
+class LinkState(NamedTuple):
     """What the gate enforces on a link, and since when more is being asked for (None: it is not)."""
 
     enforced: Directive
@@ -62,13 +61,12 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
     if current.representation == Representation.NONE:
         # Nothing flows, so the duty cycle alone can be lowered.
         duty = min(current.duty_percent, proposed.duty_percent)
-        return current if duty == current.duty_percent else replace(current, duty_percent=duty, reason=proposed.reason)
+        return current if duty == current.duty_percent else current._replace(duty_percent=duty, reason=proposed.reason)
     if proposed.representation < current.representation:
         rho, roi = proposed.rho, proposed.roi  # the budget of another rung does not bound this one
     else:
         rho, roi = min(current.rho, proposed.rho), _lower_roi(current.roi, proposed.roi)
-    reduced = replace(
-        proposed,
+    reduced = proposed._replace(
         representation=min(current.representation, proposed.representation),
         rho=rho,
         roi=roi,
@@ -79,7 +77,7 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
     if reduced == current:
         return current
     # A disc that moved while an upgrade waits is not that upgrade's doing: its reason would mislead.
-    return replace(reduced, reason=current.reason) if _level(reduced) == _level(current) else reduced
+    return reduced._replace(reason=current.reason) if _level(reduced) == _level(current) else reduced
 
 
 def _hardly_moved(proposed: Directive, current: Directive) -> bool:
@@ -91,12 +89,12 @@ def _hardly_moved(proposed: Directive, current: Directive) -> bool:
 
 
 def _level(d: Directive) -> tuple[float, ...]:
-    radius_m = math.inf if d.roi is None else d.roi.radius_m
-    return (d.representation, d.rho, radius_m, d.rate_hz, d.duty_percent, d.fusion_weight)
+    _, _, rung, rho, roi, rate_hz, _, weight, duty_percent, _ = d
+    return rung, rho, math.inf if roi is None else roi.radius_m, rate_hz, duty_percent, weight
 
 
 def _lower_roi(current: Disc | None, proposed: Disc | None) -> Disc | None:
     if current is None or proposed is None:
         return proposed if current is None else current
     # A disc that moves with its target is no switch; one that grows is.
-    return replace(proposed, radius_m=min(current.radius_m, proposed.radius_m))
+    return proposed._replace(radius_m=min(current.radius_m, proposed.radius_m))

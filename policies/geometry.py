@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from math import acos, copysign, hypot, pi, sin
 
 from policies.contract import Descriptor, FleetView
 
@@ -23,18 +23,18 @@ def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> f
         return 0.0
     if distance_m <= large - small:
         return 1.0
-    d, r2, s2 = distance_m * distance_m, small * small, large * large
-    a, b = (d + r2 - s2) / (2 * distance_m * small), (d + s2 - r2) / (2 * distance_m * large)
+    d2, r2, s2 = distance_m * distance_m, small * small, large * large
+    a, b = (d2 + r2 - s2) / (2 * distance_m * small), (d2 + s2 - r2) / (2 * distance_m * large)
     # Rounding can push the cosines past ±1 when the circles barely touch.
-    alpha, beta = math.acos(a if -1.0 < a < 1.0 else math.copysign(1.0, a)), math.acos(b if b < 1.0 else 1.0)
-    lens = r2 * (alpha - math.sin(2 * alpha) / 2) + s2 * (beta - math.sin(2 * beta) / 2)
-    return min(1.0, max(0.0, lens / (math.pi * r2)))
+    alpha, beta = acos(a if -1.0 < a < 1.0 else copysign(1.0, a)), acos(b if b < 1.0 else 1.0)
+    share = (r2 * (alpha - sin(2 * alpha) / 2) + s2 * (beta - sin(2 * beta) / 2)) / (pi * r2)
+    return 0.0 if share < 0.0 else share if share < 1.0 else 1.0
 
 
 def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
     """Overlap of two drones' nadir footprints, 0 … 1, of the smaller footprint."""
     (ax, ay, _), (bx, by, _) = a.position_m, b.position_m
-    return circle_overlap(math.hypot(ax - bx, ay - by), a.footprint_radius_m, b.footprint_radius_m)
+    return circle_overlap(hypot(ax - bx, ay - by), a.footprint_radius_m, b.footprint_radius_m)
 
 
 def peers_by_overlap(view: FleetView) -> list[int]:
@@ -45,10 +45,10 @@ def peers_by_overlap(view: FleetView) -> list[int]:
     me = view.me
     if me is None:
         return []
-    ego, descriptors = view.ego, view.descriptors
+    ego = view.ego
     ranked = [
-        (-round(footprint_overlap(me, descriptors[p]) / OVERLAP_STEP), (p - ego) % _IDS, p)
-        for p in descriptors
+        (-round(footprint_overlap(me, peer) / OVERLAP_STEP), (p - ego) % _IDS, p)
+        for p, peer in view.descriptors.items()
         if p != ego
     ]
     ranked.sort()

@@ -38,7 +38,7 @@ class Air:
     Args:
         env: the clock.
         config: the scenario's radio section.
-        n_drones: ids are 0 … n_drones − 1.
+        positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
         publish_spread: the drones' clocks are not in step, so a drone's broadcasts reach its radio a fixed time
@@ -52,7 +52,7 @@ class Air:
         self,
         env: simpy.Environment,
         config: Radio,
-        n_drones: int,
+        positions_m: ArrayLike,
         *,
         seed: int,
         replication: int = 0,
@@ -63,8 +63,8 @@ class Air:
             raise ValueError(f"publish_spread is {publish_spread!r}, must be in [0, 1]")
         self._env = env
         self._config = config
-        self._n = n_drones
-        self.channel = Channel(config, n_drones, seed, replication, frame_s)
+        self.channel = Channel(config, positions_m, seed, replication, frame_s)
+        self._n = n_drones = self.channel.n
         self.counters = Counters()
         self._gone: set[int] = set()
         self._broadcasts = Broadcasts(
@@ -84,15 +84,10 @@ class Air:
 
     # --- once a frame ----------------------------------------------------------------------------
 
-    def advance(
-        self,
-        positions_m: ArrayLike,
-        extra_loss_db: ArrayLike | None = None,
-        jammers: Sequence[Jammer] = (),
-    ) -> None:
+    def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move the links on by one frame (arguments as in `Channel.advance`); samples in service feel it at once."""
         before = self._snr_rows
-        self._snr_rows = self.channel.advance(positions_m, extra_loss_db, jammers).tolist()
+        self._snr_rows = self.channel.advance(extra_loss_db, jammers).tolist()
         self._known_rows = before or self._snr_rows
         self._broadcasts.advance()
         self.medium.retune()

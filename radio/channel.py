@@ -60,20 +60,29 @@ class Channel:
     NaN on the diagonal. `group_reach_bytes[i, j]` is the longest group-addressed frame of i that j receives
     in this frame, its fade and its luck drawn; NaN on the diagonal, so that no drone hears itself.
 
+    What follows from the flight alone is worked out for a block of frames in one pass; a frame in which nothing
+    else interferes is only looked up.
+
     Args:
         config: the scenario's radio section.
-        n_drones: ids are 0 … n_drones − 1.
+        positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
+
+    Raises:
+        ValueError: if the shape is wrong or a position is not finite.
     """
 
-    def __init__(self, config: Radio, n_drones: int, seed: int, replication: int, frame_s: float) -> None:
-        if n_drones < 1:
-            raise ValueError(f"n_drones is {n_drones}, must be at least 1")
+    def __init__(self, config: Radio, positions_m: ArrayLike, seed: int, replication: int, frame_s: float) -> None:
+        self._positions_m = p = np.asarray(positions_m, dtype=float)
+        if p.ndim != 3 or p.shape[1] < 1 or p.shape[2] != 3:
+            raise ValueError(f"positions_m has shape {p.shape}, must be (frames, drones, 3)")
+        if not np.isfinite(p).all():
+            raise ValueError("positions_m holds a value that is not finite")
         if not frame_s > 0:
             raise ValueError(f"frame_s is {frame_s!r}, must be > 0")
         self.config = config
-        self.n = n_drones
+        self.n = n_drones = p.shape[1]
         self.frame = -1
         self.snr_db: FloatArray = np.full((n_drones, n_drones), np.nan)
         self.fade_db: FloatArray = np.zeros((n_drones, n_drones))
@@ -92,58 +101,50 @@ class Channel:
         self._fade_streams = [stream(seed, replication, h, "fading") for h in ids]
         self._luck_streams = [stream(seed, replication, h, "group loss") for h in ids]
         self._block = max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
-        self._shadow_z: FloatArray
+        # the block, [frames, N, N] each
+        self._snr_db: FloatArray
+        self._shadow_db: FloatArray = np.zeros((1, n_drones, n_drones))
         self._fades: FloatArray
         self._luck: FloatArray
         self._reach_at_1: FloatArray
+        self._reach_bytes: FloatArray
 
-    def advance(
-        self, positions_m: ArrayLike, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()
-    ) -> FloatArray:
+    def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> FloatArray:
         """Move on by one frame.
 
         Args:
-            positions_m: [N, 3], ENU.
             extra_loss_db: [N, N], sender by receiver, added to the path loss; None is none.
             jammers: position (ENU, m) and power (dBm) of each; what a receiver gets of it adds to its noise.
 
         Returns:
-            `snr_db`, [N, N]: a new array each frame.
+            `snr_db`, [N, N].
 
         Raises:
-            ValueError: if a shape is wrong or a position is not finite.
+            IndexError: the flight is over.
+            ValueError: if a shape is wrong.
         """
-        p = np.asarray(positions_m, dtype=float)
-        if p.shape != (self.n, 3):
-            raise ValueError(f"positions_m has shape {p.shape}, must be ({self.n}, 3)")
-        if not np.isfinite(p).all():
-            raise ValueError("positions_m holds a value that is not finite")
+        if self.frame + 1 >= len(self._positions_m):
+            raise IndexError(f"the flight has {len(self._positions_m)} frames")
         self.frame += 1
         row = self.frame % self._block
         if row == 0:
             self._refill()
-        c = self.config
-        self.shadow_db = (
-            c.shadowing_sigma_db * self._shadow_z[row]
-            if self.frame == 0
-            else self._keep * self.shadow_db + self._renew * c.shadowing_sigma_db * self._shadow_z[row]
-        )
-        delta = p[:, None, :] - p[None, :, :]
-        distance = np.sqrt(np.einsum("ijk,ijk->ij", delta, delta))
-        loss_db = self._loss_1m_db + 10.0 * c.path_loss_exponent * np.log10(np.maximum(distance, 1.0))
-        snr: FloatArray = c.tx_power_dbm - self.noise_dbm - loss_db
-        snr += self.shadow_db
+        self.shadow_db = self._shadow_db[row]
+        self.fade_db = self._fades[row]
+        self.snr_db, self.group_reach_bytes = self._snr_db[row], self._reach_bytes[row]
+        if extra_loss_db is None and not jammers:
+            return self.snr_db
+        snr: FloatArray = self.snr_db.copy()
         if extra_loss_db is not None:
             extra = np.asarray(extra_loss_db, dtype=float)
             if extra.shape != snr.shape:
                 raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {snr.shape}")
             snr -= extra
         if jammers:
-            snr -= self._noise_rise_db(p, jammers)
-        self.fade_db = self._fades[row]
-        self.group_reach_bytes = self._reach(snr + self.fade_db, self._reach_at_1[row])
-        snr.flat[:: self.n + 1] = np.nan
-        self.snr_db = snr
+            snr -= self._noise_rise_db(self._positions_m[self.frame], jammers)
+        faded_db = snr + self.fade_db
+        np.fill_diagonal(faded_db, 0.0)  # whose reach is not a number anyway
+        self.snr_db, self.group_reach_bytes = snr, self._reach(faded_db, self._reach_at_1[row])
         return snr
 
     def reach_again(self, sender: int, times: int) -> FloatArray:
@@ -174,19 +175,39 @@ class Channel:
 
     def _refill(self) -> None:
         b, n = self._block, self.n
-        self._shadow_z = np.zeros((b, n, n))
-        x, y = np.zeros((b, n, n)), np.zeros((b, n, n))
+        shadow_z, x, y = (np.zeros((b, n, n)) for _ in range(3))
         self._luck = np.zeros((b, n, n))
         for h in range(1, n):
             z = self._shadow_streams[h].standard_normal((b, h))
-            self._shadow_z[:, h, :h] = z
-            self._shadow_z[:, :h, h] = z
+            shadow_z[:, h, :h] = z
+            shadow_z[:, :h, h] = z
             self._scatter(x, h, f := self._fade_streams[h].standard_normal((b, 2, 2, h)), 0)
             self._scatter(y, h, f, 1)
             self._scatter(self._luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
         self._luck[:, range(n), range(n)] = np.nan  # no drone hears itself
         self._reach_at_1 = _reach_at_1(self._luck)
         self._fades = 10.0 * np.log10(np.maximum(rician_gain(x, y, self.config.rician_k_db), 1e-12))
+        self._shadow_db = self._shadowing(shadow_z)
+        c, p = self.config, self._positions_m[self.frame : self.frame + b]
+        delta = p[:, :, None, :] - p[:, None, :, :]
+        distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta))
+        loss_db = self._loss_1m_db + 10.0 * c.path_loss_exponent * np.log10(np.maximum(distance, 1.0))
+        flown = len(p)
+        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db[:flown]
+        self._reach_bytes = self._reach(self._snr_db + self._fades[:flown], self._reach_at_1[:flown])
+        self._snr_db[:, range(n), range(n)] = np.nan
+
+    def _shadowing(self, z: FloatArray) -> FloatArray:
+        """[frames, N, N] dB: the Gauss–Markov process goes on from the block before."""
+        sigma_db = self.config.shadowing_sigma_db
+        shadow_db, before = np.empty_like(z), self._shadow_db[-1]
+        for t, normals in enumerate(z):
+            if self.frame + t == 0:
+                before = sigma_db * normals
+            else:
+                before = self._keep * before + self._renew * sigma_db * normals
+            shadow_db[t] = before
+        return shadow_db
 
     @staticmethod
     def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:

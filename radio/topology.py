@@ -37,6 +37,13 @@ def link_graph(quality: ArrayLike, threshold: float) -> Any:
     return graph
 
 
+def linked_drones(quality: ArrayLike, threshold: float) -> list[int]:
+    """Drones with at least one usable link, in or out, ascending; arguments as for `link_graph`."""
+    usable = np.asarray(quality, dtype=float) >= threshold
+    np.fill_diagonal(usable, False)
+    return [int(i) for i in np.flatnonzero(usable.any(axis=0) | usable.any(axis=1))]
+
+
 def is_connected(graph: Any) -> bool:
     """Whether every drone reaches every other, over several hops if need be."""
     return len(graph) <= 1 or bool(nx.is_strongly_connected(graph))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Generator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -119,4 +118,4 @@ class _Begin:
 def _empty_handed(descriptor_bytes: bytes) -> bytes:
     descriptor = decode_descriptor(descriptor_bytes)
     goodput = tuple(0.0 for _ in descriptor.peer_goodput_mbps)
-    return encode_descriptor(replace(descriptor, battery_soc=0.0, peer_goodput_mbps=goodput))
+    return encode_descriptor(descriptor._replace(battery_soc=0.0, peer_goodput_mbps=goodput))

@@ -7,9 +7,10 @@ receivers, and where a transmission number is joined again with the payload it s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from fleet.agent import Agent, Received
-from fleet.auth import Dropped, DropReason, Opened, open_datagram
+from fleet.auth import Dropped, Opened, open_datagram
 from fleet.gate import Payload
 from perception.types import Capture
 from radio import Air, Status, Transmission
@@ -39,7 +40,7 @@ class Ether:
         """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
         self.last_datagram[drone] = datagram
         opened = open_datagram(datagram, self._keys)
-        self.air.broadcast(drone, len(datagram), lambda heard: self.hand_over(opened, heard))
+        self.air.broadcast(drone, len(datagram), partial(self.hand_over, opened))
 
     def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
         """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""
@@ -49,13 +50,10 @@ class Ether:
         """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
         for receiver in heard:
             agent = self.agents[receiver]
-            if not agent.airborne:
-                continue
-            verdict = agent.inbox.accept(opened)
-            if isinstance(verdict, DropReason):
-                self._recorder.rows["drops"].append((agent.env.now, receiver, verdict.value))
-            else:
-                agent.hear(verdict)
+            if agent.airborne:
+                refused = agent.hear(opened)
+                if refused is not None:
+                    self._recorder.rows["drops"].append((agent.env.now, receiver, refused.value))
 
     def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
         """Hand a payload to the radio."""
@@ -95,13 +93,6 @@ class _Modem:
     """One drone's end of the air (fleet.agent.Modem)."""
 
     def __init__(self, ether: Ether, drone: int) -> None:
-        self._ether, self._drone = ether, drone
-
-    def broadcast(self, datagram: bytes) -> None:
-        self._ether.publish(self._drone, datagram)
-
-    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
-        self._ether.send(self._drone, peer, payload, capture, deadline_s)
-
-    def goodput_mbps(self) -> tuple[float, ...]:
-        return self._ether.air.goodput_mbps(self._drone)
+        self.broadcast = partial(ether.publish, drone)
+        self.send = partial(ether.send, drone)
+        self.goodput_mbps = partial(ether.air.goodput_mbps, drone)

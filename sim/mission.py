@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from fleet.agent import Task
 from perception.traffic import TARGET_ID, TargetPath
@@ -13,22 +14,22 @@ from scenarios.schema import Mission
 _PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 
 
-@dataclass(frozen=True, slots=True)
-class MissionNow:
+class MissionNow(NamedTuple):
     """The mission at one instant; positions ENU."""
 
     phase: str
     region: Disc | None
     target_xy: tuple[float, float] | None
 
-    def task(self, own_xy_m: tuple[float, float], footprint_m: float) -> Task:
+    def task(self, own_xy_m: Sequence[float], footprint_m: float) -> Task:
         """What a drone at `own_xy_m` is to do; it names the target while it tracks it and has it in its footprint."""
+        phase, region, target = self
         targets: tuple[int, ...] = ()
-        if self.phase == "track" and self.target_xy is not None:
-            dx_m, dy_m = self.target_xy[0] - own_xy_m[0], self.target_xy[1] - own_xy_m[1]
+        if phase == "track" and target is not None:
+            dx_m, dy_m = target[0] - own_xy_m[0], target[1] - own_xy_m[1]
             if dx_m * dx_m + dy_m * dy_m <= footprint_m * footprint_m:
                 targets = (TARGET_ID,)
-        return Task(_PHASES[self.phase], self.region, targets)
+        return Task(_PHASES[phase], region, targets)
 
 
 class MissionPlan:

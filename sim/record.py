@@ -8,7 +8,7 @@ function of (scenario, policy, seed, version) alone.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +25,7 @@ REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
 """Names as the tables have them."""
 _PHASES = {phase: phase.name.lower() for phase in TaskPhase}
 _LINKS = {link: link.name.lower() for link in LinkHealth}
+_NO_DISC = (NAN, NAN, NAN)
 F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
 
 TABLES: dict[str, dict[str, pa.DataType]] = {
@@ -115,30 +116,49 @@ def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
         digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
 
 
+Unfold = Callable[[Sequence[tuple[Any, ...]]], Sequence[Any]]
+"""Some rows to a table's columns, in the order of `TABLES`."""
+
+
 class Recorder:
-    """Gathers rows by table; `rows["states"].append((...))` in the column order of `TABLES`."""
+    """Gathers rows by table; `rows["events"].append((...))` in the column order of `TABLES`.
+
+    A table that many rows go to at once may gather something terser instead, and put into `unfold` how that
+    becomes columns.
+    """
 
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
+        self.unfold: dict[str, Unfold] = {}
         self._taken = dict.fromkeys(TABLES, 0)
 
     def tables(self) -> dict[str, pa.Table]:
         """All rows so far as Arrow tables."""
-        return {name: _table(name, rows) for name, rows in self.rows.items()}
+        return {name: self._table(name, rows) for name, rows in self.rows.items()}
 
     def take_new(self) -> dict[str, pa.Table]:
         """The rows since the last call, for a viewer that follows the flight."""
         new = {}
         for name, rows in self.rows.items():
-            new[name] = _table(name, rows[self._taken[name] :])
+            new[name] = self._table(name, rows[self._taken[name] :])
             self._taken[name] = len(rows)
         return new
 
+    def _table(self, name: str, rows: list[tuple[Any, ...]]) -> pa.Table:
+        columns = TABLES[name]
+        values = self.unfold.get(name, _columns)(rows) if rows else [()] * len(columns)
+        return pa.table({c: pa.array(v, t) for (c, t), v in zip(columns.items(), values, strict=True)})
 
-def _table(name: str, rows: list[tuple[Any, ...]]) -> pa.Table:
-    columns = TABLES[name]
-    values = list(zip(*rows, strict=True)) if rows else [()] * len(columns)
-    return pa.table({c: pa.array(v, t) for (c, t), v in zip(columns.items(), values, strict=True)})
+
+def _columns(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    return list(zip(*rows, strict=True))
+
+
+def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    """A decision's ages stand in one row."""
+    t_s, drones, ages_s = zip(*rows, strict=True)
+    counts = [len(ages) for ages in ages_s]
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), np.concatenate(ages_s)]
 
 
 class AgentNotes:
@@ -146,24 +166,24 @@ class AgentNotes:
 
     def __init__(self, recorder: Recorder) -> None:
         self._rows = recorder.rows
+        recorder.unfold["ages"] = _unfold_ages
         self._eval_ns: list[int] = []
         self._descriptor_bytes = self._directives = 0
 
     def descriptor(self, t_s: float, d: Descriptor, wire_bytes: int) -> None:
         """One descriptor was published."""
         self._descriptor_bytes += wire_bytes
-        region = (NAN, NAN, NAN) if d.region is None else (d.region.x_m, d.region.y_m, d.region.radius_m)
         self._rows["descriptors"].append(
             (
                 t_s, d.agent_id, d.stamp_ns, wire_bytes, d.battery_soc, d.cpu_headroom, d.gpu_headroom,
-                d.peer_goodput_mbps, _PHASES[d.task_phase], *region, d.novelty_flags, d.coverage_grid,
+                d.peer_goodput_mbps, _PHASES[d.task_phase], *(d.region or _NO_DISC), d.novelty_flags, d.coverage_grid,
             )
         )  # fmt: skip
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
         """A gate enforces something new."""
         self._directives += 1
-        roi = (NAN, NAN, NAN) if enforced.roi is None else (enforced.roi.x_m, enforced.roi.y_m, enforced.roi.radius_m)
+        roi = enforced.roi or _NO_DISC
         self._rows["directives"].append(
             (
                 t_s, enforced.source, enforced.destination, REPRESENTATIONS[enforced.representation], enforced.rho, *roi,
@@ -172,10 +192,10 @@ class AgentNotes:
             )
         )  # fmt: skip
 
-    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: list[float]) -> None:
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
         """A policy decided, reading peers' descriptors of these ages."""
         self._eval_ns.append(elapsed_ns)
-        self._rows["ages"] += [(t_s, drone, age_s) for age_s in peer_ages_s]
+        self._rows["ages"].append((t_s, drone, peer_ages_s))
 
     def totals(self) -> dict[str, float]:
         """Context-plane bytes: descriptors on the air, directives to the gates."""

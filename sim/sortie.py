@@ -76,7 +76,7 @@ def run_sortie(
 
     motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n)
-    air = Air(env, scenario.radio, n, seed=seed, replication=replication, frame_s=scenario.frame_s)
+    air = Air(env, scenario.radio, motion.position_m, seed=seed, replication=replication, frame_s=scenario.frame_s)
     scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
     plan = MissionPlan(scenario.mission)
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)

@@ -14,21 +14,21 @@ import simpy
 
 from fleet.agent import Agent, Platform, Task
 from fleet.battery import FleetBatteries, climb_power_w, rotor_power_w
-from fleet.coverage import RANGE_M, footprint_radius_m
+from fleet.coverage import RANGE_M
 from fleet.motion import Motion
+from fleet.senses import FlightSenses, Sensed
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc
 from radio import Air
-from radio.topology import link_graph
+from radio.topology import linked_drones
 from scenarios.schema import Scenario
 from sim.mission import MissionPlan
 from sim.record import Recorder
 
 NAN = float("nan")
+_NO_DISC, _NOWHERE = (NAN, NAN, NAN), (NAN, NAN)
 SECOND_S = 1.0
-TRUE_STATE = 13
-"""Columns of a drone's state before what it believes: position, attitude, velocity, body rates."""
 USABLE_SNR_DB = 0.0
 """Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
 
@@ -66,11 +66,8 @@ class World:
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         rotor_w = rotor_power_w(motion.air_speed_mps) + climb_power_w(motion.velocity_mps[..., 2])
         self._rotor_w: list[list[float]] = rotor_w.tolist()
-        columns = (
-            motion.position_m, motion.orientation_xyzw, motion.velocity_mps, motion.body_rates_radps,
-            motion.est_position_m, motion.est_yaw_rad[..., None],
-        )  # fmt: skip
-        self._states: list[list[list[float]]] = np.concatenate(columns, axis=-1).tolist()
+        self._flight = FlightSenses(motion, scenario.frame_s)
+        recorder.unfold["states"] = self._unfold_states
         self._busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
@@ -92,7 +89,7 @@ class World:
             self.drain()
             self._frame = frame
             self.now = self.plan.at(env.now)
-            self.air.advance(self.motion.position_m[frame], self.extra_loss_db, list(self.jammers.values()))
+            self.air.advance(self.extra_loss_db if self.extra_loss_db.any() else None, list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
@@ -139,22 +136,25 @@ class World:
         busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
         self._busy_at_s = (self.env.now, busy_s)
         flying = [a.drone for a in self.agents if a.airborne]
-        graph = link_graph(self.air.snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
-        linked = sum(1 for drone in graph if graph.degree(drone))
-        self._recorder.rows["medium"].append((self.env.now, busy, linked))
+        linked = linked_drones(self.air.snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
+        self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
 
     def _write(self, frame: int) -> None:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
-        rows["states"].extend(
-            (
-                now_s, agent.drone, *self._states[frame][agent.drone][:TRUE_STATE], batteries.soc[agent.drone],
-                batteries.voltage_v[agent.drone], batteries.current_a[agent.drone], agent.airborne,
-            )
-            for agent in self.agents
-        )  # fmt: skip
-        region, target = self.now.region, self.now.target_xy
-        disc = (NAN, NAN, NAN) if region is None else (region.x_m, region.y_m, region.radius_m)
-        rows["mission"].append((now_s, self.now.phase, *disc, *((NAN, NAN) if target is None else target)))
+        airborne = [agent.airborne for agent in self.agents]
+        rows["states"].append(
+            (now_s, frame, batteries.soc.copy(), batteries.voltage_v.copy(), batteries.current_a.copy(), airborne)
+        )
+        phase, region, target = self.now
+        rows["mission"].append((now_s, phase, *(region or _NO_DISC), *(target or _NOWHERE)))
+
+    def _unfold_states(self, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
+        now_s, frames, *changing = zip(*rows, strict=True)
+        n, m = len(self.agents), self.motion
+        known = (m.position_m, m.orientation_xyzw, m.velocity_mps, m.body_rates_radps)
+        flown = np.concatenate([states[list(frames)] for states in known], axis=-1).reshape(len(rows) * n, -1)
+        return [np.repeat(now_s, n), np.tile(range(n), len(rows)), *flown.T, *(np.concatenate(c) for c in changing)]
 
     # --- what one drone knows of itself ----------------------------------------------------------
 
@@ -169,15 +169,8 @@ class _OwnSenses:
     def __init__(self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> None:
         self._world, self._drone, self._count_boxes = world, drone, count_boxes
 
-    def capture(self, frame: int) -> Capture:
-        world, i = self._world, self._drone
-        x, y, z, qx, qy, qz, qw, _, _, _, _, _, _, est_x, est_y, est_z, est_yaw = world._states[frame][i]
-        t_s = frame * world._scenario.frame_s  # sensors trigger with the frame, the drone's phase comes after
-        return Capture(i, t_s, (x, y, z), (qx, qy, qz, qw), (est_x, est_y, est_z), est_yaw)
-
-    def velocity_mps(self, frame: int) -> tuple[float, float, float]:
-        state = self._world._states[frame][self._drone]
-        return state[7], state[8], state[9]
+    def sense(self, frame: int) -> Sensed:
+        return self._world._flight.at(frame)[self._drone]
 
     def platform(self) -> Platform:
         """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
@@ -186,8 +179,8 @@ class _OwnSenses:
 
     def task(self) -> Task:
         world = self._world
-        x_m, y_m, z_m = world._states[world._frame][self._drone][:3]
-        return world.now.task((x_m, y_m), footprint_radius_m(z_m))
+        sensed = world._flight.at(world._frame)[self._drone]
+        return world.now.task(sensed.capture.position_m, sensed.footprint_radius_m)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:

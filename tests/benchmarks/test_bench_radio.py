@@ -17,12 +17,12 @@ FRAMES = 1200
 
 def _sortie(samples: int) -> int:
     env = simpy.Environment()
-    air = Air(env, Radio(), 5, seed=1, frame_s=0.1)
+    air = Air(env, Radio(), np.broadcast_to(CROSS_M, (FRAMES, 5, 3)), seed=1, frame_s=0.1)
     done: list[Any] = []
 
     def frames() -> simpy.events.ProcessGenerator:
         for _ in range(FRAMES):
-            air.advance(CROSS_M)
+            air.advance()
             for i in range(5):
                 air.broadcast(i, 208, done.append)
             yield env.timeout(0.03)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 
 import pytest
 from fleet_examples import DESCRIPTOR
@@ -112,7 +111,7 @@ def test_older_than_the_newest_is_a_replay_and_every_sender_counts_alone() -> No
     inbox = Inbox()
     assert isinstance(inbox.accept(open_datagram(sealed(counter=9), KEYS)), Descriptor)
     assert inbox.accept(open_datagram(sealed(counter=8), KEYS)) is DropReason.REPLAYED
-    other = encode_descriptor(replace(DESCRIPTOR, agent_id=4))
+    other = encode_descriptor(DESCRIPTOR._replace(agent_id=4))
     assert isinstance(inbox.accept(open_datagram(sealed(other, counter=1), KEYS)), Descriptor)
     assert (inbox.highest(3, 7), inbox.highest(4, 7), inbox.highest(5, 7)) == (9, 1, 0)
 

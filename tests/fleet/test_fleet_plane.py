@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet import gate
-from fleet.coverage import CELL_M, CoverageMap, footprint_radius_m, pack_grid, unpack_grid
+from fleet.coverage import CELL_M, RANGE_M, footprint_radius_m, pack_grid, survey, unpack_grid
 from fleet.gate import Gate, make_payload
 from fleet.staleness import LinkHealth, cap_by_age, health
 from fleet.wire import DIRECTIVE_BYTES
@@ -65,7 +64,7 @@ def test_age_only_reduces(rung: Representation, rate_hz: float, rho: float, a_s:
 
 
 def sends(gate_: Gate, rate_hz: float, seconds: float = 10.0, frame_s: float = 0.1) -> int:
-    gate_.enforce(replace(FULL, rate_hz=rate_hz))
+    gate_.enforce(FULL._replace(rate_hz=rate_hz))
     return sum(len(gate_.due(k * frame_s + 0.033)) for k in range(round(seconds / frame_s)))
 
 
@@ -81,16 +80,16 @@ def test_repeating_a_directive_restarts_no_timer() -> None:
     g = Gate()
     sent = 0
     for k in range(100):
-        g.enforce(replace(FULL, rate_hz=2.0))  # every frame anew
+        g.enforce(FULL._replace(rate_hz=2.0))  # every frame anew
         sent += len(g.due(k * 0.1))
     assert sent == 20
 
 
 def test_a_changed_rate_counts_from_the_last_send() -> None:
     g = Gate()
-    g.enforce(replace(FULL, rate_hz=2.0))
+    g.enforce(FULL._replace(rate_hz=2.0))
     assert len(g.due(0.0)) == 1
-    g.enforce(replace(FULL, rate_hz=5.0))
+    g.enforce(FULL._replace(rate_hz=5.0))
     assert [len(g.due(t)) for t in (0.1, 0.2)] == [0, 1]
 
 
@@ -98,7 +97,7 @@ def test_links_are_served_by_ascending_peer_and_none_sends_nothing() -> None:
     g = Gate()
     for peer in (3, 1, 2):
         g.enforce(
-            replace(FULL, destination=peer, representation=Representation.NONE if peer == 2 else FULL.representation)
+            FULL._replace(destination=peer, representation=Representation.NONE if peer == 2 else FULL.representation)
         )
     assert [d.destination for d in g.due(0.0)] == [1, 3]
 
@@ -106,8 +105,8 @@ def test_links_are_served_by_ascending_peer_and_none_sends_nothing() -> None:
 def test_duty_is_the_highest_asked_for() -> None:
     g = Gate()
     assert g.duty_percent == 100
-    g.enforce(replace(FULL, duty_percent=20))
-    g.enforce(replace(FULL, destination=2, duty_percent=50))
+    g.enforce(FULL._replace(duty_percent=20))
+    g.enforce(FULL._replace(destination=2, duty_percent=50))
     assert g.duty_percent == 50
 
 
@@ -118,11 +117,11 @@ OVERHEAD = gate.HEADER_BYTES + DIRECTIVE_BYTES
     ("directive", "cells", "content"),
     [
         (FULL, 4096, 655_360),  # a whole map needs no index
-        (replace(FULL, rho=0.25), 1024, 163_840 + 512),  # bitmap
-        (replace(FULL, rho=0.02), 81, 12_960 + 122),  # list of 12-bit indices
-        (replace(FULL, representation=Representation.RAW), 0, 5_400_000),
-        (replace(FULL, representation=Representation.DETECTIONS), 0, 40 * 24),
-        (replace(FULL, representation=Representation.TRACKS), 0, 12 * 20),
+        (FULL._replace(rho=0.25), 1024, 163_840 + 512),  # bitmap
+        (FULL._replace(rho=0.02), 81, 12_960 + 122),  # list of 12-bit indices
+        (FULL._replace(representation=Representation.RAW), 0, 5_400_000),
+        (FULL._replace(representation=Representation.DETECTIONS), 0, 40 * 24),
+        (FULL._replace(representation=Representation.TRACKS), 0, 12 * 20),
     ],
 )
 def test_payloads_have_the_papers_sizes(directive: Directive, cells: int, content: int) -> None:
@@ -133,23 +132,23 @@ def test_payloads_have_the_papers_sizes(directive: Directive, cells: int, conten
 
 def test_a_region_confines_cells_and_boxes() -> None:
     disc = Disc(10.0, 5.0, 32.0)
-    payload = make_payload(replace(FULL, roi=disc), *ORIGIN, lambda roi: 0)
+    payload = make_payload(FULL._replace(roi=disc), *ORIGIN, lambda roi: 0)
     assert payload is not None
     assert payload.cells == pytest.approx(314, abs=6), "π 32² / 3.2² cells (FACTS §1)"
     asked: list[Disc | None] = []
     make_payload(
-        replace(FULL, representation=Representation.DETECTIONS, roi=disc), *ORIGIN, lambda r: asked.append(r) or 3
+        FULL._replace(representation=Representation.DETECTIONS, roi=disc), *ORIGIN, lambda r: asked.append(r) or 3
     )
     assert asked == [disc]
 
 
 def test_nothing_is_sent_where_the_region_is_out_of_sight() -> None:
-    assert make_payload(replace(FULL, roi=Disc(900, 0, 32)), *ORIGIN, lambda roi: 0) is None
-    assert make_payload(replace(FULL, representation=Representation.NONE), *ORIGIN, lambda roi: 9) is None
+    assert make_payload(FULL._replace(roi=Disc(900, 0, 32)), *ORIGIN, lambda roi: 0) is None
+    assert make_payload(FULL._replace(representation=Representation.NONE), *ORIGIN, lambda roi: 9) is None
 
 
 def test_compact_payloads_go_reliably() -> None:
-    kinds = {r: make_payload(replace(FULL, representation=r), *ORIGIN, lambda roi: 1) for r in list(Representation)[1:]}
+    kinds = {r: make_payload(FULL._replace(representation=r), *ORIGIN, lambda roi: 1) for r in list(Representation)[1:]}
     assert {r.name: p.reliable for r, p in kinds.items() if p} == {
         "TRACKS": True, "DETECTIONS": True, "FEATURES": False, "RAW": False,
     }  # fmt: skip
@@ -172,17 +171,32 @@ def test_grid_packs_into_64_bytes_and_back(states: list[int]) -> None:
 
 
 def test_what_was_seen_is_novel_once() -> None:
-    look = CoverageMap()
-    first, novel = look.look(0.0, 0.0, 42.0)
-    assert novel
-    again, novel = look.look(0.0, 0.0, 42.0)
-    assert not novel
+    (first, novel), (again, seen), (moved, anew) = survey([0.0, 0.0, 60.0], [0.0, 0.0, 0.0], [42.0] * 3)
+    assert (novel, seen, anew) == (True, False, True)
     grids = [unpack_grid(g) for g in (first, again)]
     area = np.count_nonzero(grids[0] == Coverage.NOVEL) * CELL_M**2
     assert area == pytest.approx(math.pi * 42.0**2, rel=0.15)
     assert np.array_equal(grids[0] == Coverage.NOVEL, grids[1] == Coverage.WELL)
     assert grids[0][0, 0] == Coverage.UNSEEN, "the square's corner is beyond the range"
     assert np.count_nonzero(grids[1] == Coverage.POOR) > 100
-    moved, novel = look.look(60.0, 0.0, 42.0)
-    assert novel
-    assert Coverage.WELL in unpack_grid(moved)
+    assert {Coverage.WELL, Coverage.NOVEL} <= set(unpack_grid(moved).ravel().tolist())
+
+
+@given(st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(0, 60)), min_size=1, max_size=12))
+def test_a_survey_is_its_looks_one_after_the_other(looks: list[tuple[float, float, float]]) -> None:
+    """Against the plain way: a cell at a time, and a memory of what was seen."""
+    seen: set[tuple[int, int]] = set()
+    for (x_m, y_m, radius_m), (grid, novel) in zip(looks, survey(*zip(*looks, strict=True)), strict=True):
+        expected, fresh = np.zeros((16, 16), np.uint8), False
+        west, south = math.floor(x_m / CELL_M) - 8, math.floor(y_m / CELL_M) - 8
+        for row in range(16):
+            for column in range(16):
+                cell = (south + row, west + column)
+                away_m = np.hypot((cell[1] + 0.5) * CELL_M - x_m, (cell[0] + 0.5) * CELL_M - y_m)
+                if away_m <= radius_m:
+                    expected[row, column] = Coverage.WELL if cell in seen else Coverage.NOVEL
+                    fresh |= cell not in seen
+                    seen.add(cell)
+                elif away_m <= RANGE_M:
+                    expected[row, column] = Coverage.POOR
+        assert (unpack_grid(grid).tolist(), novel) == (expected.tolist(), fresh)

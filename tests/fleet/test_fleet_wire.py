@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,13 +105,13 @@ def test_directive_survives_the_wire(d: Directive) -> None:
 
 def test_sizes_of_the_paper() -> None:
     assert len(encode_descriptor(DESCRIPTOR)) == descriptor_bytes(5) == 180
-    assert len(encode_descriptor(replace(DESCRIPTOR, priority_target_ids=(7,)))) == descriptor_bytes(5, 1) == 182
+    assert len(encode_descriptor(DESCRIPTOR._replace(priority_target_ids=(7,)))) == descriptor_bytes(5, 1) == 182
     assert descriptor_bytes(100) == 560
     assert len(encode_directive(DIRECTIVE)) == DIRECTIVE_BYTES == 36
 
 
 def test_floats_are_rounded_to_32_bits_and_the_reason_stays_at_home() -> None:
-    back = decode_directive(encode_directive(replace(DIRECTIVE, rho=0.1, reason="because")))
+    back = decode_directive(encode_directive(DIRECTIVE._replace(rho=0.1, reason="because")))
     assert back.rho == float(np.float32(0.1)) != 0.1
     assert back.reason == ""
 
@@ -132,16 +131,16 @@ def test_floats_are_rounded_to_32_bits_and_the_reason_stays_at_home() -> None:
 )
 def test_past_a_kilobyte_it_is_refused_with_the_field_named(changes: dict[str, tuple], message: str) -> None:
     with pytest.raises(DescriptorTooLarge) as caught:
-        encode_descriptor(replace(DESCRIPTOR, **changes))
+        encode_descriptor(DESCRIPTOR._replace(**changes))
     assert str(caught.value) == message
 
 
 def test_the_largest_fleet_that_fits() -> None:
-    largest = replace(DESCRIPTOR, peer_goodput_mbps=(1.0,) * 215)
+    largest = DESCRIPTOR._replace(peer_goodput_mbps=(1.0,) * 215)
     assert len(encode_descriptor(largest)) == 1024
     assert decode_descriptor(encode_descriptor(largest)) == largest
     with pytest.raises(DescriptorTooLarge):
-        encode_descriptor(replace(largest, priority_target_ids=(1,)))
+        encode_descriptor(largest._replace(priority_target_ids=(1,)))
 
 
 @pytest.mark.parametrize(
@@ -156,13 +155,13 @@ def test_the_largest_fleet_that_fits() -> None:
 )
 def test_what_the_wire_cannot_hold_is_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        encode_descriptor(replace(DESCRIPTOR, **changes))
+        encode_descriptor(DESCRIPTOR._replace(**changes))
     with pytest.raises(ValueError, match="directive 1→300 does not fit"):
-        encode_directive(replace(DIRECTIVE, destination=300))
+        encode_directive(DIRECTIVE._replace(destination=300))
 
 
 GOOD = encode_descriptor(DESCRIPTOR)
-NONE = encode_descriptor(replace(DESCRIPTOR, region=None))
+NONE = encode_descriptor(DESCRIPTOR._replace(region=None))
 NAN = struct.pack("<f", math.nan)
 
 
@@ -287,4 +286,4 @@ def test_layout_aligns_from_after_the_header() -> None:
 def test_disc_of_zero_radius_is_no_region() -> None:
     """A degenerate region cannot be told from none on the wire, so it is refused where it arrives."""
     with pytest.raises(MalformedDatagram, match="neither a disc nor none"):
-        decode_descriptor(encode_descriptor(replace(DESCRIPTOR, region=Disc(0.0, 0.0, 0.0))))
+        decode_descriptor(encode_descriptor(DESCRIPTOR._replace(region=Disc(0.0, 0.0, 0.0))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +11,7 @@ from policies.contract import Directive, Disc, Representation
 from policies.damping import LinkState, damp
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
-HALF = replace(FULL, rate_hz=5.0, reason="half")
+HALF = FULL._replace(rate_hz=5.0, reason="half")
 BOXES = Directive(0, 1, Representation.DETECTIONS, 0.0, None, 2.0, reason="boxes")
 NOTHING = Directive(0, 1)
 DWELL_S = 1.0
@@ -29,7 +28,7 @@ def run(start: Directive, asked: list[Directive], step_s: float = 0.1) -> list[D
 def test_a_repeated_directive_changes_nothing_and_restarts_nothing() -> None:
     state = LinkState(FULL)
     assert damp(state, FULL, 0.0, DWELL_S) is state
-    assert damp(state, replace(FULL, reason="other words"), 5.0, DWELL_S) is state
+    assert damp(state, FULL._replace(reason="other words"), 5.0, DWELL_S) is state
     waiting = damp(LinkState(BOXES), FULL, 0.0, DWELL_S)
     assert damp(waiting, FULL, 0.5, DWELL_S) is waiting, "asking again must not restart the dwell"
     assert damp(waiting, FULL, 1.0, DWELL_S).enforced == FULL
@@ -49,25 +48,25 @@ def test_a_passing_change_does_not_switch() -> None:
 
 
 def test_a_mixed_change_is_lowered_where_it_is_lower() -> None:
-    asked = replace(FULL, rate_hz=2.0)
-    first, *_, last = run(replace(FULL, rho=0.1), [asked] * 11)
+    asked = FULL._replace(rate_hz=2.0)
+    first, *_, last = run(FULL._replace(rho=0.1), [asked] * 11)
     assert (first.rho, first.rate_hz) == (0.1, 2.0)
     assert last == asked
 
 
 def test_a_region_confines_at_once_moves_freely_and_widens_late() -> None:
     here, there, wide = Disc(0, 0, 32), Disc(5, 0, 32), Disc(5, 0, 64)
-    confined = replace(FULL, roi=here)
+    confined = FULL._replace(roi=here)
     assert run(FULL, [confined]) == [confined]
-    assert run(confined, [replace(FULL, roi=there)]) == [replace(FULL, roi=there)]
-    assert run(confined, [replace(FULL, roi=wide)])[0].roi == there
+    assert run(confined, [FULL._replace(roi=there)]) == [FULL._replace(roi=there)]
+    assert run(confined, [FULL._replace(roi=wide)])[0].roi == there
     released = run(confined, [FULL] * 11)
     assert [d.roi for d in released] == [here] * 10 + [None]
 
 
 def test_the_reason_in_force_is_the_one_that_decided() -> None:
-    confined = replace(BOXES, roi=Disc(0, 0, 32))
-    asked = replace(FULL, roi=Disc(1, 0, 32))
+    confined = BOXES._replace(roi=Disc(0, 0, 32))
+    asked = FULL._replace(roi=Disc(1, 0, 32))
     (waiting,) = run(confined, [asked])
     assert waiting.roi == Disc(1, 0, 32)
     assert waiting.reason == "boxes", "the disc moved, but full features are still waiting"
@@ -109,15 +108,15 @@ def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Direc
 
 
 def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
-    resting = replace(NOTHING, duty_percent=20)
+    resting = NOTHING._replace(duty_percent=20)
     assert run(NOTHING, [resting]) == [resting]
     assert [d.duty_percent for d in run(resting, [NOTHING] * 11)] == [20] * 10 + [100]
-    (first,) = run(NOTHING, [replace(FULL, duty_percent=20)])
+    (first,) = run(NOTHING, [FULL._replace(duty_percent=20)])
     assert (first.representation, first.duty_percent) == (Representation.NONE, 20)
 
 
 def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
-    state = LinkState(replace(FULL, roi=Disc(0, 0, 32)))
-    assert damp(state, replace(FULL, roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
-    assert damp(state, replace(FULL, roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
-    assert damp(state, replace(FULL, roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)
+    state = LinkState(FULL._replace(roi=Disc(0, 0, 32)))
+    assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
+    assert damp(state, FULL._replace(roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
+    assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from policies_examples import fleet_of
 
@@ -58,15 +56,15 @@ def test_only_the_two_most_overlapping_peers_get_anything() -> None:
 def test_jitter_of_a_metre_does_not_reorder_peers() -> None:
     view = fleet_of(5)
     near = dict(view.descriptors)
-    near[3] = replace(near[3], position_m=(15.0, 0.5, 60.0))
-    near[2] = replace(near[2], position_m=(15.5, 0.0, 60.0))
+    near[3] = near[3]._replace(position_m=(15.0, 0.5, 60.0))
+    near[2] = near[2]._replace(position_m=(15.5, 0.0, 60.0))
     sent = [d.destination for d in worked(FleetView(0, 0.1, near, view.age_s)) if d.rate_hz]
     assert sent == [1, 2], "overlaps within a step tie, and ties go round by id"
 
 
 def test_drones_in_one_place_do_not_all_choose_the_same_peers() -> None:
     view = fleet_of(5)
-    here = {i: replace(d, position_m=(0.0, 0.0, 60.0)) for i, d in view.descriptors.items()}
+    here = {i: d._replace(position_m=(0.0, 0.0, 60.0)) for i, d in view.descriptors.items()}
     chosen = {i: peers_by_overlap(FleetView(i, 0.1, here, view.age_s))[:2] for i in here}
     assert chosen == {0: [1, 2], 1: [2, 3], 2: [3, 4], 3: [4, 0], 4: [0, 1]}
 
@@ -103,7 +101,7 @@ def test_a_circle_within_another_is_covered() -> None:
 )
 def test_a_broken_directive_is_named(change: dict[str, object], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
-        check_directives([replace(Directive(0, 1), **change)], fleet_of(5))
+        check_directives([Directive(0, 1)._replace(**change)], fleet_of(5))
 
 
 def test_two_directives_for_one_link_are_refused() -> None:

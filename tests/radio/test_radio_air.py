@@ -11,6 +11,7 @@ import pytest
 import simpy
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from radio_examples import CROSS_M, still
 from scipy import stats
 
 from radio import Air, Status, Transmission
@@ -18,7 +19,6 @@ from radio.rates import RATES_MBPS
 from radio.transmission import losses
 from scenarios.schema import Radio
 
-CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60], [40, 0, 60]], float)
 DEFAULT = Radio()
 STILL = Radio(shadowing_sigma_db=0.0)
 
@@ -31,7 +31,9 @@ class Flight:
     ) -> None:
         self.env = simpy.Environment()
         self.n = n
-        self.air = Air(self.env, config, n, seed=seed, replication=replication, frame_s=0.1, publish_spread=spread)
+        self.air = Air(
+            self.env, config, still(CROSS_M[:n]), seed=seed, replication=replication, frame_s=0.1, publish_spread=spread
+        )
         self.rows: list[Transmission] = []
         self.heard: list[tuple[float, int, tuple[int, ...]]] = []
         self.extra = np.zeros((n, n))
@@ -58,7 +60,7 @@ class Flight:
             for k in range(round(duration_s * 10)):
                 if k:
                     yield self.env.timeout(k / 10 - self.env.now)
-                self.air.advance(CROSS_M[: self.n], self.extra)
+                self.air.advance(self.extra)
                 tick(k / 10)
 
         self.env.process(frames())
@@ -210,7 +212,7 @@ def test_a_silenced_drone_neither_sends_nor_hears() -> None:
 
 def test_what_is_in_flight_at_the_end_is_told() -> None:
     f = Flight(STILL, 2)
-    f.air.advance(CROSS_M[:2])
+    f.air.advance()
     f.send(0, 1, 2_000_000)
     f.send(0, 1, 1000, kind="d")
     f.env.run(until=0.005)
@@ -402,7 +404,7 @@ def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
 
 def test_arguments_out_of_bounds_are_refused() -> None:
     f = Flight(STILL, 2)
-    f.air.advance(CROSS_M[:2])
+    f.air.advance()
     with pytest.raises(ValueError, match=r"sender is 0 and receiver 0, must be two drones in \[0, 1\]"):
         f.send(0, 0, 1)
     with pytest.raises(ValueError, match="payload_bytes is 0, must be at least 1"):

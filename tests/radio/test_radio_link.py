@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from radio_examples import CROSS_M, still
 from scipy import integrate, stats
 
 from radio.channel import Channel, free_space_loss_db, noise_dbm, path_loss_db
 from radio.rates import LEGACY_RATES_MBPS, NO_LINK_PER, RATES_MBPS, choose_mcs, group_mcs, per, rate_table, rescale
 from scenarios.schema import Radio
-
-CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60], [40, 0, 60]], float)
 
 
 @pytest.mark.parametrize(
@@ -37,39 +36,39 @@ def test_noise_floor(bandwidth_mhz: int, dbm: float) -> None:
 
 
 def test_snr_without_shadowing_is_the_link_budget() -> None:
-    channel = Channel(Radio(shadowing_sigma_db=0.0), 2, 1, 0, 0.1)
-    snr = channel.advance(CROSS_M[:2])
+    channel = Channel(Radio(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
+    snr = channel.advance()
     assert snr[0, 1] == pytest.approx(20.0 - float(path_loss_db(20.0, 5.2, 2.1)) - noise_dbm(80, 7.0))
     assert np.isnan(np.diag(snr)).all()
     extra = np.array([[0.0, 30.0], [0.0, 0.0]])
-    again = channel.advance(CROSS_M[:2], extra)
+    again = channel.advance(extra)
     np.testing.assert_allclose((snr - again)[[0, 1], [1, 0]], [30.0, 0.0], atol=1e-9)
 
 
 def test_a_jammer_adds_its_received_power_to_the_noise() -> None:
-    channel = Channel(Radio(shadowing_sigma_db=0.0), 2, 1, 0, 0.1)
-    clear = channel.advance(CROSS_M[:2])
+    channel = Channel(Radio(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
+    clear = channel.advance()
     where = (20.0, 50.0, 60.0)
     received = [20.0 - float(path_loss_db(d, 5.2, 2.1)) for d in (np.hypot(20, 50), 50.0)]
-    jammed = channel.advance(CROSS_M[:2], None, [(where, 20.0)])
+    jammed = channel.advance(None, [(where, 20.0)])
     for sender, receiver in ((0, 1), (1, 0)):
         rise = 10 * np.log10(1 + 10 ** ((received[receiver] - channel.noise_dbm) / 10))
         assert clear[sender, receiver] - jammed[sender, receiver] == pytest.approx(rise)
 
 
 def _shadowing(frames: int) -> np.ndarray:
-    channel = Channel(Radio(), 6, 3, 0, 0.1)
+    channel = Channel(Radio(), still(CROSS_M), 3, 0, 0.1)
     rows = []
     for _ in range(frames):
-        channel.advance(CROSS_M)
+        channel.advance()
         rows.append(channel.shadow_db[np.triu_indices(6, 1)])
     return np.array(rows)
 
 
 def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> None:
-    channel = Channel(Radio(), 6, 3, 0, 0.1)
-    channel.advance(CROSS_M)
-    channel.advance(CROSS_M)
+    channel = Channel(Radio(), still(CROSS_M), 3, 0, 0.1)
+    channel.advance()
+    channel.advance()
     np.testing.assert_array_equal(channel.shadow_db, channel.shadow_db.T)
     x = _shadowing(12_000)  # 1200 s × 15 pairs, about 2000 independent values
     assert x.std() == pytest.approx(3.5, rel=0.08)
@@ -78,10 +77,10 @@ def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> N
 
 
 def test_fading_is_rician_in_mean_and_outage() -> None:
-    channel = Channel(Radio(rician_k_db=8.0), 6, 3, 0, 0.1)
+    channel = Channel(Radio(rician_k_db=8.0), still(CROSS_M), 3, 0, 0.1)
     gains = []
     for _ in range(4000):
-        channel.advance(CROSS_M)
+        channel.advance()
         gains.append(10 ** (channel.fade_db[~np.eye(6, dtype=bool)] / 10))
     envelope = np.sqrt(np.array(gains).ravel())  # 120,000 values
     k = 10**0.8
@@ -94,26 +93,26 @@ def test_fading_is_rician_in_mean_and_outage() -> None:
 
 
 def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None:
-    five, six = Channel(Radio(), 5, 9, 2, 0.1), Channel(Radio(), 6, 9, 2, 0.1)
+    five, six = Channel(Radio(), still(CROSS_M[:5]), 9, 2, 0.1), Channel(Radio(), still(CROSS_M), 9, 2, 0.1)
     for _ in range(1100):  # past the first block of draws
-        a, b = five.advance(CROSS_M[:5]), six.advance(CROSS_M)
+        a, b = five.advance(), six.advance()
         np.testing.assert_array_equal(a, b[:5, :5])
         np.testing.assert_array_equal(five.fade_db, six.fade_db[:5, :5])
         np.testing.assert_array_equal(five.group_reach_bytes, six.group_reach_bytes[:5, :5])
-    other = Channel(Radio(), 5, 9, 3, 0.1)
-    assert not np.array_equal(other.advance(CROSS_M[:5]), a, equal_nan=True)
+    other = Channel(Radio(), still(CROSS_M[:5]), 9, 3, 0.1)
+    assert not np.array_equal(other.advance(), a, equal_nan=True)
 
 
 def test_group_frames_arrive_as_often_as_their_per_says() -> None:
     config = Radio(shadowing_sigma_db=0.0, rician_k_db=40.0)
-    channel = Channel(config, 2, 1, 0, 0.1)
+    channel = Channel(config, still(CROSS_M[:2]), 1, 0, 0.1)
     loss_db = 20.0 - float(path_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) + 0.94 - 0.1
     extra = np.full((2, 2), loss_db)  # leaves 0.1 dB above s50 in the primary 20 MHz
     fade_db = stats.norm(0, 10 / np.log(10) * np.sqrt(2 / 1e4))  # what K = 40 dB leaves of it
     for length in (304, 1458):
         heard, again = [], []
         for _ in range(6000):
-            channel.advance(CROSS_M[:2], extra)
+            channel.advance(extra)
             heard.append(channel.group_reach_bytes[0, 1] >= length)
             again.append(channel.reach_again(0, 1)[1] >= length)
         expected = integrate.quad(
@@ -123,18 +122,41 @@ def test_group_frames_arrive_as_often_as_their_per_says() -> None:
         assert np.mean(again) == pytest.approx(expected, abs=0.025)
 
 
+def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:
+    clear, disturbed = (Channel(Radio(), still(CROSS_M), 4, 0, 0.1) for _ in range(2))
+    for frame in range(30):
+        expected = clear.advance()
+        if frame % 3 == 1:
+            assert np.nanmax(disturbed.advance(np.full((6, 6), 10.0)) - expected) == pytest.approx(-10.0)
+            assert not np.array_equal(disturbed.group_reach_bytes, clear.group_reach_bytes, equal_nan=True)
+        else:
+            np.testing.assert_array_equal(disturbed.advance(), expected)
+            np.testing.assert_array_equal(disturbed.group_reach_bytes, clear.group_reach_bytes)
+
+
+def test_a_flight_of_many_blocks_is_one_flight() -> None:
+    """Blocks hold fewer frames the more drones there are; a drone far off changes nothing but their length."""
+    path = np.cumsum(np.full((2100, 2, 3), 0.01), axis=0) + CROSS_M[:2]
+    crowd = np.concatenate([path, np.full((2100, 22, 3), 5000.0)], axis=1)
+    two, many = Channel(Radio(), path, 1, 0, 0.1), Channel(Radio(), crowd, 1, 0, 0.1)
+    for _ in range(2100):
+        np.testing.assert_array_equal(two.advance(), many.advance()[:2, :2])
+
+
 def test_wrong_shapes_are_refused() -> None:
-    channel = Channel(Radio(), 2, 1, 0, 0.1)
-    with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(2, 3\)"):
-        channel.advance(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(frames, drones, 3\)"):
+        Channel(Radio(), np.zeros((3, 3)), 1, 0, 0.1)
+    with pytest.raises(ValueError, match=r"positions_m has shape \(9, 0, 3\), must be \(frames, drones, 3\)"):
+        Channel(Radio(), np.zeros((9, 0, 3)), 1, 0, 0.1)
     with pytest.raises(ValueError, match="positions_m holds a value that is not finite"):
-        channel.advance(np.full((2, 3), np.nan))
-    with pytest.raises(ValueError, match=r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"):
-        channel.advance(np.zeros((2, 3)), np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="n_drones is 0, must be at least 1"):
-        Channel(Radio(), 0, 1, 0, 0.1)
+        Channel(Radio(), np.full((9, 2, 3), np.nan), 1, 0, 0.1)
     with pytest.raises(ValueError, match=r"frame_s is 0\.0, must be > 0"):
-        Channel(Radio(), 1, 1, 0, 0.0)
+        Channel(Radio(), np.zeros((9, 1, 3)), 1, 0, 0.0)
+    channel = Channel(Radio(), np.zeros((1, 2, 3)), 1, 0, 0.1)
+    with pytest.raises(ValueError, match=r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"):
+        channel.advance(np.zeros((3, 3)))
+    with pytest.raises(IndexError, match="the flight has 1 frames"):
+        channel.advance()
 
 
 # --- rates -----------------------------------------------------------------------------------------
