@@ -177,6 +177,7 @@ class Renderer:
         if not captures:
             return out
         window = self._window_over(captures)
+        gain = self.scene.config.brightness
         for t_s in dict.fromkeys(c.t_s for c in captures):
             here = [i for i, c in enumerate(captures) if c.t_s == t_s]
             with window.with_cars(self.scene.moving_cars(t_s)):
@@ -184,6 +185,8 @@ class Renderer:
                 def one(i: int) -> None:
                     with torch.inference_mode():
                         image = _cast(window, captures[i])
+                        if gain != 1.0:
+                            image = (image * gain).to(torch.int16)
                         image = image + _noise(self.seed, captures[i], image.numel()).view_as(image)
                         out[i] = image.clamp_(0, 255).to(torch.uint8).view(out.shape[1:]).numpy()
 

@@ -33,9 +33,8 @@ RES_M = 0.32
 """Raster resolution, m a pixel."""
 TILE_PX = 320
 TILE_M = RES_M * TILE_PX
-_PAD_PX = 80  # 25.6 m around a tile, so that shadows cross its seams
-_SUN = (0.55, 0.35)  # shadow displacement (x, y) in metres per metre of height
-_SHADE = 0.6  # light that is left in a shadow
+_PAD_PX = 80  # 25.6 m around a tile at least, so that shadows cross its seams
+_SHADE = 0.6  # light that is left in a shadow under a clear sky
 
 CAR_COLOURS: Bytes = np.array(
     [
@@ -53,6 +52,34 @@ CAR_COLOURS: Bytes = np.array(
     dtype=np.uint8,
 )
 _COLOUR_SHARE = np.cumsum([0.24, 0.2, 0.14, 0.16, 0.08, 0.07, 0.03, 0.03, 0.03, 0.02])
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """What lots of one style look like."""
+
+    lot_m: float
+    """A lot's side, roughly: as many as fit between the pavements."""
+    fill: tuple[float, float]
+    """The part of its lot's side that a house takes, least and most."""
+    height: float
+    """Factor on the scene's mean height of buildings."""
+    gardens: int
+    """Trees that an empty lot may hold; built lots too where `green`."""
+    green: bool
+    lawn: tuple[tuple[int, int, int], tuple[int, int, int]]
+    """The two colours between which a lot's ground lies."""
+    wall: tuple[tuple[int, int, int], tuple[int, int, int]]
+    """The same of its roof."""
+
+
+STYLES = {
+    "town": Style(20.0, (0.5, 0.9), 1.0, 1, False, ((88, 118, 62), (150, 142, 120)), ((142, 78, 62), (172, 170, 168))),
+    "old_town": Style(12.0, (0.75, 1.0), 1.1, 1, False, ((138, 130, 116), (158, 152, 140)), ((150, 74, 52), (132, 92, 74))),
+    "suburb": Style(26.0, (0.3, 0.5), 0.7, 3, True, ((76, 122, 56), (112, 132, 74)), ((120, 84, 70), (96, 96, 100))),
+    "yard": Style(48.0, (0.55, 0.9), 0.9, 0, False, ((118, 118, 116), (146, 142, 134)), ((150, 154, 158), (186, 188, 190))),
+}  # fmt: skip
+"""By the names of `Scene.style`."""
 
 
 def zigzag(index: int) -> int:
@@ -105,16 +132,18 @@ def block(scene: Scene, i: int, j: int) -> Block:
     x0, y0 = i * size, j * size
     inner = size - 2 * PAVEMENT_M
 
-    n = max(1, int(inner // 20.0))
+    style = STYLES[scene.style]
+    n = max(1, int(inner // style.lot_m))
     pitch = inner / n
     gx, gy = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     u = rng.random((n * n, 8))
     lx = x0 + PAVEMENT_M + gx.ravel() * pitch
     ly = y0 + PAVEMENT_M + gy.ravel() * pitch
     lots = np.stack([lx, ly, lx + pitch, ly + pitch, u[:, 7]], axis=1)
-    w, d = (0.5 + 0.4 * u[:, 1]) * pitch, (0.5 + 0.4 * u[:, 2]) * pitch
+    least, span = style.fill[0], style.fill[1] - style.fill[0]
+    w, d = (least + span * u[:, 1]) * pitch, (least + span * u[:, 2]) * pitch
     bx, by = lx + u[:, 3] * (pitch - w), ly + u[:, 4] * (pitch - d)
-    height = np.clip(scene.building_height_m * (0.5 + u[:, 5]), 2.5, 40.0)
+    height = np.clip(scene.building_height_m * style.height * (0.5 + u[:, 5]), 2.5, 40.0)
     built = u[:, 0] < scene.building_density
     buildings = np.stack([bx, by, bx + w, by + d, height, u[:, 6]], axis=1)[built]
 
@@ -157,18 +186,19 @@ def block(scene: Scene, i: int, j: int) -> Block:
         parked.append(row[stands])
         bodies.append(u[stands][:, 4:7])
 
-    u = rng.random((n * n, 6))
-    gardens = np.stack(
-        [
-            lx + (0.2 + 0.6 * u[:, 1]) * pitch,
-            ly + (0.2 + 0.6 * u[:, 2]) * pitch,
-            1.5 + 2.0 * u[:, 3],
-            4 + 5 * u[:, 4],
-            u[:, 5],
-        ],
-        axis=1,
-    )
-    trees.append(gardens[(u[:, 0] < scene.tree_density) & ~built])
+    for _ in range(style.gardens):
+        u = rng.random((n * n, 6))
+        gardens = np.stack(
+            [
+                lx + (0.2 + 0.6 * u[:, 1]) * pitch,
+                ly + (0.2 + 0.6 * u[:, 2]) * pitch,
+                1.5 + 2.0 * u[:, 3],
+                4 + 5 * u[:, 4],
+                u[:, 5],
+            ],
+            axis=1,
+        )
+        trees.append(gardens[(u[:, 0] < scene.tree_density) & (style.green | ~built)])
     return Block(lots, buildings, np.concatenate(trees), np.concatenate(parked), draw_bodies(np.concatenate(bodies)))
 
 
@@ -221,8 +251,11 @@ class Town:
         return found
 
     def _rasterise(self, ix: int, iy: int) -> Tile:
-        x0, y0 = ix * TILE_M - _PAD_PX * RES_M, iy * TILE_M - _PAD_PX * RES_M
-        size = TILE_PX + 2 * _PAD_PX
+        style = STYLES[self.scene.style]
+        longest_m = np.hypot(*shadow_m(self.scene)) * min(40.0, 1.5 * self.scene.building_height_m * style.height)
+        pad = max(_PAD_PX, 4 * int(np.ceil(longest_m / RES_M / 4)))
+        x0, y0 = ix * TILE_M - pad * RES_M, iy * TILE_M - pad * RES_M
+        size = TILE_PX + 2 * pad
         side = size * RES_M
         blocks = self.blocks(x0 - 4.0, y0 - 4.0, x0 + side + 4.0, y0 + side + 4.0)
         cx, cy = x0 + (np.arange(size) + 0.5) * RES_M, y0 + (np.arange(size) + 0.5) * RES_M
@@ -236,11 +269,11 @@ class Town:
 
         for b in blocks:
             for lot in b.lots:
-                colour[rect(*lot[:4])] = _mix((88, 118, 62), (150, 142, 120), lot[4])
+                colour[rect(*lot[:4])] = _mix(*style.lawn, lot[4])
             for one in b.buildings:
                 at = rect(*one[:4])
                 height[at] = one[4]
-                colour[at] = _mix((142, 78, 62), (172, 170, 168), one[5])
+                colour[at] = _mix(*style.wall, one[5])
                 inner = rect(one[0] + 0.8, one[1] + 0.8, one[2] - 0.8, one[3] - 0.8)
                 colour[inner] *= 0.88
         trees = [t for b in blocks for t in b.trees]
@@ -252,12 +285,12 @@ class Town:
             height[at] = np.where(inside, dome, height[at])
             leaf = _mix((34, 70, 30), (74, 104, 44), tone) * (1.05 - 0.35 * part[..., None])
             colour[at] = np.where(inside[..., None], leaf, colour[at])
-        light = _shadows(height)
+        light = _shadows(height, self.scene)
         rng = stream(self.scene.seed, 0, (zigzag(ix), zigzag(iy)), "town.texture")
         grain = rng.random((size // 4, size // 4), dtype=np.float32).repeat(4, 0).repeat(4, 1)
         fine = rng.random((size, size), dtype=np.float32)
         colour *= (light * (0.86 + 0.14 * grain + 0.14 * fine))[..., None]
-        cut = slice(_PAD_PX, _PAD_PX + TILE_PX)
+        cut = slice(pad, pad + TILE_PX)
         return Tile(
             np.ascontiguousarray(height[cut, cut]),
             np.clip(colour[cut, cut], 0, 255).astype(np.uint8),
@@ -290,16 +323,28 @@ def _ground(cx: NDArray[Any], cy: NDArray[Any], block_m: float) -> FloatMap:
     return out
 
 
-def _shadows(height: FloatMap) -> FloatMap:
+def shadow_m(scene: Scene) -> tuple[float, float]:
+    """How far a shadow falls (x, y) in metres for each metre of height."""
+    long = 1.0 / np.tan(np.radians(scene.sun_elevation_deg))
+    away = np.radians(scene.sun_azimuth_deg)
+    return float(-long * np.cos(away)), float(-long * np.sin(away))
+
+
+def _shadows(height: FloatMap, scene: Scene) -> FloatMap:
     """Light on each pixel, 1 or the shade: a pixel is dark if something towards the sun stands above the ray to it."""
+    if scene.overcast >= 1.0:
+        return np.ones(height.shape, np.float32)
+    sun_x, sun_y = shadow_m(scene)
     lit = np.full(height.shape, -1e3, np.float32)
     top = float(height.max())
     step_m = 1.0
+    rows, columns = height.shape
     for k in range(1, int(top / step_m) + 1):
-        dx, dy = round(_SUN[0] * k * step_m / RES_M), round(_SUN[1] * k * step_m / RES_M)
-        if dx >= height.shape[1] or dy >= height.shape[0]:
+        dx, dy = round(sun_x * k * step_m / RES_M), round(sun_y * k * step_m / RES_M)
+        if abs(dx) >= columns or abs(dy) >= rows:
             break
-        np.maximum(
-            lit[dy:, dx:], height[: height.shape[0] - dy, : height.shape[1] - dx] - k * step_m, out=lit[dy:, dx:]
-        )
-    return np.where(lit > height + 0.1, np.float32(_SHADE), np.float32(1.0))
+        to = slice(max(dy, 0), rows + min(dy, 0)), slice(max(dx, 0), columns + min(dx, 0))
+        of = slice(max(-dy, 0), rows + min(-dy, 0)), slice(max(-dx, 0), columns + min(-dx, 0))
+        np.maximum(lit[to], height[of] - k * step_m, out=lit[to])
+    shade = np.float32(_SHADE + (1 - _SHADE) * scene.overcast)
+    return np.where(lit > height + 0.1, shade, np.float32(1.0))

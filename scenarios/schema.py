@@ -215,6 +215,10 @@ class Context(Section):
 
 class Scene(Section):
     seed: int = Field(7, ge=0, description="Layout of the town; separate from the sortie's seed.")
+    style: Literal["town", "old_town", "suburb", "yard"] = Field(
+        "town",
+        description="Lots and houses: a town's, a dense old town's, a suburb's with gardens, a works yard's halls.",
+    )
     block_m: float = Field(80.0, ge=40, le=400, description="Distance between parallel roads.")
     building_density: float = Field(0.6, ge=0, le=1, description="Fraction of building lots that are built on.")
     building_height_m: float = Field(10.0, ge=3, le=25, description="Mean height of buildings.")
@@ -222,6 +226,10 @@ class Scene(Section):
     parked_density: float = Field(0.35, ge=0, le=1, description="Fraction of kerb spots with a parked car.")
     moving_cars_per_km: float = Field(10.0, ge=0, le=100, description="Moving cars per kilometre of lane.")
     moving_speed_mps: float = Field(8.0, gt=0, le=40, description="Mean speed of moving cars.")
+    sun_azimuth_deg: float = Field(212.5, ge=0, le=360, description="Where the sun stands, from east towards north.")
+    sun_elevation_deg: float = Field(56.9, ge=20, le=90, description="How high it stands; low suns cast long shadows.")
+    overcast: float = Field(0.0, ge=0, le=1, description="Cloud: 0 casts dark shadows, 1 casts none.")
+    brightness: float = Field(1.0, ge=0.1, le=1.5, description="Exposure: a factor on every image.")
 
 
 class Perception(Section):

@@ -119,6 +119,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.cells_by": ("norm", ()),
     "perception.unsent_cells": ("zero", ()),
     "perception.scene.seed": ("8", ()),
+    "perception.scene.style": ("suburb", ()),
     "perception.scene.block_m": ("100", ()),
     "perception.scene.building_density": ("0.1", ()),
     "perception.scene.building_height_m": ("20", ()),
@@ -126,6 +127,10 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.scene.parked_density": ("0.9", ()),
     "perception.scene.moving_cars_per_km": ("40", ()),
     "perception.scene.moving_speed_mps": ("15", ()),
+    "perception.scene.sun_azimuth_deg": ("30", ()),
+    "perception.scene.sun_elevation_deg": ("20", ()),
+    "perception.scene.overcast": ("1", ()),
+    "perception.scene.brightness": ("0.4", ()),
 }
 
 

@@ -1,0 +1,1 @@
+"""The benchmark: seeded splits of procedural scenes that anyone can make again."""
