@@ -49,7 +49,7 @@ class Benchmark:
     """Which benchmark: everything that its files follow from."""
 
     seed: int = 0
-    difficulty: Difficulty = Difficulty()
+    difficulty: Difficulty = Difficulty()  # noqa: RUF009 (frozen)
     geometry: Geometry = FULL
 
     def key(self) -> str:

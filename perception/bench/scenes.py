@@ -34,7 +34,7 @@ def draw_scene(seed: int, split: Split, index: int, difficulty: Difficulty) -> S
 
     return Scene(
         seed=name,
-        style=layout.styles[index % len(layout.styles)],  # type: ignore[arg-type]
+        style=layout.styles[index % len(layout.styles)],
         block_m=within(layout.block_m),
         building_density=within(difficulty.building_density),
         building_height_m=within(difficulty.building_height_m),
