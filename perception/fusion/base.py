@@ -7,6 +7,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from perception.fusion.traffic import LinkBytes, features_of
+
 UnsentCells = Literal["masked", "zero"]
 
 
@@ -19,16 +21,61 @@ class Fusion(nn.Module):
     - takes_part [n, 1 + k, h, w] bool: which agent has a say in which cell, the ego in all of them;
     - weight [n, 1 + k]: each link's fusion weight from its directive, 0 … 1, the ego's 1;
 
-    and returns [n, c, h, w]. Where no peer takes part the ego's features come back as they are. k may be 0.
+    and returns [n, c, h, w]. Where no peer takes part the ego's features come back as they are; a peer of weight 0
+    takes no part (`takes_part`); peers have no order. k may be 0.
     """
 
     name: ClassVar[str]
+    per_cell: ClassVar[bool] = False
+    """Whether a cell's result depends on that cell alone: then fusing only the cells where something arrived is the same."""
+    about: ClassVar[str]
+    """One line for lists."""
+    shares: ClassVar[Literal["features", "boxes", "nothing"]] = "features"
+    """What its peers send: none and late fusion leave the ego's features alone."""
+    reach_cells: ClassVar[int] = 0
+    """How far a peer's cell acts on the fused map: 0 where each cell is fused by itself."""
 
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
         raise NotImplementedError
 
     def fold(self) -> None:
         """Fold batch norms into the layers before them, for inference; what has none does nothing."""
+
+    @classmethod
+    def link_bytes(cls, cells: int = 0, boxes: int = 0) -> LinkBytes:
+        """What one peer puts on the air for one ego and frame, given the cells and boxes it has to send."""
+        return features_of(cells)
+
+
+class PerCell(Fusion):
+    """A method that fuses each cell by itself: it sees only the cells where a peer has a say, under a budget few."""
+
+    def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
+        n, many, channels, height, width = agents.shape
+        cells = height * width
+        part = takes_part.permute(1, 0, 2, 3).reshape(many, n * cells)
+        at = part[1:].any(dim=0).nonzero().squeeze(1)
+        if not len(at):
+            return agents[:, 0]
+        sample, cell = at // cells, at % cells
+        row = sample * (many * cells) + cell + torch.arange(many, device=at.device)[:, None] * cells
+        table = agents.permute(0, 1, 3, 4, 2).reshape(-1, channels)  # no copy where maps are channels-last
+        said = table.index_select(0, row.flatten()).view(many, len(at), channels)
+        mixed = self.mix(said, part.index_select(1, at), weight.T.index_select(1, sample))
+        own = agents[:, 0].permute(0, 2, 3, 1).reshape(-1, channels)
+        return own.index_copy(0, at, mixed).view(n, height, width, channels).permute(0, 3, 1, 2)
+
+    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        """[agents, p, c] with who takes part and link weights, [agents, p] each → [p, c]; the ego is the first agent."""
+        raise NotImplementedError
+
+
+def weighted_sum(share: Tensor, said: Tensor) -> Tensor:
+    """Σ over agents of share [agents, p] · said [agents, p, c]; one agent at a time, which needs no copy of all."""
+    out = share[0, :, None] * said[0]
+    for one, row in zip(share[1:], said[1:], strict=True):
+        out = torch.addcmul(out, one[:, None], row)
+    return out
 
 
 def takes_part(sent: Tensor, inside: Tensor, weight: Tensor, unsent: UnsentCells) -> Tensor:

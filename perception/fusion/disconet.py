@@ -10,12 +10,11 @@ import math
 from itertools import pairwise
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from perception.fusion.base import Fusion
+from perception.fusion.base import PerCell, weighted_sum
 from perception.geometry import CHANNELS
 
 
@@ -29,42 +28,34 @@ class EdgeWeights(nn.Module):
         self.norms = nn.ModuleList(nn.BatchNorm1d(b) for b in widths[1:])
         self.last = nn.Linear(widths[-1], 1)
 
-    def forward(self, rows: Tensor) -> Tensor:
-        """[p, agents, 80], the ego first → [p, agents]."""
+    def forward(self, said: Tensor) -> Tensor:
+        """[agents, p, 80], the ego first → [agents, p]."""
         first, norm = self.layers[0], self.norms[0]
         # the ego's half of the first layer is the same beside every agent
-        ego = F.linear(rows[:, :1], first.weight[:, :CHANNELS])  # type: ignore[index]
-        x = F.linear(rows, first.weight[:, CHANNELS:], first.bias) + ego  # type: ignore[index,arg-type]
+        ego = F.linear(said[0], first.weight[:, :CHANNELS])  # type: ignore[index]
+        x = F.linear(said, first.weight[:, CHANNELS:], first.bias)  # type: ignore[index,arg-type]
+        x += ego
         x = F.relu(norm(x.flatten(0, 1)), inplace=True)
         for layer, norm in zip(list(self.layers)[1:], list(self.norms)[1:], strict=True):
             x = F.relu(norm(layer(x)), inplace=True)
-        logit: Tensor = F.relu(self.last(x)).view(rows.shape[:2])
+        logit: Tensor = F.relu(self.last(x)).view(said.shape[:2])
         return logit
 
 
-class DiscoNet(Fusion):
+class DiscoNet(PerCell):
     """Softmax over agents per cell; a link's weight multiplies its softmax weight."""
 
     name = "disconet"
+    per_cell = True
+    about = "an edge network's softmax over agents, cell by cell (DiscoNet)"
 
     def __init__(self) -> None:
         super().__init__()
         self.edge = EdgeWeights()
 
-    def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
-        n, many, channels, height, width = agents.shape
-        rows = agents.permute(0, 3, 4, 1, 2).reshape(-1, many, channels)
-        part = takes_part.permute(0, 2, 3, 1).reshape(-1, many)
-        # where no peer has a say the ego's features stay as they are: under a budget, most cells
-        at = part[:, 1:].any(dim=1).nonzero().squeeze(1)
-        if not len(at):
-            return agents[:, 0]
-        said, part = rows[at], part[at]
-        bias = weight.clamp_min(1e-12).log()[torch.div(at, height * width, rounding_mode="floor")]
-        logit = (self.edge(said) + bias).masked_fill(~part, -math.inf)
-        mixed = torch.einsum("pa,pac->pc", logit.softmax(dim=1), said)
-        out = rows[:, 0].index_copy(0, at, mixed)
-        return out.view(n, height, width, channels).permute(0, 3, 1, 2)
+    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        logit = (self.edge(said) + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf)
+        return weighted_sum(logit.softmax(dim=0), said)
 
     def fold(self) -> None:
         edge: Any = self.edge
