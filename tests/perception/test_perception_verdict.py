@@ -1,0 +1,139 @@
+"""The rule of verdicts: every branch, over made intervals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perception.harness import verdict
+from perception.harness.verdict import HALF_AN_ORDER, Judgement, Measured, Paper, Size, Verdict
+
+UP, DOWN, NOTHING = Paper(4.8, 3.8, 5.8), Paper(-4.8, -5.8, -3.8), Paper(0.8, -0.8, 2.3, significant=False)
+R, N, O, X = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.OPPOSITE, Verdict.NOT_MEASURABLE  # noqa: E741
+
+
+def m(value: float, low: float, high: float) -> Measured:
+    return Measured(value, low, high, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("paper", "ours", "expected"),
+    [
+        (UP, m(5.0, 4.0, 6.0), Judgement(R, Size.SAME)),
+        (UP, m(5.0, 5.8, 6.0), Judgement(R, Size.SAME)),  # intervals that touch overlap
+        (UP, m(9.0, 8.0, 10.0), Judgement(R, Size.LARGER)),
+        (UP, m(1.0, 0.5, 1.5), Judgement(R, Size.SMALLER)),
+        (UP, m(1.0, -0.1, 4.5), Judgement(N, Size.SAME)),
+        (UP, m(0.1, -0.1, 0.3), Judgement(N, Size.SMALLER)),
+        (UP, m(0.1, 0.0, 0.3), Judgement(N, Size.SMALLER)),  # an interval that touches zero holds it
+        (UP, m(-2.0, -3.0, -1.0), Judgement(O, Size.SMALLER)),
+        (UP, m(-9.0, -9.9, -8.0), Judgement(O, Size.LARGER)),
+        (DOWN, m(-5.0, -6.0, -4.0), Judgement(R, Size.SAME)),
+        (DOWN, m(2.0, 1.0, 3.0), Judgement(O, Size.SMALLER)),
+        (NOTHING, m(0.2, -0.5, 0.9), Judgement(R, Size.SAME)),
+        (NOTHING, m(-2.0, -5.0, 0.1), Judgement(R, Size.SAME)),
+        (NOTHING, m(1.0, 0.5, 1.5), Judgement(N, Size.SAME)),
+        (NOTHING, m(-3.0, -4.0, -2.0), Judgement(N, Size.LARGER)),
+        (NOTHING, m(0.0, 0.0, 0.0), Judgement(R, Size.SAME)),
+        (Paper(58.0), m(55.0, 50.0, 60.0), Judgement(R, Size.SAME)),  # no interval in the paper: ours holds its value
+        (Paper(58.0), m(75.0, 70.0, 80.0), Judgement(R, Size.LARGER)),
+        (Paper(-24.0), m(-9.0, -10.0, -8.0), Judgement(R, Size.SMALLER)),
+        (Paper(significant=False), m(1.0, -1.0, 2.0), Judgement(R)),  # no value in the paper
+        (Paper(significant=False), m(1.0, 0.5, 2.0), Judgement(N)),
+        (UP, None, Judgement(X)),
+        (UP, Measured(4.8), Judgement(X)),
+        (UP, m(math.nan, math.nan, math.nan), Judgement(X)),
+    ],
+)
+def test_a_difference_is_judged_by_sign_and_significance(
+    paper: Paper, ours: Measured | None, expected: Judgement
+) -> None:
+    assert verdict.contrast(paper, ours) == expected
+
+
+@given(st.floats(-30, 30), st.floats(0.001, 10), st.floats(-30, 30), st.floats(0.001, 10))
+def test_signs_turned_on_both_sides_turn_nothing(a: float, wide_a: float, b: float, wide_b: float) -> None:
+    def both(sign: int) -> Judgement:
+        ends = sorted((sign * (a - wide_a), sign * (a + wide_a)))
+        paper = Paper(sign * a, *ends, significant=not ends[0] <= 0 <= ends[1])
+        return verdict.contrast(paper, m(sign * b, *sorted((sign * (b - wide_b), sign * (b + wide_b)))))
+
+    assert both(1) == both(-1)
+
+
+@given(st.floats(-30, 30), st.floats(0.001, 10))
+def test_the_papers_own_figures_reproduce_it(value: float, wide: float) -> None:
+    low, high = value - wide, value + wide
+    paper = Paper(value, low, high, significant=not low <= 0 <= high)
+    assert verdict.contrast(paper, m(value, low, high)) == Judgement(R, Size.SAME)
+
+
+@pytest.mark.parametrize(
+    ("ours", "expected"),
+    [
+        (m(88.0, 80.0, 95.0), Judgement(R, Size.SAME)),
+        (m(70.0, 51.0, 80.0), Judgement(R, Size.SMALLER)),
+        (m(55.0, 50.0, 60.0), Judgement(N, Size.SMALLER)),
+        (m(40.0, 30.0, 49.9), Judgement(O, Size.SMALLER)),
+        (Measured(70.0), Judgement(X)),
+        (None, Judgement(X)),
+    ],
+)
+def test_most_is_more_than_a_half(ours: Measured | None, expected: Judgement) -> None:
+    assert verdict.most(Paper(89.0), ours) == expected
+
+
+def test_absolute_levels_are_not_compared() -> None:
+    assert verdict.level(Paper(0.371), m(0.371, 0.35, 0.39)) == Judgement(Verdict.NOT_COMPARABLE)
+    assert verdict.level(Paper(0.371), None) == Judgement(X)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(10.08, R), (10.05, R), (10.149, R), (10.151, N), (9.9, N), (math.nan, X)],
+)
+def test_what_follows_by_counting_has_to_round_to_the_print(value: float, expected: Verdict) -> None:
+    assert verdict.exact(Paper(10.1), Measured(value)).verdict == expected
+    assert verdict.exact(Paper(10.1), None).verdict == X
+
+
+@pytest.mark.parametrize(
+    ("times", "most", "least", "order"),
+    [
+        (1.0, R, R, R),
+        (0.999 * HALF_AN_ORDER, R, R, R),
+        (1.001 * HALF_AN_ORDER, N, R, N),
+        (1.001 / HALF_AN_ORDER, R, R, R),
+        (0.999 / HALF_AN_ORDER, R, N, N),
+    ],
+)
+def test_quantities_are_judged_to_half_an_order_of_magnitude(
+    times: float, most: Verdict, least: Verdict, order: Verdict
+) -> None:
+    paper, ours = Paper(0.1), Measured(0.1 * times)
+    assert verdict.at_most(paper, ours).verdict == most
+    assert verdict.at_least(paper, ours).verdict == least
+    assert verdict.same_order(paper, ours).verdict == order
+
+
+def test_a_quantity_that_is_not_there_is_not_measurable() -> None:
+    for rule in (verdict.at_most, verdict.at_least, verdict.same_order):
+        assert [rule(Paper(9.0), o).verdict for o in (None, Measured(math.nan), Measured(0.0))] == [X, X, X]
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (5.0, Judgement(R, Size.SAME)),
+        (10.0, Judgement(R, Size.SAME)),
+        (4.9, Judgement(N, Size.SMALLER)),
+        (25.0, Judgement(N, Size.LARGER)),
+        (math.nan, Judgement(N)),
+    ],
+)
+def test_a_place_is_reproduced_inside_the_papers_bracket(value: float, expected: Judgement) -> None:
+    assert verdict.same_place(Paper(low=5.0, high=10.0), Measured(value)) == expected
+    assert verdict.same_place(Paper(low=5.0, high=10.0), None) == Judgement(X)
