@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from perception.fusion.traffic import LinkBytes, features_of
 
 UnsentCells = Literal["masked", "zero"]
+Shares = Literal["features", "boxes", "nothing"]
 
 
 class Fusion(nn.Module):
@@ -26,11 +27,9 @@ class Fusion(nn.Module):
     """
 
     name: ClassVar[str]
-    per_cell: ClassVar[bool] = False
-    """Whether a cell's result depends on that cell alone: then fusing only the cells where something arrived is the same."""
     about: ClassVar[str]
     """One line for lists."""
-    shares: ClassVar[Literal["features", "boxes", "nothing"]] = "features"
+    shares: ClassVar[Shares] = "features"
     """What its peers send: none and late fusion leave the ego's features alone."""
     reach_cells: ClassVar[int] = 0
     """How far a peer's cell acts on the fused map: 0 where each cell is fused by itself."""

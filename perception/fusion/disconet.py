@@ -46,7 +46,6 @@ class DiscoNet(PerCell):
     """Softmax over agents per cell; a link's weight multiplies its softmax weight."""
 
     name = "disconet"
-    per_cell = True
     about = "an edge network's softmax over agents, cell by cell (DiscoNet)"
 
     def __init__(self) -> None:

@@ -106,7 +106,7 @@ def test_fusion_is_the_stated_formula_and_peers_have_no_order(net: CarNet) -> No
         own = ego.flatten(2)[0].T  # [4096, 80]
 
         def edge(agent: torch.Tensor) -> torch.Tensor:
-            return net.fusion.edge(torch.stack([own, agent.flatten(1).T], dim=1))[:, 1].view(1, 1, CELLS, CELLS)
+            return net.fusion.edge(torch.stack([own, agent.flatten(1).T]))[1].view(1, 1, CELLS, CELLS)
 
         parts = [edge(ego[0]).exp()]
         parts += [edge(p).exp() * w * s for p, w, s in zip(peers, weight, sent, strict=True)]
