@@ -1,4 +1,4 @@
-"""Splits on disk: one npz file a scene, made in parallel, kept where they exist, and a manifest that says what they are."""
+"""Splits on disk: one npz file a scene, made in parallel, kept where they exist, and listed in the manifest with their hashes."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import hashlib
 import json
 import multiprocessing
 import os
+import zipfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from perception.bench.difficulty import Difficulty, Split
+from perception.bench import manifest
+from perception.bench.difficulty import Difficulty, Layout, Split
+from perception.bench.manifest import COLUMNS, BenchmarkError
 from perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
 from perception.bev import lift
 from perception.geometry import FULL, IMAGE_PX, Geometry
@@ -26,7 +31,6 @@ FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
 SIZES: dict[Split, tuple[int, int]] = {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (80, 1)}
 """Scenes and frames a scene. The test split has a scene for every frame, as UAV3D's mini-validation."""
-COLUMNS = ("images", "true_pose", "est_pose", "cars")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +61,42 @@ class Benchmark:
         text = json.dumps({"format": FORMAT, **asdict(self)}, sort_keys=True)
         return hashlib.blake2b(text.encode(), digest_size=6).hexdigest()
 
+    @classmethod
+    def at(cls, folder: Path) -> Benchmark:
+        """The one whose manifest lies in `folder`.
+
+        Raises:
+            BenchmarkError: no manifest, or one of another format or with other parameters than this version knows.
+        """
+        data, path = manifest.read(folder), folder / manifest.MANIFEST
+        if data["format"] != FORMAT:
+            raise BenchmarkError(f"{path}: format is {data['format']}, must be {FORMAT}: make it anew")
+        try:
+            told = data["benchmark"]
+            known = {f.name for f in fields(Difficulty)}
+            if set(told["difficulty"]) != known:
+                raise ValueError(f"difficulty has {sorted(set(told['difficulty']) ^ known)} too many or too few")
+            bench = cls(told["seed"], _difficulty(told["difficulty"]), Geometry(**told["geometry"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BenchmarkError(f"{path}: cannot be understood: {error}") from error
+        if bench.key() != data["key"]:
+            raise BenchmarkError(f"{path}: key is {data['key']}, must be {bench.key()}: its parameters were changed")
+        return bench
+
     def folder(self, root: Path) -> Path:
         """Where its splits lie under `root`."""
         return root / f"seed{self.seed}-{self.difficulty.density}-{self.geometry.half_extent_m:g}m-{self.key()}"
+
+
+def _difficulty(told: dict[str, Any]) -> Difficulty:
+    """From JSON, which knows lists but no tuples."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return Layout(**{k: plain(v) for k, v in value.items()})
+        return tuple(value) if isinstance(value, list) else value
+
+    return Difficulty(**{k: plain(v) for k, v in told.items()})
 
 
 def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> Path:
@@ -90,6 +127,18 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
     return path
 
 
+def _make(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> tuple[str, dict[str, Any]]:
+    """The scene's file, and what the manifest says of it."""
+    make_scene_file(bench, split, index, frames, path)
+    config = draw_scene(bench.seed, split, index, bench.difficulty).model_dump()
+    return path.name, {
+        "index": index,
+        "frames": frames,
+        "sha256": manifest.content_hash(path),
+        "scene": config,
+    }
+
+
 def _start_worker() -> None:
     torch.set_num_threads(1)
 
@@ -110,31 +159,56 @@ def make_split(
         scenes: only the first so many.
         workers: processes; left out, one a core.
         progress: called with scenes done and scenes to make.
+
+    Raises:
+        ValueError: more scenes than the split has, or none.
+        BenchmarkError: a file on disk is broken, or a worker was killed.
     """
     count, frames = SIZES[split]
-    count = count if scenes is None else scenes
+    if scenes is not None:
+        if not 1 <= scenes <= count:
+            raise ValueError(f"scenes is {scenes}, must be 1 to the {count} of the {split} split")
+        count = scenes
     folder = bench.folder(root)
     paths = [folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in range(count)]
-    todo = [k for k, path in enumerate(paths) if not path.exists()]
+    known = manifest.listed(folder, split)
+    todo = [k for k, path in enumerate(paths) if not path.exists() or path.name not in known]
     if todo:
+        entries: list[tuple[str, dict[str, Any]]] = []
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=_start_worker) as pool:
-            jobs = [pool.submit(make_scene_file, bench, split, k, frames, paths[k]) for k in todo]
+        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=_start_worker)
+        try:
+            jobs = [pool.submit(_make, bench, split, k, frames, paths[k]) for k in todo]
             for done, job in enumerate(as_completed(jobs), 1):
-                job.result()
+                entries.append(job.result())
                 if progress is not None:
                     progress(done, len(jobs))
+        except BrokenProcessPool as error:
+            raise BenchmarkError(f"{folder}: a worker was killed; what is finished is kept, run it again") from error
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if entries:
+                header = {"format": FORMAT, "key": bench.key(), "benchmark": asdict(bench)}
+                manifest.add(folder, header, split, entries)
     return paths
 
 
 def load_frames(paths: Sequence[Path]) -> Frames:
-    """All frames of the files, in order, in memory (1.3 MB a fleet-frame)."""
+    """All frames of the files, in order, in memory (1.3 MB a fleet-frame).
+
+    Raises:
+        ValueError: no files.
+        BenchmarkError: a file cannot be read.
+    """
     if not paths:
         raise ValueError("load_frames needs at least one file")
     parts = []
     for path in paths:
-        with np.load(path, allow_pickle=False) as file:
-            parts.append({k: file[k] for k in COLUMNS})
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                parts.append({k: file[k] for k in COLUMNS})
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise BenchmarkError(f"{path}: cannot be read: {error}") from error
     most = max(p["cars"].shape[1] for p in parts)
     for p in parts:
         p["cars"] = np.pad(p["cars"], ((0, 0), (0, most - p["cars"].shape[1]), (0, 0)), constant_values=np.nan)
