@@ -6,90 +6,33 @@ matching go best first, so what a box below τ does concerns boxes below τ alon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.ap import Matched, average_precision, match, suppress
+from perception.ap import CONVENTIONS, Matched, best_first, hits, suppressed
 from perception.geometry import CELLS, Geometry
 from perception.harness import selection
 from perception.harness.condition import Condition
 from perception.harness.contract import Exchange, FleetFrames, Floats, Instrument, View
+from perception.harness.evaluation import FLOOR, NMS_IOU, Evaluation, FrameResult, Region, Settings, Store, assemble
+from perception.overlap import overlapping
 from perception.types import Boxes
 from scenarios.streams import stream
 
-Region = Literal["full", "mission", "ego"]
+__all__ = ["FLOOR", "NMS_IOU", "REGION_M", "Evaluation", "Region", "Settings", "evaluate", "mission_target", "truth"]
+
+T = TypeVar("T")
 REGION_M = 32.0
 """Radius of the mission's disc, and of the one around the ego."""
-NMS_IOU, FLOOR = 0.15, 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the numbers depend on beside the instrument, the frames and the condition."""
-
-    egos: int = 5
-    """The first so many drones of a frame are egos."""
-    floor: float = FLOOR
-    """The lowest score that is kept."""
-    nms_iou: float = NMS_IOU
-    seed: int = 0
-    """Of the mission's targets and of random peers."""
-
-
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """n frames × `egos` under every condition. A unit is one ego of one frame, frame by frame."""
-
-    conditions: tuple[Condition, ...]
-    regions: tuple[Region, ...]
-    settings: Settings
-    scene: NDArray[np.int64]
-    """[n]"""
-    target: Floats
-    """[n, 2] centre of the mission's disc; NaN where the frame has none and does not count for the mission."""
-    units: Mapping[tuple[Condition, Region], Sequence[Matched]]
-    """One `Matched` per unit [n · egos]."""
-    cells: Mapping[Condition, NDArray[np.int64]]
-    """[n · egos] cells shared to the unit, in all."""
-    payload_bytes: Mapping[Condition, NDArray[np.int64]]
-    """[n · egos] cells × 80 × 2."""
-    index_bytes: Mapping[Condition, NDArray[np.int64]]
-    """[n · egos] which cells they are, counted apart."""
-
-    def at(self, tau: float) -> Evaluation:
-        """The same with every box below `tau` gone.
-
-        Raises:
-            ValueError: below the floor, where boxes were not kept.
-        """
-        if tau < self.settings.floor:
-            raise ValueError(f"tau is {tau}, must be at least the floor {self.settings.floor}")
-        cut = {key: [m.at(tau) for m in several] for key, several in self.units.items()}
-        return replace(self, units=cut, settings=replace(self.settings, floor=tau))
-
-    def counts(self, region: Region) -> NDArray[np.bool_]:
-        """[n · egos]: the units that count in a region; for the mission those of frames that have a target."""
-        every = np.ones(len(self.scene), bool) if region != "mission" else ~np.isnan(self.target[:, 0])
-        return np.repeat(every, self.settings.egos)
-
-    def matched(self, condition: Condition, region: Region = "full") -> list[Matched]:
-        """The units that count, in order."""
-        several = self.units[condition, region]
-        return [several[i] for i in np.flatnonzero(self.counts(region)).tolist()]
-
-    def groups(self, region: Region = "full", by: Literal["frame", "scene"] = "frame") -> NDArray[np.int64]:
-        """A label for each unit of `matched`: units of one frame, or of one scene, stand or fall together in a bootstrap."""
-        label = np.arange(len(self.scene)) if by == "frame" else self.scene
-        return np.repeat(label, self.settings.egos)[self.counts(region)]
-
-    def ap(self, condition: Condition, region: Region = "full") -> float:
-        """AP@0.5 over the units that count."""
-        return average_precision(self.matched(condition, region))
+IOU = 0.5
+FLUSH_FRAMES = 4
+"""Frames that are lost when an evaluation is interrupted, at most."""
 
 
 def evaluate(
@@ -100,8 +43,10 @@ def evaluate(
     regions: Sequence[Region] = ("full", "mission"),
     egos: int = 5,
     floor: float = FLOOR,
+    convention: str = "rotated",
     seed: int = 0,
     store: Path | None = None,
+    workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Every ego of every frame under every condition.
@@ -112,12 +57,14 @@ def evaluate(
         regions: full: every car in the ego's square; mission: 32 m around the frame's target; ego: around the ego.
         egos: how many drones of each frame are egos, the first ones.
         floor: the lowest score that is kept.
+        convention: a name of `ap.CONVENTIONS`: how boxes are matched and AP is worked out.
         seed: of targets and random peers.
         store: a folder for finished frames, so that a later call goes on where this one ended.
+        workers: frames worked on side by side, each in one thread. The numbers do not depend on it.
         progress: called with frames done and frames in all.
 
     Raises:
-        ValueError: an unknown region, more egos than drones, or a condition that does not fit the fleet.
+        ValueError: an unknown region or convention, more egos than drones, or a condition that does not fit the fleet.
     """
     drones = frames.est_pose.shape[1]
     if not 1 <= egos <= drones:
@@ -125,37 +72,50 @@ def evaluate(
     for region in regions:
         if region not in get_args(Region):
             raise ValueError(f"region is {region!r}, must be {' or '.join(get_args(Region))}")
+    if convention not in CONVENTIONS:
+        raise ValueError(f"convention is {convention!r}, must be {' or '.join(CONVENTIONS)}")
     conditions = tuple(dict.fromkeys(conditions))
-    settings = Settings(egos, floor, NMS_IOU, seed)
+    settings = Settings(egos, floor, convention, seed)
     plain = {c: c.plain(drones) for c in conditions}
     todo = tuple(dict.fromkeys(plain.values()))
     keys = frame_keys(frames)
-    rows = []
-    for f in range(len(keys)):
-        rows.append(_frame(instrument, frames, f, keys[f], todo, regions, settings))
+    kept = None if store is None else Store(store, instrument.fingerprint, settings, regions)
+
+    def task(f: int) -> tuple[str, FrameResult]:
+        name = "" if kept is None else frame_hash(frames, f, keys[f])
+        known = None if kept is None else kept.get(name)
+        missing = [c for c in todo if known is None or c not in known.cost]
+        if known is not None and not missing:
+            return name, known
+        return name, _frame(instrument, frames, f, keys[f], missing, regions, settings)
+
+    results: list[FrameResult] = []
+    for name, found in _in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
+        results.append(found if kept is None else kept.add(name, found))
+        if kept is not None and (len(results) % FLUSH_FRAMES == 0 or len(results) == len(keys)):
+            kept.flush()
         if progress is not None:
-            progress(f + 1, len(keys))
-    return Evaluation(
-        conditions,
-        tuple(regions),
-        settings,
-        np.asarray(frames.scene),
-        np.array([row.target for row in rows]),
-        {(c, r): [m for row in rows for m in row.units[plain[c], r]] for c in conditions for r in regions},
-        *(
-            {c: np.array([cost[i] for row in rows for cost in row.cost[plain[c]]]) for c in conditions}
-            for i in range(3)
-        ),
-    )
+            progress(len(results), len(keys))
+    return assemble(results, conditions, regions, settings, np.asarray(frames.scene), plain)
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One frame's results."""
-
-    target: tuple[float, float]
-    units: dict[tuple[Condition, Region], list[Matched]]
-    cost: dict[Condition, list[tuple[int, int, int]]]
+def _in_order(task: Callable[[int], T], count: int, workers: int, start: Callable[[], None] | None) -> Iterator[T]:
+    """task(0), task(1), … by so many threads, never more than twice as many ahead as there are threads."""
+    if workers <= 1:
+        yield from map(task, range(count))
+        return
+    with ThreadPoolExecutor(workers, "evaluate", initializer=start) as pool:
+        ahead: list[Future[T]] = []
+        try:
+            for f in range(count):
+                ahead.append(pool.submit(task, f))
+                if len(ahead) == 2 * workers:
+                    yield ahead.pop(0).result()
+            while ahead:
+                yield ahead.pop(0).result()
+        finally:
+            for future in ahead:
+                future.cancel()
 
 
 def frame_keys(frames: FleetFrames) -> list[tuple[int, int]]:
@@ -166,6 +126,15 @@ def frame_keys(frames: FleetFrames) -> list[tuple[int, int]]:
         seen[scene] = seen.get(scene, -1) + 1
         out.append((int(scene), seen[scene]))
     return out
+
+
+def frame_hash(frames: FleetFrames, f: int, key: tuple[int, int]) -> str:
+    """A frame by its content and its key; `images` count where there are any."""
+    digest = hashlib.blake2b(repr(key).encode(), digest_size=16)
+    for name in ("true_pose", "est_pose", "cars", "images"):
+        if hasattr(frames, name):
+            digest.update(np.ascontiguousarray(getattr(frames, name)[f]).tobytes())
+    return digest.hexdigest()
 
 
 def mission_target(frames: FleetFrames, f: int, key: tuple[int, int], seed: int = 0) -> tuple[float, float] | None:
@@ -187,7 +156,8 @@ def truth(frames: FleetFrames, f: int, ego: int, geometry: Geometry) -> Boxes:
     x, y, yaw = frames.true_pose[f, ego]
     dx, dy, c, s = cars[:, 0] - x, cars[:, 1] - y, np.cos(yaw), np.sin(yaw)
     reach = geometry.half_extent_m
-    cars = cars[(np.abs(c * dx + s * dy) < reach) & (np.abs(c * dy - s * dx) < reach)]
+    inside = (np.abs(c * dx + s * dy) < reach) & (np.abs(c * dy - s * dx) < reach)
+    cars = cars[inside]
     return Boxes(cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
 
 
@@ -232,28 +202,76 @@ def _frame(
     conditions: Sequence[Condition],
     regions: Sequence[Region],
     settings: Settings,
-) -> _Row:
+) -> FrameResult:
     view = instrument.look(frames, f)
     target = mission_target(frames, f, key, settings.seed)
     given = exchanges(view, frames, f, key, conditions, settings, instrument.geometry, target)
-    found = view.detect([e for e, _ in given], settings.floor)
-    there = [truth(frames, f, ego, instrument.geometry) for ego in range(settings.egos)]
-    discs: dict[tuple[Region, int], tuple[float, float, float] | None] = {}
-    for ego in range(settings.egos):
-        x, y = frames.true_pose[f, ego, :2]
-        discs["full", ego] = None
-        discs["ego", ego] = (float(x), float(y), REGION_M)
-        discs["mission", ego] = (*target, REGION_M) if target else (0.0, 0.0, -1.0)
-    units: dict[tuple[Condition, Region], list[Matched]] = {(c, r): [] for c in conditions for r in regions}
-    cost: dict[Condition, list[tuple[int, int, int]]] = {c: [] for c in conditions}
-    for i, ((e, count), boxes) in enumerate(zip(given, found, strict=True)):
-        c = conditions[i // settings.egos]
-        cost[c].append((sum(count), *selection.link_bytes(count)))
-        x, y, yaw = frames.est_pose[f, e.ego].tolist()
-        placed = suppress(Boxes.placed(boxes, (x, y, yaw)), settings.nms_iou)
+    local = view.detect([e for e, _ in given], settings.floor)
+    there = [truth(frames, f, ego, instrument.geometry).table() for ego in range(settings.egos)]
+    discs: dict[Region, Floats | None] = {
+        "full": None,
+        "ego": frames.true_pose[f, : settings.egos, :2],
+        "mission": np.tile(target or (np.inf, np.inf), (settings.egos, 1)),
+    }
+    ego_of = np.array([e.ego for e, _ in given])
+    matched = match_all(local, ego_of, frames.est_pose[f], there, {r: discs[r] for r in regions}, settings)
+    cost: dict[Condition, list[tuple[int, int, int]]] = {}
+    units: dict[tuple[Condition, Region], list[Matched]] = {}
+    for n, c in enumerate(conditions):
+        these = slice(n * settings.egos, (n + 1) * settings.egos)
+        cost[c] = [(sum(count), *selection.link_bytes(count)) for _, count in given[these]]
         for r in regions:
-            if r == "mission" and target is None:
-                units[c, r].append(Matched(np.zeros(0), np.zeros(0, bool), 0))
-            else:
-                units[c, r].append(match(placed, there[e.ego], discs[r, e.ego]))
-    return _Row(target or (np.nan, np.nan), units, cost)
+            units[c, r] = matched[r][these]
+    return FrameResult(target or (np.nan, np.nan), units, cost)
+
+
+def match_all(
+    local: Sequence[Floats],
+    ego_of: NDArray[np.int64],
+    est_pose: Floats,
+    there: Sequence[Floats],
+    discs: dict[Region, Floats | None],
+    settings: Settings,
+) -> dict[Region, list[Matched]]:
+    """Many images of one frame at once: put boxes into the world, suppress, match in every region.
+
+    Args:
+        local: boxes [m, 6] of each image in its ego's estimated frame; ego_of: [images] which ego's.
+        est_pose: [drones, 3]; there: each ego's cars [m, 5].
+        discs: by region the discs' centres [egos, 2], or None for everything.
+    """
+    convention = CONVENTIONS[settings.convention]
+    image = np.repeat(np.arange(len(local)), [len(boxes) for boxes in local])
+    boxes = np.concatenate([np.zeros((0, 6)), *local])
+    order = best_first(boxes[:, 5], image)
+    boxes, image = boxes[order], image[order]
+    x0, y0, yaw = est_pose[ego_of[image]].T
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = x0 + c * boxes[:, 0] - s * boxes[:, 1], y0 + s * boxes[:, 0] + c * boxes[:, 1]
+    world = np.stack([x, y, boxes[:, 2], boxes[:, 3], boxes[:, 4] + yaw], axis=1)
+    left = suppressed(world, image, settings.nms_iou)
+    world, image = world[left], image[left]
+    score = boxes[left, 5].astype(np.float32).astype(np.float64)  # as it is stored
+
+    cars = np.concatenate([np.zeros((0, 5)), *there])
+    cars_of = np.repeat(np.arange(len(there)), [len(t) for t in there])
+    ego = ego_of[image]
+    i, j, value = overlapping(world, cars, ego, cars_of, convention.overlap)
+    good = value >= IOU
+    i, j, value = i[good], j[good], value[good]
+    out: dict[Region, list[Matched]] = {}
+    for region, centre in discs.items():
+        found, real = np.ones(len(world), bool), np.ones(len(cars), bool)
+        if centre is not None:
+            found = np.hypot(*(world[:, :2] - centre[ego]).T) <= REGION_M
+            real = np.hypot(*(cars[:, :2] - centre[cars_of]).T) <= REGION_M
+        both = found[i] & real[j]
+        # every image has cars of its own
+        hit = hits(len(world), i[both], j[both] + image[i[both]] * len(cars), value[both], convention.match)
+        truths = np.bincount(cars_of[real], minlength=len(there))
+        ends = np.searchsorted(image[found], np.arange(1, len(local)))
+        scores, found_hits = np.split(score[found], ends), np.split(hit[found], ends)
+        out[region] = [
+            Matched(a, b, int(truths[e])) for a, b, e in zip(scores, found_hits, ego_of.tolist(), strict=True)
+        ]
+    return out
