@@ -8,9 +8,9 @@ network call has the same shapes whatever else is asked for, so the same capture
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,6 +25,8 @@ from perception.bev import lift
 from perception.checkpoint import load_weights
 from perception.decode import decode
 from perception.fusion.base import takes_part
+from perception.fusion.late import join_boxes, sendable
+from perception.fusion.registry import FUSIONS
 from perception.geometry import CELLS, FULL
 from perception.model import folded
 from perception.render import Renderer
@@ -34,13 +36,21 @@ from perception.types import Boxes, Capture, Share
 from perception.warp import warp
 from scenarios.schema import Perception
 
-SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "disconet.safetensors"
+WEIGHTS = Path(__file__).parent / "weights"
+SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 NMS_IOU = 0.15
 KEPT_CAPTURES = 64
 MAPS, LATE = ("features", "raw"), ("detections", "tracks")
+Pose = tuple[float, float, float]
+Disc = tuple[float, float, float]
 R = TypeVar("R")
 
-__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth"]
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth", "shipped"]
+
+
+def shipped(fusion: str) -> Path:
+    """The weights that a fusion flies with when the scenario names none; those without parameters of their own take DiscoNet's."""
+    return SHIPPED_WEIGHTS if FUSIONS[fusion].shares != "features" else WEIGHTS / f"{fusion}.safetensors"
 
 
 def ground_truth(
@@ -74,6 +84,8 @@ class _Encoded:
     features: Tensor
     out: Tensor | None = None
     boxes: Boxes | None = None
+    in_part: dict[tuple[float, Disc | None], Tensor] = field(default_factory=dict)
+    """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
 
 
 class TorchDetector:
@@ -83,10 +95,10 @@ class TorchDetector:
         scene: what there is to see.
         config: the scenario's `perception` section.
         seed: the sortie's seed (sensor noise follows from it).
-        weights: a safetensors file; None takes the shipped one.
+        weights: a safetensors file; None takes the one shipped for `perception.fusion`.
 
     Raises:
-        ValueError: weights that are missing or do not fit, naming file and tensor.
+        ValueError: weights that are missing or do not fit, naming file and tensor, or that learned another fusion.
 
     One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
     side as torch has threads when the detector is made (`torch.set_num_threads`). The numbers do not depend on it.
@@ -94,8 +106,13 @@ class TorchDetector:
 
     def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
         self._scene, self._config = scene, config
-        path = SHIPPED_WEIGHTS if weights is None else weights
+        self._fusion = FUSIONS[config.fusion]
+        path = shipped(config.fusion) if weights is None else weights
         net = load_weights(path)
+        if self._fusion.shares == "features" and net.config.fusion != config.fusion:
+            raise ValueError(
+                f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
+            )
         if net.config.geometry != FULL:
             raise ValueError(
                 f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
@@ -110,15 +127,24 @@ class TorchDetector:
     def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
         """Each ego's boxes from its own features and what it was sent, ENU, best first.
 
-        A late share is used as it is: the sender's pose at its capture places it, what has moved since lags.
+        A late share's map lies where its sender was at the capture, both poses being known: what has moved since
+        lags, what stands still fits. Without `motion_compensation` it lies where its sender is now, if that is among
+        the egos. Boxes travel in world coordinates and need none.
         """
+        if self._fusion.shares == "nothing":
+            jobs = [(ego, ()) for ego, _ in jobs]
         self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
-        shared = [s for _, shares in jobs for s in shares]
+        shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         alone = [s.capture for s in shared if s.representation in LATE]
-        alone += [ego for ego, shares in jobs if not any(s.representation in MAPS for s in shares)]
+        alone += [ego for ego, shares in jobs if not any(self._is_fused(s) for s in shares)]
         self._each(self._look_alone, dict.fromkeys(alone))
         self._each(self._head_alone, dict.fromkeys(s.capture for s in shared if self._must_rank(s)))
-        return self._each(lambda job: self._fuse(*job), jobs)
+        if self._fusion.shares == "boxes":
+            self._each(
+                self._head_in_part, {(s.capture, s.rho, s.roi): s for s in shared if s.representation in MAPS}.values()
+            )
+        now = {ego.drone: ego for ego, _ in jobs}
+        return self._each(lambda job: self._find(*job, now), jobs)
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
@@ -178,16 +204,17 @@ class TorchDetector:
         """Work out what the capture shows without peers, once."""
         kept = self._kept[capture]
         if kept.boxes is None:
-            kept.boxes = self._place(self._head_alone(capture), capture)
+            kept.boxes = self._place(self._head_alone(capture), capture.est_pose)
 
     def _alone(self, capture: Capture) -> Boxes:
         boxes = self._kept[capture].boxes
         assert boxes is not None  # noqa: S101 (looked at before)
         return boxes
 
-    def _place(self, out: Tensor, capture: Capture) -> Boxes:
+    def _place(self, out: Tensor, pose: Pose) -> Boxes:
+        """The boxes of a head's output [7, 128, 128] in the world, suppressed."""
         local = decode(out, self._config.score_threshold).numpy()
-        return suppress(Boxes.placed(local, capture.est_pose), NMS_IOU)
+        return suppress(Boxes.placed(local, pose), NMS_IOU)
 
     def _sent(self, share: Share) -> Tensor:
         """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""
@@ -202,30 +229,58 @@ class TorchDetector:
             rank = F.max_pool2d(self._head_alone(share.capture)[:1], 2)[0].numpy()
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose))[None]
 
-    def _fuse(self, ego: Capture, shares: Sequence[Share]) -> Boxes:
-        maps = [s for s in shares if s.representation in MAPS]
-        if not maps:
+    def _is_fused(self, share: Share) -> bool:
+        return self._fusion.shares == "features" and share.representation in MAPS
+
+    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
+        """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
+        maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
+        out = self._fuse(ego, maps, now) if maps else None
+        if out is None:
+            self._look_alone(ego)
             own = self._alone(ego)
         else:
-            features = torch.stack([self._kept[s.capture].features for s in maps])
-            # relative to the ego, so that float32 keeps millimetres kilometres from the origin
-            x, y, yaw = ego.est_pose
-            poses = [(s.capture.est_pose[0] - x, s.capture.est_pose[1] - y, s.capture.est_pose[2]) for s in maps]
-            sent = torch.stack([self._sent(s) for s in maps])
-            here = torch.tensor((0.0, 0.0, yaw))
-            warped, arrived, inside = warp(features, sent, here, torch.tensor(poses), FULL.cell_m)
-            weight = torch.tensor([[s.weight for s in maps]])
-            part = takes_part(arrived[None, :, 0], inside[None, :, 0], weight, self._config.unsent_cells)
-            agents = torch.cat([self._kept[ego].features[None], warped])[None]
-            fused = self._net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0))
-            own = self._place(self._net.head(fused)[0], ego)
-        late = [self._sent_boxes(s) for s in shares if s.representation in LATE]
-        return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own
+            own = self._place(out, ego.est_pose)
+        late = [self._sent_boxes(s, now) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+        return join_boxes(own, late) if late else own
 
-    def _sent_boxes(self, share: Share) -> Boxes:
+    def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> Tensor | None:
+        """The head's output after fusion; None where no peer has a say in any cell."""
+        features = torch.stack([self._kept[s.capture].features for s in maps])
+        # relative to the ego, so that float32 keeps millimetres kilometres from the origin
+        x, y, yaw = ego.est_pose
+        poses = [self._lies(s, now) for s in maps]
+        there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
+        sent = torch.stack([self._sent(s) for s in maps])
+        warped, arrived, inside = warp(features, sent, torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
+        weight = torch.tensor([[s.weight for s in maps]])
+        part = takes_part(arrived[None, :, 0], inside[None, :, 0], weight, self._config.unsent_cells)
+        if not bool(part[:, 1:].any()):
+            return None
+        agents = torch.cat([self._kept[ego].features[None], warped])[None]
+        out: Tensor = self._net.head(self._net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0)))[0]
+        return out
+
+    def _lies(self, share: Share, now: Mapping[int, Capture]) -> Pose:
+        """The pose that places a share's map in the world."""
+        capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
+        return capture.est_pose
+
+    def _sent_boxes(self, share: Share, now: Mapping[int, Capture]) -> Boxes:
+        """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
+        if share.representation in MAPS:
+            return sendable(self._place(self._head_in_part(share), self._lies(share, now)))
         boxes = self._alone(share.capture).inside(share.roi)
         if share.representation == "tracks":
             boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))  # they are best first
-        if share.weight <= 0.0:
-            return Boxes.empty()
-        return boxes
+        return sendable(boxes) if self._fusion.shares == "boxes" else boxes
+
+    def _head_in_part(self, share: Share) -> Tensor:
+        """The head's output [7, 128, 128] from what was sent of a map, worked out once for a capture and a budget."""
+        kept, key = self._kept[share.capture], (share.rho, share.roi)
+        sent = self._sent(share)
+        if bool(sent.all()):
+            return self._head_alone(share.capture)
+        if key not in kept.in_part:
+            kept.in_part[key] = self._net.head((kept.features * sent)[None])[0]
+        return kept.in_part[key]

@@ -234,13 +234,19 @@ class Scene(Section):
 
 class Perception(Section):
     detector: Literal["torch", "none"] = Field("torch", description="The detector; none flies the traffic alone.")
-    weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights.")
+    fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "where2comm"] = Field(
+        "disconet", description="How what peers sent is fused; weights belong to a fusion, none and late take any."
+    )
+    weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights of the fusion.")
     sample_rate_hz: float = Field(
         2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
     )
     compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
     fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
     max_age_s: float = Field(0.5, gt=0, le=60, description="Received payloads older than this are not fused.")
+    motion_compensation: bool = Field(
+        True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
+    )
     score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
     unsent_cells: Literal["masked", "zero"] = Field(

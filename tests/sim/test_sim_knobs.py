@@ -111,10 +111,12 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
 
 # These act through the detector, so their sorties fly with it, shortly.
 SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
+    "perception.fusion": ("late", ()),
     "perception.weights": ("WEIGHTS", ()),
     "perception.sample_rate_hz": ("5", ()),
     "perception.fusion_delay_s": ("0.2", ()),
     "perception.max_age_s": ("0.05", ()),
+    "perception.motion_compensation": ("false", ("perception.compute_delay_s=0.12",)),
     "perception.score_threshold": ("0.5", ()),
     "perception.cells_by": ("norm", ()),
     "perception.unsent_cells": ("zero", ()),
@@ -202,9 +204,10 @@ def test_a_knob_of_perception_changes_the_record(
     field: str, seen: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     value, shared = SEEN[field]
+    before = run_sortie(example(*SHORT, *shared)).fingerprint if shared else seen
     if value == "WEIGHTS":
         value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
-    assert run_sortie(example(*SHORT, *shared, f"{field}={value}")).fingerprint != seen
+    assert run_sortie(example(*SHORT, *shared, f"{field}={value}")).fingerprint != before
 
 
 def other_weights(path):  # type: ignore[no-untyped-def]
