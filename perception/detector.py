@@ -144,7 +144,7 @@ class TorchDetector:
                 self._head_in_part, {(s.capture, s.rho, s.roi): s for s in shared if s.representation in MAPS}.values()
             )
         now = {ego.drone: ego for ego, _ in jobs}
-        return self._each(lambda job: self._find(*job, now), jobs)
+        return self._each(lambda job: self._find(job[0], job[1], now), jobs)
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
