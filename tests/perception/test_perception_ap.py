@@ -1,5 +1,7 @@
-"""AP and overlap against plain shapely, and the bootstrap against explicit resampling."""
+"""AP and overlap against plain shapely, AP in the field's conventions against pycocotools."""
 
+import contextlib
+import io
 import math
 
 import numpy as np
@@ -7,10 +9,23 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 from shapely import affinity
 
-from perception.ap import Matched, average_precision, iou_pairs, match, suppress
-from perception.harness.statistics import compare
+from perception.ap import (
+    CONVENTIONS,
+    Convention,
+    Matched,
+    average_precision,
+    best_first,
+    hits,
+    iou_pairs,
+    match,
+    suppress,
+    suppressed,
+)
+from perception.overlap import near_pairs, overlapping
 from perception.types import Boxes
 
 box = st.tuples(
@@ -162,34 +177,190 @@ def test_suppression_leaves_no_overlap_above_the_limit() -> None:
     assert len(kept) > 5
 
 
-def test_bootstrap_equals_explicit_resampling() -> None:
-    frames = some_frames(8, 10)
-    a = [match(f, t) for f, t in frames]
-    b = [Matched(m.score, m.hit & (np.arange(len(m.hit)) % 3 > 0), m.truths) for m in a]
-    found = compare(b, a, draws=200, seed=4)
-    from scenarios.streams import stream
-
-    weights = stream(4, 0, (), "ap.bootstrap").multinomial(10, np.full(10, 0.1), size=200)
-    gains = []
-    for row in weights:
-        again_a = [m for m, w in zip(a, row, strict=True) for _ in range(w)]
-        again_b = [m for m, w in zip(b, row, strict=True) for _ in range(w)]
-        gains.append(average_precision(again_a) - average_precision(again_b))
-    assert (found.low, found.high) == pytest.approx(tuple(np.percentile(gains, [2.5, 97.5])), abs=1e-9)
-    assert found.delta == pytest.approx(average_precision(a) - average_precision(b))
-    assert found.low < found.delta < found.high
+def crowd(seed: int, images: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes that crowd one another, with their images and scores, in the order of `best_first`."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    n = int(rng.integers(0, 400))
+    boxes = rng.uniform((-15, -15, 3.5, 1.6, -4), (15, 15, 5, 2.1, 4), (n, 5))
+    image, score = rng.integers(0, images, n), np.round(rng.random(n), 2)
+    order = best_first(score, image)
+    return boxes[order], image[order], score[order]
 
 
-def test_bootstrap_of_equals_is_nothing_and_groups_widen_it() -> None:
-    a = [match(f, t) for f, t in some_frames(9, 12)]
-    same = compare(a, a)
-    assert (same.delta, same.low, same.high) == (0.0, 0.0, 0.0)
-    b = [Matched(m.score, m.hit & (k % 4 > 0), m.truths) for k, m in enumerate(a)]
-    by_group = compare(a + a, b + b, groups=[k % 12 for k in range(24)], seed=1)
-    by_frame = compare(a + a, b + b, seed=1)
-    assert by_group.high - by_group.low > by_frame.high - by_frame.low
+@pytest.mark.parametrize("seed", range(8))
+def test_suppression_of_many_images_is_the_loop_over_boxes(seed: int) -> None:
+    boxes, image, _ = crowd(seed)
+    keep: list[int] = []
+    for k in range(len(boxes)):
+        rivals = [j for j in keep if image[j] == image[k]]
+        if not rivals or iou_pairs(boxes[rivals], np.repeat(boxes[k : k + 1], len(rivals), 0)).max() <= 0.15:
+            keep.append(k)
+    assert np.flatnonzero(suppressed(boxes, image, 0.15)).tolist() == keep
 
 
-def test_bootstrap_refuses_unequal_frames() -> None:
-    with pytest.raises(ValueError, match=r"a has 0 frames and b has 1, must be the same"):
-        compare([], [Matched(np.zeros(0), np.zeros(0, bool), 1)])
+@settings(max_examples=200, deadline=None)
+@given(
+    st.integers(1, 12),
+    st.lists(st.tuples(st.integers(0, 11), st.integers(0, 7), st.sampled_from([0.5, 0.6, 0.7, 0.8])), max_size=40),
+    st.sampled_from(["remaining", "first"]),
+)
+def test_matching_in_rounds_is_serving_by_rank(count: int, pairs: list[tuple[int, int, float]], rule: str) -> None:
+    unique = list({(i % count, j): (i % count, j, v) for i, j, v in pairs}.values())
+    taken: set[int] = set()
+    expected = []
+    for detection in range(count):
+        options = sorted((-v, j) for i, j, v in unique if i == detection)[: 1 if rule == "first" else None]
+        free = [j for _, j in options if j not in taken]
+        taken.update(free[:1])
+        expected.append(bool(free))
+    i, j, v = (np.array([p[c] for p in unique], kind) for c, kind in enumerate((int, int, float)))
+    assert hits(count, i, j, v, rule).tolist() == expected
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_a_threshold_after_is_a_threshold_before(seed: int, tau: float) -> None:
+    """Suppression and matching go best first, so what is below τ changes nothing above it."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    truth = Boxes(rng.uniform(-12, 12, (9, 2)), np.tile((4.5, 1.9), (9, 1)), rng.uniform(-3, 3, 9), np.ones(9))
+    near = rng.integers(0, 9, 60)
+    found = Boxes(
+        truth.xy_m[near] + rng.normal(0, 1, (60, 2)),
+        truth.size_m[near],
+        truth.yaw_rad[near],
+        np.round(rng.random(60), 1),
+    )
+    after = match(suppress(found, 0.15), truth).at(tau)
+    before = match(suppress(found.take(found.score >= tau), 0.15), truth)
+    assert after.score.tolist() == before.score.tolist()
+    assert after.hit.tolist() == before.hit.tolist()
+
+
+def outside_ap(frames: list[tuple[Boxes, Boxes]], convention: Convention) -> float:
+    """AP by pycocotools: its matching, its sorting and its interpolation, on overlaps that shapely works out.
+
+    It takes the precision at given recalls. In the middle between k and k + 1 hits the interpolated curve is flat, so
+    the mean over those recalls is the area under it.
+    """
+    coco, dt = COCO(), []
+    total = sum(len(truth) for _, truth in frames)
+    coco.dataset = {"images": [{"id": k} for k in range(len(frames))], "categories": [{"id": 1}], "annotations": []}
+    ids = iter(range(1, 1_000_000))
+    for k, (found, truth) in enumerate(frames):
+        for _ in range(len(truth)):
+            one = {"id": next(ids), "image_id": k, "category_id": 1, "bbox": [0, 0, 9, 9], "area": 81, "iscrowd": 0}
+            coco.dataset["annotations"].append(one)
+        order = np.argsort(-found.score, kind="stable")
+        place = np.argsort(order)
+        for n in range(len(found)):
+            # a sort within frames alone is a sort by (frame, place)
+            score = found.score[n] if convention.sort == "all" else -1000.0 * k - place[n]
+            dt.append({"image_id": k, "category_id": 1, "bbox": [0, 0, 9, 9], "score": float(score)})
+    with contextlib.redirect_stdout(io.StringIO()):
+        coco.createIndex()
+        if not dt:
+            return 0.0
+        run = COCOeval(coco, coco.loadRes(dt), "bbox")
+        run.params.iouThrs, run.params.maxDets = np.array([0.5]), [10_000]
+        run.params.areaRng, run.params.areaRngLbl = [[0, 1e9]], ["all"]
+        run.params.recThrs = (
+            (np.arange(total) + 0.5) / total if convention.points == "all" else np.arange(11) / 10 - 1e-9
+        )
+
+        def overlaps(image: int, category: int) -> np.ndarray:
+            found, truth = frames[image]
+            table = np.zeros((len(found), len(truth)))
+            for row, n in zip(table, np.argsort(-found.score, kind="stable"), strict=True):
+                for m in range(len(truth)):
+                    p, q = polygon(found.table()[n]), polygon(truth.table()[m])
+                    if convention.overlap == "axis-aligned":
+                        p, q = p.envelope, q.envelope
+                    row[m] = p.intersection(q).area / p.union(q).area
+            if convention.match == "first" and table.size:
+                table *= table == table.max(axis=1, keepdims=True)
+            return table
+
+        run.computeIoU = overlaps
+        run.evaluate()
+        run.accumulate()
+    return float(run.eval["precision"].mean())
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_every_convention_equals_an_outside_implementation(name: str, seed: int) -> None:
+    convention = CONVENTIONS[name]
+    frames = some_frames(100 + seed, 10)
+    # no two scores alike: what ties are worth is each implementation's own choice
+    scores = iter(np.random.Generator(np.random.PCG64(seed)).permutation(2000) / 2000)
+    frames = [
+        (Boxes(f.xy_m, f.size_m, f.yaw_rad, np.array([next(scores) for _ in range(len(f))])), t) for f, t in frames
+    ]
+    ours = average_precision([match(f, t, convention=convention) for f, t in frames], convention)
+    assert ours == pytest.approx(outside_ap(frames, convention), abs=1e-6)
+    assert 0.05 < ours < 0.95
+
+
+def test_the_conventions_differ_as_they_should() -> None:
+    frames = some_frames(3, 12)
+    ap = {name: [] for name in CONVENTIONS}
+    for shift in range(3):
+        for name, convention in CONVENTIONS.items():
+            turned = frames[shift:] + frames[:shift]
+            ap[name].append(average_precision([match(f, t, convention=convention) for f, t in turned], convention))
+    assert max(ap["rotated"]) == min(ap["rotated"])
+    assert max(ap["uav3d"]) == min(ap["uav3d"])
+    assert max(ap["opencood"]) > min(ap["opencood"]), "there the order of frames decides"
+    assert ap["rotated"][0] != ap["uav3d"][0]
+
+
+def test_a_detection_whose_best_truth_is_gone() -> None:
+    size = np.array([(4.0, 2.0)])
+    truth = Boxes(np.array([(0.0, 0.0), (0.8, 0.0)]), size.repeat(2, 0), np.zeros(2), np.ones(2))
+    found = Boxes(np.array([(0.8, 0.0), (0.5, 0.0)]), size.repeat(2, 0), np.zeros(2), np.array([0.9, 0.8]))
+    assert match(found, truth).hit.tolist() == [True, True]
+    assert match(found, truth, convention=CONVENTIONS["uav3d"]).hit.tolist() == [True, False]
+
+
+def test_eleven_points() -> None:
+    curve = [Matched(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, False, True, False]), 4)]
+    # recall 0.25 at precision 1, 0.5 at 2/3: levels 0, 0.1, 0.2 see 1, levels 0.3, 0.4, 0.5 see 2/3
+    assert average_precision(curve, Convention(points="11")) == pytest.approx((3 * 1 + 3 * 2 / 3) / 11)
+    assert average_precision(curve) == pytest.approx(0.25 * 1 + 0.25 * 2 / 3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(a=box, b=box)
+def test_axis_aligned_overlap_is_of_the_hulls(a: tuple[float, ...], b: tuple[float, ...]) -> None:
+    p, q = polygon(np.array(a)).envelope, polygon(np.array(b)).envelope
+    _, _, value = overlapping(np.array([a]), np.array([b]), kind="axis-aligned")
+    expected = p.intersection(q).area / p.union(q).area
+    assert (value[0] if len(value) else 0.0) == pytest.approx(expected, abs=1e-6)
+
+
+def test_near_pairs_are_brute_forces() -> None:
+    a, of_a, _ = crowd(1)
+    b, of_b, _ = crowd(2)
+    i, j = near_pairs(a, b, of_a, of_b)
+    reach = 0.5 * (np.hypot(*a[:, 2:4].T)[:, None] + np.hypot(*b[:, 2:4].T))
+    apart = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
+    expected = np.argwhere((apart <= reach) & (of_a[:, None] == of_b))
+    assert sorted(zip(i.tolist(), j.tolist(), strict=True)) == [tuple(row) for row in expected.tolist()]
+    assert len(expected) > 100
+    assert [len(x) for x in near_pairs(a, b[:0], of_a, of_b[:0])] == [0, 0]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 2, math.pi, 1e-10, -1e-8])
+@pytest.mark.parametrize("twist", [0.0, math.pi / 2, math.pi, 1e-12, -1e-10, 1e-9, 1e-6])
+def test_edges_that_coincide(turn: float, twist: float) -> None:
+    c, s = math.cos(turn), math.sin(turn)
+    at = [
+        (u, v, *size)
+        for u in (0, 1, 2.5, 4, 4.0000000001)
+        for v in (0, 0.5, 1.0000000001, 2, -2)
+        for size in ((4, 2), (2, 1), (4, 1))
+    ]
+    b = np.array([(7 + c * u - s * v, 9 + s * u + c * v, length, width, turn + twist) for u, v, length, width in at])
+    a = np.tile((7.0, 9.0, 4.0, 2.0, turn), (len(b), 1))
+    assert iou_pairs(a, b) == pytest.approx([plain_iou(p, q) for p, q in zip(a, b, strict=True)], abs=1e-6)
+    assert iou_pairs(b, a) == pytest.approx(iou_pairs(a, b), abs=1e-6)

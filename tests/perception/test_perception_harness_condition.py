@@ -1,0 +1,68 @@
+"""Conditions: what they refuse, their labels, and which of them are the same."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perception.harness.condition import FULL_SHARING, SINGLE, Condition
+
+conditions = st.one_of(
+    st.just(SINGLE),
+    st.builds(
+        Condition,
+        st.floats(0, 1),
+        st.sampled_from(["all-4", "best-1", "best-2", "best-4", "worst-2", "worst-3", "random-2", "random-4"]),
+        st.sampled_from(["uniform", "overlap"]),
+        st.sampled_from(["confidence", "norm"]),
+        st.sampled_from(["zero", "masked"]),
+        st.booleans(),
+    ),
+)
+
+
+@given(conditions)
+def test_a_label_names_its_condition(condition: Condition) -> None:
+    assert Condition.parse(condition.label) == condition
+
+
+def test_labels_are_short() -> None:
+    assert SINGLE.label == "single"
+    assert FULL_SHARING.label == "all-4@1"
+    assert Condition(0.02, "best-2").label == "best-2@0.02"
+    assert Condition(0.1, "all-4", "overlap", "norm", "masked", True).label == "all-4@0.1,overlap,norm,masked,roi"
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"rho": 1.5}, "rho is 1.5, must be 0 to 1"),
+        ({"rho": float("nan")}, "rho is nan, must be 0 to 1"),
+        ({"rho": 0.1, "peers": "nearest-2"}, "peers is 'nearest-2', must be none, or all-k, best-k"),
+        ({"rho": 0.1, "peers": "best-0"}, "peers is 'best-0', must be"),
+        ({"rho": 0.1, "peers": "none"}, "rho is 0.1 with no peers, must be 0"),
+        ({"rho": 0.1, "allocation": "equal"}, "allocation is 'equal', must be uniform or overlap"),
+        ({"rho": 0.1, "cells_by": "luck"}, "cells_by is 'luck', must be confidence or norm"),
+        ({"rho": 0.1, "unsent": "gone"}, "unsent is 'gone', must be zero or masked"),
+    ],
+)
+def test_what_a_condition_refuses(knobs: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Condition(**knobs)
+
+
+@pytest.mark.parametrize("label", ["", "best-2", "best-2@x", "best-2@0.1,loud", "best-2@7"])
+def test_what_is_no_label(label: str) -> None:
+    with pytest.raises(ValueError, match="must be like best-2@0\\.02,masked"):
+        Condition.parse(label)
+
+
+def test_conditions_that_differ_in_nothing() -> None:
+    parse = Condition.parse
+    assert parse("best-4@0.1").plain() == parse("worst-4@0.1").plain() == parse("all-4@0.1")
+    assert parse("best-2@0.1").plain() == parse("best-2@0.1")
+    assert parse("all-4@1,overlap,norm,roi").plain() == FULL_SHARING
+    assert parse("best-2@0.5,norm").plain() == parse("best-2@0.5"), "half of full sharing is all that two have"
+    assert parse("best-2@0.49,norm").plain() == parse("best-2@0.49,norm")
+    assert parse("all-4@0,masked").plain() == SINGLE
+    assert parse("all-4@0").plain() == parse("all-4@0"), "four silent peers still dilute"
+    assert parse("best-2@0.4").plain(drones=3) == parse("all-2@0.4")

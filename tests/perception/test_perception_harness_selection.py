@@ -1,0 +1,181 @@
+"""Who shares, how many cells, and which: against brute force, shapely and the sortie's own rules."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perception import budget
+from perception.geometry import FULL, SMALL
+from perception.harness import selection
+from perception.harness.condition import Condition
+from policies.geometry import circle_overlap
+
+CROSS = np.array([(0.0, 0.0), (20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)])
+RADII = np.full(5, selection.FOOTPRINT_M)
+coordinate = st.floats(-120, 120)
+fleets = st.integers(2, 6).flatmap(
+    lambda n: st.tuples(
+        st.lists(st.tuples(coordinate, coordinate), min_size=n, max_size=n),
+        st.lists(st.floats(20, 60), min_size=n, max_size=n),
+    )
+)
+
+
+def test_the_footprint_is_the_papers() -> None:
+    assert pytest.approx(42.0, abs=0.02) == selection.FOOTPRINT_M
+
+
+@settings(max_examples=60, deadline=None)
+@given(fleets)
+def test_overlap_equals_shapely_discs_and_the_policies(fleet: tuple) -> None:
+    xy, radius = np.array(fleet[0]), np.array(fleet[1])
+    ours = selection.footprint_overlap(xy, radius)
+    discs = [shapely.Point(p).buffer(r, quad_segs=256) for p, r in zip(xy, radius, strict=True)]
+    for i, j in itertools.product(range(len(xy)), repeat=2):
+        area = discs[i].intersection(discs[j]).area / discs[i].area
+        assert ours[i, j] == pytest.approx(area, abs=2e-4)
+        # the policies' overlap is of the smaller footprint, ours of the receiver's
+        smaller = min(radius[i], radius[j])
+        theirs = circle_overlap(math.dist(xy[i], xy[j]), radius[i], radius[j]) * (smaller / radius[i]) ** 2
+        assert ours[i, j] == pytest.approx(theirs, abs=1e-9)
+
+
+def test_best_worst_and_all_in_a_cross() -> None:
+    overlap = selection.footprint_overlap(CROSS, RADII)
+    # drone 1 is at the tip: the centre is nearest, the opposite tip farthest, equal ones go by id
+    assert selection.choose(Condition(0.1, "best-2"), 1, overlap[1]) == (0, 2)
+    assert selection.choose(Condition(0.1, "worst-2"), 1, overlap[1]) == (4, 3)
+    assert selection.choose(Condition(0.1, "all-4"), 1, overlap[1]) == (0, 2, 4, 3)
+    assert selection.choose(Condition(0.0, "none"), 1, overlap[1]) == ()
+
+
+@given(st.lists(st.floats(0, 1), min_size=5, max_size=5), st.integers(0, 4), st.integers(1, 4))
+def test_best_and_worst_are_brute_forces(overlap: list[float], ego: int, k: int) -> None:
+    row = np.array(overlap)
+    peers = [i for i in range(5) if i != ego]
+    by_sum = {sum(sorted(overlap[i] for i in c)) for c in itertools.combinations(peers, k)}
+    chosen = {rule: selection.choose(Condition(0.1, f"{rule}-{k}"), ego, row) for rule in ("best", "worst", "random")}
+    assert sum(sorted(overlap[i] for i in chosen["best"])) == max(by_sum)
+    assert sum(sorted(overlap[i] for i in chosen["worst"])) == min(by_sum)
+    for some in chosen.values():
+        assert len(set(some)) == k
+        assert ego not in some
+        assert list(some) == sorted(some, key=lambda i: (-overlap[i], i)), "most overlapping first"
+
+
+def test_random_peers_are_the_frames_own_and_even() -> None:
+    overlap, condition = selection.footprint_overlap(CROSS, RADII), Condition(0.1, "random-2")
+    draws = [selection.choose(condition, 0, overlap[0], (7, n)) for n in range(3000)]
+    assert draws[5] == selection.choose(condition, 0, overlap[0], (7, 5))
+    pairs = [draws.count(pair) for pair in itertools.combinations((1, 2, 3, 4), 2)]
+    assert sum(pairs) == 3000
+    assert min(pairs) > 400  # 500 expected, σ 20
+    other = [selection.choose(condition, 1, overlap[1], (7, n)) for n in range(50)]
+    assert len(set(other)) > 3
+    assert draws[:50] != [selection.choose(condition, 0, overlap[0], (7, n), seed=1) for n in range(50)]
+
+
+@pytest.mark.parametrize("peers", ["best-5", "all-3", "all-5"])
+def test_a_condition_that_does_not_fit_the_fleet(peers: str) -> None:
+    with pytest.raises(ValueError, match=f"peers is '{peers}', must fit a fleet with 4 peers"):
+        selection.choose(Condition(0.1, peers), 0, np.ones(5))
+
+
+@pytest.mark.parametrize(
+    ("rho", "cells"), [(1, 16384), (0.25, 4096), (0.1, 1638), (0.05, 819), (0.02, 327), (0.01, 163), (0, 0)]
+)
+def test_the_papers_budgets_in_cells(rho: float, cells: int) -> None:
+    assert selection.total_cells(rho, 4) == cells
+
+
+overlaps = st.lists(st.one_of(st.just(0.0), st.floats(1e-6, 1)), min_size=1, max_size=5)
+
+
+@given(st.integers(0, 20_000), overlaps, st.sampled_from(["uniform", "overlap"]))
+def test_allocation_spends_the_whole_budget(total: int, overlap: list[float], rule: str) -> None:
+    cells = selection.allocate(total, overlap, rule)
+    assert sum(cells) == min(total, 4096 * len(overlap))
+    assert all(0 <= c <= 4096 for c in cells)
+
+
+@given(st.integers(0, 400), st.lists(st.integers(0, 9), min_size=1, max_size=4), st.integers(1, 100))
+def test_allocation_is_the_fairest_there_is(total: int, weights: list[int], most: int) -> None:
+    """Brute force: cell by cell to whoever is farthest below the quota, all quotas found by raising one level."""
+    overlap = [w / 9 for w in weights]
+    cells = selection.allocate(total, overlap, "overlap", most)
+    left, quota, open_, share = (
+        float(total),
+        [0.0] * len(weights),
+        set(range(len(weights))),
+        [float(w) for w in weights],
+    )
+    while open_:  # pour level by level: whoever is filled first leaves
+        if sum(share[i] for i in open_) == 0:
+            share = [1.0] * len(weights)
+        whole = sum(share[i] for i in open_)
+        over = [i for i in open_ if share[i] * left / whole >= most - 1e-9]
+        if not over:
+            for i in open_:
+                quota[i] = share[i] * left / whole
+            break
+        for i in over:
+            quota[i] = most
+            left -= most
+            open_.discard(i)
+    for c, q in zip(cells, quota, strict=True):
+        assert q - 1 < c + 1e-6
+        assert c - 1e-6 < q + 1
+
+
+def test_remainders_go_to_the_largest_fraction_then_to_more_overlap() -> None:
+    assert selection.allocate(327, [0.4, 0.7, 0.7, 0.6], "uniform") == [81, 82, 82, 82]
+    assert selection.allocate(10, [0.5, 0.25, 0.25], "overlap") == [5, 3, 2]
+    assert selection.allocate(5000, [0.9, 0.1], "overlap") == [4096, 904]
+    assert selection.allocate(10, [0.0, 0.0], "overlap") == [5, 5]
+    assert selection.allocate(16384, [0.9, 0.1], "uniform") == [4096, 4096]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 30), st.booleans(), st.integers(0, 4096))
+def test_sent_cells_are_brute_forces(seed: int, levels: int, with_roi: bool, cells: int) -> None:
+    rng = np.random.Generator(np.random.PCG64(seed))
+    rank = rng.integers(0, levels, (2, 64, 64)).astype(np.float32)  # many ties
+    first = rng.random((2, 64, 64)) < 0.1 if with_roi else None
+    order = selection.sending_order(rank, first)
+    for d in range(2):
+        wanted = sorted(
+            range(4096),
+            key=lambda i: (first is not None and not first[d].flat[i], -rank[d].flat[i], i),
+        )[:cells]
+        assert set(np.flatnonzero(order[d] < cells).tolist()) == set(wanted)
+
+
+def test_without_a_disc_the_cells_are_the_sorties() -> None:
+    rank = np.random.Generator(np.random.PCG64(3)).normal(size=(1, 64, 64)).astype(np.float32)
+    order = selection.sending_order(rank)
+    for rho in (0.02, 0.1, 0.25, 1.0):
+        sent = budget.select(rank[0], rho, None, 0.0, 0.0, 0.0)
+        assert np.array_equal(order[0] < math.floor(rho * 4096), sent)
+
+
+@given(st.tuples(coordinate, coordinate, st.floats(1, 60)), st.tuples(coordinate, coordinate, st.floats(-4, 4)))
+def test_the_disc_is_the_sorties(disc: tuple, pose: tuple) -> None:
+    assert np.array_equal(selection.in_disc(np.array([pose]), disc)[0], budget.roi_mask(disc, *pose))
+
+
+def test_the_disc_in_cells() -> None:
+    at = np.zeros((1, 3))
+    assert selection.in_disc(at, (0.0, 0.0, 32.0), FULL).sum() == pytest.approx(314, abs=6)
+    assert selection.in_disc(at, (0.0, 0.0, 32.0), SMALL).sum() == pytest.approx(4 * 314, abs=20)
+
+
+def test_bytes_are_the_papers() -> None:
+    assert selection.link_bytes([4096] * 4) == (4 * 655_360, 0)
+    assert selection.link_bytes([1024] * 4) == (4 * 163_840, 4 * 512)
+    assert selection.link_bytes([82, 82, 82, 81]) == (327 * 160, 3 * 123 + 122)
+    assert selection.link_bytes([]) == (0, 0)
