@@ -1,4 +1,4 @@
-"""The command line: fly, compare, view, check, list, train."""
+"""The command line: fly, compare, view, check, list, train; `paper` is in a file of its own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
-from sim import rundir, tables
+from sim import cli_bench, cli_paper, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.expect import check as check_expectations
 from sim.outcome import outcome
@@ -29,6 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Fly drone fleets that share what they see, and tell what they saw and what it cost.",
 )
+app.add_typer(cli_bench.app, name="bench")
 out = Console()
 err = Console(stderr=True, highlight=False)
 
@@ -212,6 +213,9 @@ def train(
             progress=progress,
         )
     out.print(tables.training_table(result))
+
+
+app.command()(cli_paper.paper)
 
 
 @app.callback(invoke_without_command=True)

@@ -6,6 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.bench.dataset import SIZES, Benchmark, Frames, load_frames, make_split
+from perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
 from perception.harness.claims import conditions
 from perception.harness.condition import CellsBy, Unsent
 from perception.harness.contract import FleetFrames, Instrument
@@ -13,6 +18,8 @@ from perception.harness.evaluate import FLOOR, Evaluation, evaluate
 from perception.harness.measures import under
 from perception.harness.scores import Bootstrap, By
 from perception.harness.statistics import DRAWS
+from perception.render import Renderer
+from perception.scene import SceneModel
 
 TAU = 0.1
 """UAV3D's head cuts its scores there; also the paper's, as far as it says."""
@@ -45,6 +52,7 @@ def measure(
     asked: Asked = Asked(),
     *,
     store: Path | None = None,
+    workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Mapping[Unsent, Bootstrap]:
     """Evaluate what the claims need, all instruments over the same features; the scores of each.
@@ -52,9 +60,31 @@ def measure(
     Args:
         instrument, frames: a model and what it looks at.
         store: a folder for finished frames; a later call with the same arguments goes on from there.
+        workers: frames worked on side by side; the numbers do not depend on it.
         progress: called with frames done and frames in all.
     """
     every = dict.fromkeys(under(c, unsent, asked.cells_by) for unsent in asked.unsent for c in conditions())
-    found: Evaluation = evaluate(instrument, frames, tuple(every), store=store, progress=progress)
+    found: Evaluation = evaluate(instrument, frames, tuple(every), store=store, workers=workers, progress=progress)
     cut = found.at(asked.tau)
     return {u: Bootstrap(cut, u, asked.cells_by, by=asked.by, draws=asked.draws) for u in asked.unsent}
+
+
+def bench_frames(seed: int, count: int, root: Path, progress: Callable[[int, int], None] | None = None) -> Frames:
+    """The first `count` frames of the benchmark's test split, each of a scene of its own; made where they are missing.
+
+    Raises:
+        ValueError: more frames than the split has.
+    """
+    scenes, per_scene = SIZES["test"]
+    if not 1 <= count <= scenes * per_scene:
+        raise ValueError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
+    return load_frames(make_split(Benchmark(seed), "test", root, scenes=count, progress=progress))
+
+
+def camera_views(seed: int, frame: int) -> NDArray[np.uint8]:
+    """[drone, camera, height, width, 3]: what the drones' cameras see in a frame of the test split, rendered anew."""
+    bench, name = Benchmark(seed), scene_id(seed, "test", frame)
+    scene = SceneModel(draw_scene(seed, "test", frame, bench.difficulty), None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    captures = draw_captures(seed, "test", frame, 0, bench.difficulty)
+    views: NDArray[np.uint8] = Renderer(scene, name).render(captures)
+    return views

@@ -1,12 +1,13 @@
 """One frame as the paper's data figure shows it: what was there, what an ego found, which cells its peers shared at two budgets.
 
-Free of torch; drawn by `figures.data_figure` and, in Rerun, by the simulator's playback.
+Free of torch; drawn by `figure_frame.draw` and, in Rerun, by the simulator's playback.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,7 @@ def sharers(exchange: Exchange, est_pose: Floats, geometry: Geometry) -> NDArray
     return count
 
 
-def to_world(forward: Floats, left: Floats, pose: Floats) -> tuple[Floats, Floats]:
+def to_world(forward: NDArray[Any], left: NDArray[Any], pose: Floats) -> tuple[Floats, Floats]:
     """Points of a drone's level frame, put into the world by its pose (x, y, yaw)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return pose[0] + c * forward - s * left, pose[1] + s * forward + c * left

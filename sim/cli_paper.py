@@ -1,0 +1,168 @@
+"""`sortie paper`: the command."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from perception.harness import report
+from perception.harness.rows import INSTRUMENTS, Row
+from perception.harness.verdict import Verdict
+from sim.rundir import RunError
+
+if TYPE_CHECKING:
+    from perception.harness.picture import Picture
+
+COLOURS = {Verdict.REPRODUCED: "green", Verdict.NOT_REPRODUCED: "yellow", Verdict.OPPOSITE: "red"}
+
+
+def paper(
+    context: typer.Context,
+    frames: Annotated[int, typer.Option(help="Frames of the test split, each of a scene of its own.", min=2)] = 80,
+    seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
+    weights: Annotated[Path | None, typer.Option(help="A weights file; left out, the shipped one.")] = None,
+    unsent: Annotated[
+        str, typer.Option(help="What unsent cells count as: zero (the paper), masked, or both.")
+    ] = "both",
+    cells_by: Annotated[str, typer.Option(help="What ranks cells: confidence or norm.")] = "confidence",
+    tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
+    scenes: Annotated[bool, typer.Option("--by-scene", help="Resample whole scenes instead of frames.")] = False,
+    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
+    out_dir: Annotated[Path, typer.Option("--out", help="The report's folder.")] = Path("runs/paper"),
+    work: Annotated[
+        Path | None, typer.Option(help="Keeps the benchmark and finished frames; left out, the user's cache.")
+    ] = None,
+    readme: Annotated[Path | None, typer.Option(help="Write this file's results section anew.")] = None,
+    frame: Annotated[
+        int | None, typer.Option(help="Only open this frame in Rerun, as in the paper's data figure.", min=0)
+    ] = None,
+    ego: Annotated[int, typer.Option(help="With --frame: whose peers' cells.", min=0)] = 0,
+    show: Annotated[bool, typer.Option("--view", help="With --frame: open the viewer.")] = False,
+) -> None:
+    """The paper's Evaluation, claim by claim: its value, ours, and a verdict by rule.
+
+    What is finished is kept, so that a run that was cut off goes on where it was.
+    """
+    from perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
+    from perception.harness import figures
+    from perception.harness.paper import Asked
+    from sim import paper as making
+    from sim.cli import _progress, out
+
+    chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
+    if chosen is None:
+        raise RunError(f"unsent is {unsent!r}, must be zero, masked or both")
+    if cells_by not in ("confidence", "norm"):
+        raise RunError(f"cells_by is {cells_by!r}, must be confidence or norm")
+    folder = making.default_work() if work is None else work
+    try:
+        asked = Asked(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
+        cores = workers or os.cpu_count() or 1
+        job = making.Job(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context))
+        if frame is not None:
+            _open_frame(making.frame_picture(job, folder, frame, ego), out_dir / f"frame_{frame}.rrd", out, show=show)
+            return
+        making.ensure_writable(out_dir)
+        with _progress() as bar:
+            bars: dict[str, Callable[[float], None]] = {}
+
+            def progress(stage: str, done: int, of: int) -> None:
+                if stage not in bars:
+                    bars[stage] = bar(stage, of)
+                bars[stage](done)
+
+            result = making.make(job, folder, progress)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    making.write(result, out_dir)
+    out.print(verdicts_table(result.rows))
+    out.print(_tally(result.rows))
+    if not figures.available():
+        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
+    out.print(
+        f"{result.facts['cpu_s']:.0f} CPU-seconds, {result.facts['wall_s']:.0f} s; kept in [bold]{out_dir}[/bold]"
+    )
+    if readme is not None:
+        link = _relative(out_dir / making.REPORT, readme.parent)
+        making.put_into_readme(readme, result.rows, result.facts, link)
+        out.print(f"results section of [bold]{readme}[/bold] written")
+
+
+def verdicts_table(rows: Sequence[Row]) -> Table:
+    """Every claim: the paper's figure, ours under each instrument, and the verdicts."""
+    shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
+    table = Table(title="the paper's Evaluation, AP differences in points with 95 % intervals")
+    table.add_column("claim")
+    table.add_column("paper", justify="right")
+    for i in shown:
+        table.add_column(INSTRUMENTS[i], justify="right")
+        table.add_column("verdict")
+    claims: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        claims.setdefault(row.id, {})[row.instrument] = row
+    section = ""
+    for several in claims.values():
+        first = next(iter(several.values()))
+        if first.section != section:
+            section = first.section
+            table.add_section()
+            table.add_row(f"[bold]{section}[/bold]")
+        cells: list[str] = []
+        for k, i in enumerate(shown):
+            it = several.get(i) or (several.get("") if k == 0 else None)
+            cells += ["", ""] if it is None else [_safe(report.ours(it)), _coloured(it)]
+        table.add_row(_safe(first.says), _safe(report.papers(first)), *cells)
+    return table
+
+
+def _tally(rows: Sequence[Row]) -> str:
+    names: dict[str, str] = {str(i): name for i, name in INSTRUMENTS.items()}
+    names[""] = "measured on a flown sortie"
+    return "\n".join(
+        f"{name}: {report.tally(r for r in rows if r.instrument == i)}"
+        for i, name in names.items()
+        if any(r.instrument == i for r in rows)
+    )
+
+
+def _coloured(row: Row) -> str:
+    colour = COLOURS.get(Verdict(row.verdict), "dim")
+    return f"[{colour}]{row.verdict}[/{colour}]" + (f", {row.size}" if row.size and row.rule != "exact" else "")
+
+
+def _safe(text: str) -> str:
+    return text.replace("[", r"\[")
+
+
+def _open_frame(picture: Picture, path: Path, out: Console, *, show: bool) -> None:
+    from sim.playback import open_viewer
+    from sim.playback_frame import save_frame
+
+    save_frame(picture, path)
+    out.print(
+        f"{picture.name}, ego {picture.ego}: {len(picture.truth)} cars, {len(picture.found)} boxes; kept in [bold]{path}[/bold]"
+    )
+    if show:
+        open_viewer(path)
+
+
+def _command(context: typer.Context) -> str:
+    """The command with those options that the numbers depend on and that differ from their defaults."""
+    given = []
+    for parameter in context.command.params:
+        name, value = parameter.name, context.params.get(parameter.name or "")
+        if name in ("frames", "seed", "weights", "unsent", "cells_by", "tau", "scenes") and value != parameter.default:
+            shown = value.name if isinstance(value, Path) else value
+            given.append(parameter.opts[0] if value is True else f"{parameter.opts[0]} {shown}")
+    return " ".join(["sortie paper", *given])
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """The link from a file in `folder` to `path`."""
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
