@@ -1,0 +1,173 @@
+"""`sortie bench`: make the benchmark's scenes, look at a frame, verify the files, count what is in them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from perception.bench.difficulty import Difficulty
+from perception.bench.manifest import BenchmarkError, complaints, read
+from perception.geometry import Geometry
+from sim.rundir import RunError
+
+app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
+out = Console()
+err = Console(stderr=True, highlight=False)
+
+
+class SplitName(StrEnum):
+    train = "train"
+    validation = "validation"
+    tau = "tau"
+    test = "test"
+
+
+class DensityName(StrEnum):
+    sparse = "sparse"
+    default = "default"
+    dense = "dense"
+
+
+class RangeName(StrEnum):
+    full = "102.4"
+    small = "51.2"
+
+
+FolderArgument = Annotated[Path, typer.Argument(help="The benchmark's folder, the one with manifest.json.")]
+
+
+@app.command()
+def make(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder of benchmarks; each has its own folder in it.")] = Path(
+        "runs/bench"
+    ),
+    seed: Annotated[int, typer.Option(help="Another seed is another benchmark.", min=0)] = 0,
+    split: Annotated[list[SplitName] | None, typer.Option(help="Only this split; may be given again.")] = None,
+    range_: Annotated[RangeName, typer.Option("--range", help="How far the grids reach, ± metres.")] = RangeName.full,
+    density: Annotated[DensityName, typer.Option(help="How many cars.")] = DensityName.default,
+    scenes: Annotated[int | None, typer.Option(help="Only the first so many scenes of each split.", min=1)] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
+) -> None:
+    """Render the splits; what is there already is kept, and a run that was cut off goes on where it was."""
+    from perception.bench.dataset import SIZES, Benchmark, make_split
+
+    bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
+    with _told(), _bars() as bar:
+        for name in dict.fromkeys(s.value for s in split) if split else SIZES:
+            count = min(scenes or SIZES[name][0], SIZES[name][0])
+            make_split(bench, name, out_dir, scenes=count, workers=workers, progress=bar(f"{name} scenes"))
+    folder = bench.folder(out_dir)
+    table = Table("split", "scenes", "fleet-frames", title=f"seed {seed}, {density.value}, ±{range_.value} m")
+    for name, files in read(folder)["splits"].items():
+        table.add_row(name, f"{len(files)}", f"{sum(f['frames'] for f in files.values())}")
+    out.print(table)
+    out.print(f"kept in [bold]{folder}[/bold], see a frame with: sortie bench show {folder} test 0", soft_wrap=True)
+
+
+@app.command()
+def show(
+    folder: FolderArgument,
+    split: Annotated[SplitName, typer.Argument(help="Its split.")],
+    index: Annotated[int, typer.Argument(help="The scene's number in the split.", min=0)],
+    frame: Annotated[int, typer.Option(help="The frame's number in the scene.", min=0)] = 0,
+    out_file: Annotated[Path | None, typer.Option("--out", help="The PNG; left out, beside the splits.")] = None,
+) -> None:
+    """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
+    with _told():
+        from perception.bench.dataset import SIZES, Benchmark
+        from perception.bench.sheet import save, sheet
+
+        bench = Benchmark.at(folder)
+        count, frames = SIZES[split.value]
+        if index >= count:
+            raise ValueError(f"scene is {index}, must be 0 to {count - 1} in the {split.value} split")
+        if frame >= frames:
+            raise ValueError(f"frame is {frame}, must be 0 to {frames - 1} in the {split.value} split")
+        path = out_file or folder / "sheets" / f"{split.value}_{index}_{frame}.png"
+        save(sheet(bench, split.value, index, frame), path)
+    out.print(f"drawn in [bold]{path}[/bold]", soft_wrap=True)
+
+
+@app.command()
+def verify(folder: FolderArgument) -> None:
+    """Hold every file against the manifest; exit code 1 if one is missing or holds other data."""
+    with _told(), _bars() as bar:
+        from perception.bench.dataset import Benchmark
+
+        Benchmark.at(folder)
+        found = complaints(folder, bar("files"))
+    for line in found:
+        err.print(f"[red]{line}[/red]", soft_wrap=True)
+    if found:
+        raise typer.Exit(1)
+    count = sum(len(files) for files in read(folder)["splits"].values())
+    out.print(f"{count} files, all as the manifest says")
+
+
+@app.command()
+def survey(
+    seed: Annotated[int, typer.Option(help="The benchmark's seed.", min=0)] = 0,
+    density: Annotated[DensityName, typer.Option(help="How many cars.")] = DensityName.default,
+    range_: Annotated[RangeName, typer.Option("--range", help="How far the grids reach, ± metres.")] = RangeName.full,
+    scenes: Annotated[int, typer.Option(help="How many scenes of each split.", min=1)] = 12,
+) -> None:
+    """Count what the scenes hold, by split and style: cars, who can see them, houses. Nothing is rendered."""
+    from perception.bench.dataset import SIZES, Benchmark
+    from perception.bench.survey import by_style
+    from perception.bench.survey import survey as survey_scene
+
+    bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
+    table = Table("split", "style", "scenes", "cars a view", "seen alone", "by the fleet", "built", "height m", "lot m")
+    with _bars() as bar:
+        for split in SIZES:
+            done = bar(f"{split} scenes")
+            rows = []
+            for k in range(min(scenes, SIZES[split][0])):
+                rows.append(survey_scene(bench, split, k))
+                done(k + 1, scenes)
+            for style, n, mean in by_style(rows):
+                table.add_row(
+                    split, style, f"{n}", f"{mean.cars:.1f}", f"{mean.alone:.2f}", f"{mean.fleet:.2f}",
+                    f"{mean.built:.2f}", f"{mean.height_m:.1f}", f"{mean.lot_m:.1f}",
+                )  # fmt: skip
+    out.print(table)
+
+
+# --- helpers -------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """What a user can mend as one line: the command's entry point prints it and leaves with code 2."""
+    try:
+        yield
+    except ImportError as error:
+        if error.name != "matplotlib":
+            raise
+        raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
+    except OSError as error:
+        raise RunError(f"{error.filename}: {error.strerror}") from error
+    except (BenchmarkError, ValueError, json.JSONDecodeError) as error:
+        raise RunError(str(error)) from error
+
+
+@contextmanager
+def _bars() -> Iterator[Callable[[str], Callable[[int, int], None]]]:
+    """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+
+        def add(label: str) -> Callable[[int, int], None]:
+            task = progress.add_task(label, total=None)
+            return lambda done, of: progress.update(task, completed=done, total=of)
+
+        yield add
