@@ -18,12 +18,12 @@ from typing import cast
 import simpy
 from numpy.typing import ArrayLike
 
-from radio.airtime import fragments, frame_bytes, repair_wire_bytes, sample_wire_bytes
+from radio.airtime import frame_bytes, repair_wire_bytes, sample_wire
 from radio.broadcasts import Broadcast, Broadcasts, OnHeard
 from radio.channel import Channel, FloatArray, Jammer, SampleLuck
 from radio.counters import Counters
 from radio.goodput import Goodput
-from radio.medium import End, Job, Medium
+from radio.medium import End, Medium
 from radio.sample import Sample, Service
 from radio.transmission import Status, Transmission, losses
 from scenarios.schema import Radio
@@ -71,7 +71,7 @@ class Air:
             config, self.channel, self.counters, self._gone,
             seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
         )  # fmt: skip
-        self.medium = Medium(env, n_drones, self._begin, self._end, self._broadcasts.end)
+        self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
         self._service = Service(config)
         self._luck = SampleLuck(seed, replication)
         self._goodput = Goodput(n_drones)
@@ -165,15 +165,11 @@ class Air:
         now = self._env.now
         number = self._numbers
         self._numbers = number + 1
-        fragment_bytes = self._config.fragment_bytes
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            fragments=fragments(payload_bytes, fragment_bytes),
-            wire_bytes=sample_wire_bytes(payload_bytes, fragment_bytes),
-            luck=self._luck.next(sender, receiver),
-            snr_db=self._snr_rows[sender][receiver],
+            *sample_wire(payload_bytes, self._config.fragment_bytes), self._luck.next(sender, receiver),
+            self._snr_rows[sender][receiver], self._drained(sender),
         )  # fmt: skip
-        s.drained_bits = self._drained(sender)
         self._in_flight[number] = s
         self.counters.data_sent_bytes += payload_bytes
         if sender in self._gone:
@@ -188,7 +184,7 @@ class Air:
         elif old.live:
             served = self.medium.in_service(sender) is old
             self.medium.replace(old, s)
-            self._measure(old, served)
+            self._measure(old, served, now)
             self._close(old, Status.EXPIRED, "replaced")
         else:  # it waits for its repair, outside the medium
             self.medium.submit(s)
@@ -216,17 +212,15 @@ class Air:
         if s.number in self._in_flight:
             self._close(s, Status.LOST, "sender_gone")
 
-    def _begin(self, job: Job) -> None:
+    def _begin(self, s: Sample, now_s: float) -> None:
         """A sample comes to the head of its queue, or its link has changed while it is there."""
-        s = cast(Sample, job)
         self._book(s)
         i, j = s.sender, s.receiver
-        self._service.begin(s, self._env.now, self._known_rows[i][j], self._snr_rows[i][j], j in self._gone)
+        self._service.begin(s, now_s, self._known_rows[i][j], self._snr_rows[i][j], j in self._gone)
 
-    def _end(self, job: Job, how: End) -> None:
+    def _end(self, s: Sample, how: End, now_s: float) -> None:
         """The medium is through with a sample's pass, or its deadline has passed."""
-        s = cast(Sample, job)
-        self._measure(s, how is not End.DEADLINE_QUEUED)
+        self._measure(s, how is not End.DEADLINE_QUEUED, now_s)
         if how is not End.SERVED:
             queued = how is End.DEADLINE_QUEUED and s.repairs == 0
             if queued:
@@ -247,7 +241,7 @@ class Air:
         else:
             s.left = lost
             wait_s = self._config.heartbeat_s + self._config.nack_delay_s
-            wait_s = max(0.0, min(wait_s, s.deadline_s - self._env.now))
+            wait_s = max(0.0, min(wait_s, s.deadline_s - now_s))
             self._env.timeout(wait_s, s).callbacks.append(self._repair)
 
     def _repair(self, event: simpy.Event) -> None:
@@ -287,12 +281,11 @@ class Air:
         Samples that are still in service or queued lower it already by how little has got through so far.
         """
         known = self._goodput.read(sender)
-        if self.medium.in_service(sender) is not None:
-            drained = self._drained(sender)
-            now = self._env.now
-            for job in self.medium.queued(sender):
-                s = cast(Sample, job)
-                if job is self.medium.in_service(sender) and now - s.mark_s >= _WINDOW_S:
+        head = self.medium.in_service(sender)
+        if head is not None:
+            drained, now = self._drained(sender), self._env.now
+            for s in self.medium.queued(sender):
+                if s is head and now - s.mark_s >= _WINDOW_S:
                     since, bits = s.mark_s, s.mark_bits
                 else:
                     since, bits = s.t_sent_s, drained - s.drained_bits
@@ -303,29 +296,29 @@ class Air:
 
     def _book(self, s: Sample) -> None:
         """Count what was acknowledged since the last time."""
-        self._drained_bits[s.sender] += s.book()
+        if s.remaining < s.mark_left:
+            self._drained_bits[s.sender] += s.book()
 
     def _drained(self, sender: int) -> float:
         """What the sender has got through so far, bits as goodput counts them."""
         head = self.medium.in_service(sender)
         if head is not None:
             self.medium.sync()
-            self._book(cast(Sample, head))
+            self._book(head)
         return self._drained_bits[sender]
 
-    def _measure(self, s: Sample, served: bool) -> None:
+    def _measure(self, s: Sample, served: bool, now_s: float) -> None:
         """Learn from a sample whose service, or whose wait for it, is over."""
-        now = self._env.now
-        if not served:
-            waited = now - s.t_sent_s
+        if served:
+            self._book(s)
+            window = now_s - s.mark_s
+            if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.t_start_s):
+                self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6)
+        else:
+            waited = now_s - s.t_sent_s
             if s.repairs == 0 and waited >= _WINDOW_S:
                 rate = (self._drained(s.sender) - s.drained_bits) / waited * 1e-6
                 self._goodput.bounded(s.sender, s.receiver, rate)
-            return
-        self._book(s)
-        window = now - s.mark_s
-        if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.t_start_s):
-            self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6)
 
     # --- accounts --------------------------------------------------------------------------------
 

@@ -47,10 +47,10 @@ def frame_bytes(payload_bytes: int, *, fragmented: bool = False, unicast: bool =
 
 
 @lru_cache(maxsize=4096)
-def sample_wire_bytes(payload_bytes: int, fragment_bytes: int) -> int:
-    """Every byte of a unicast sample's frames, each counted once."""
+def sample_wire(payload_bytes: int, fragment_bytes: int) -> tuple[int, int]:
+    """A unicast sample's fragments, and every byte of its frames, each counted once."""
     k = fragments(payload_bytes, fragment_bytes)
-    return payload_bytes + k * frame_bytes(0, fragmented=k > 1)
+    return k, payload_bytes + k * frame_bytes(0, fragmented=k > 1)
 
 
 @lru_cache(maxsize=4096)

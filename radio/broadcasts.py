@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Set
-from typing import cast
 
 from radio.airtime import frame_bytes, group_frame_s
 from radio.channel import Channel
@@ -14,6 +13,8 @@ from scenarios.streams import stream
 
 MAX_GROUP_PAYLOAD_BYTES = 2200
 """A group-addressed sample is one 802.11 frame."""
+
+_GROUP_OVERHEAD_BYTES = frame_bytes(0, unicast=False)
 
 OnHeard = Callable[[list[int]], None]
 
@@ -79,17 +80,17 @@ class Broadcasts:
             ready.extend(self._access_streams[sender].random((256, 2)).tolist()[::-1])
         slot_u, residual = ready.pop()
         airtime_s = group_frame_s(payload_bytes, self._rate_mbps)
-        mpdu_bytes = frame_bytes(payload_bytes, unicast=False)
-        self._counters.broadcasts += 1
-        self._counters.context_sent_bytes += payload_bytes
+        mpdu_bytes = payload_bytes + _GROUP_OVERHEAD_BYTES
+        counters = self._counters
+        counters.broadcasts += 1
+        counters.context_sent_bytes += payload_bytes
         return Broadcast(sender, airtime_s, int(slot_u * (CW_CONTEXT + 1)), residual, mpdu_bytes, on_heard)
 
-    def end(self, frame: GroupFrame, collided: bool) -> None:
+    def end(self, frame: Broadcast, collided: bool) -> None:
         """The medium is through with a frame."""
-        frame = cast(Broadcast, frame)
         counters, sender, gone = self._counters, frame.sender, self._gone
         counters.context_wire_bytes += frame.mpdu_bytes
-        living = self._n - 1 - len(gone - {sender})
+        living = self._n - 1 - (len(gone - {sender}) if gone else 0)
         if collided:
             counters.collided += 1
             counters.missed += living
@@ -101,7 +102,9 @@ class Broadcasts:
         self._heard_frame[sender] = (index, times)
         row = self._reach_bytes[sender] if times == 0 else self._channel.reach_again(sender, times).tolist()
         length = frame.mpdu_bytes
-        heard = [i for i, reach in enumerate(row) if reach >= length and i not in gone]
+        heard = [i for i, reach in enumerate(row) if reach >= length]
+        if gone:
+            heard = [i for i in heard if i not in gone]
         counters.receptions += len(heard)
         counters.missed += living - len(heard)
         frame.on_heard(heard)

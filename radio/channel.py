@@ -227,15 +227,16 @@ class SampleLuck:
 
     def __init__(self, seed: int, replication: int) -> None:
         self._key = (seed, replication)
-        self._links: dict[tuple[int, int], tuple[np.random.Generator, list[list[float]]]] = {}
+        self._streams: dict[tuple[int, int], np.random.Generator] = {}
+        self._ready: dict[tuple[int, int], list[list[float]]] = {}
 
     def next(self, sender: int, receiver: int) -> list[float]:
         """The numbers of the link's next sample."""
         link = (sender, receiver)
-        known = self._links.get(link)
-        if known is None:
-            known = self._links[link] = (stream(*self._key, link, "fragment loss"), [])
-        generator, ready = known
+        ready = self._ready.get(link)
+        if ready is None:
+            ready = self._ready[link] = []
+            self._streams[link] = stream(*self._key, link, "fragment loss")
         if not ready:
-            ready.extend(generator.random((self._BLOCK, self.ROUNDS)).tolist()[::-1])
+            ready.extend(self._streams[link].random((self._BLOCK, self.ROUNDS)).tolist()[::-1])
         return ready.pop()

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from heapq import heappop, heappush
 from math import inf, nan
+from typing import Generic, TypeVar
 
 import simpy
 
@@ -44,7 +45,8 @@ class Job:
     """One sample's claim on the air; subclassed by what knows the sample.
 
     `remaining` runs from 1 to 0 while it is served. `granted_s` is the channel time that it was given
-    (shares of contention included), `served_alone_s` the time that its acknowledged part would have taken alone.
+    (shares of contention included), `alone_s` the channel time that it needs alone, `need_s` beside the senders
+    that are backlogged now.
     """
 
     __slots__ = (
@@ -55,6 +57,7 @@ class Job:
         "deadline_s",
         "granted_s",
         "live",
+        "need_s",
         "number",
         "ppdu_s",
         "remaining",
@@ -70,7 +73,7 @@ class Job:
         self.granted_s = 0.0
         self.t_start_s = nan
         self.live = True
-        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = 0.0
+        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = self.need_s = 0.0
 
     def demand(self, exchanges: Exchanges, tries: float = 1.0) -> None:
         """Set what the whole job asks of the medium, each frame sent `tries` times; `remaining` stays."""
@@ -85,7 +88,7 @@ _IDLE_ALONE_S = contention(1).idle_s
 
 
 class GroupFrame:
-    """One group-addressed frame."""
+    """One group-addressed frame; subclassed by what knows its content."""
 
     __slots__ = ("airtime_s", "fire_s", "sender", "slots")
 
@@ -96,14 +99,20 @@ class GroupFrame:
         self.fire_s = inf
 
 
-class Medium:
+J = TypeVar("J", bound=Job)
+F = TypeVar("F", bound=GroupFrame)
+
+
+class Medium(Generic[J, F]):
     """One channel that everybody hears.
 
     Args:
         env: the clock.
         n_drones: senders are 0 … n_drones − 1.
-        on_begin: called when a job comes to the head of its queue; must call `job.demand`.
-        on_end: called once a job is through or its deadline has passed, after the medium has moved on.
+        on_begin: called with a job and the time when it comes to the head of its queue, and again by `retune` while
+            it is there; must call `job.demand`.
+        on_end: called with a job, how it ended and the time, once it is through or its deadline has passed, after
+            the medium has moved on.
         on_group_end: called at a context frame's end with the frame and whether it collided.
     """
 
@@ -111,15 +120,15 @@ class Medium:
         self,
         env: simpy.Environment,
         n_drones: int,
-        on_begin: Callable[[Job], None],
-        on_end: Callable[[Job, End], None],
-        on_group_end: Callable[[GroupFrame, bool], None],
+        on_begin: Callable[[J, float], None],
+        on_end: Callable[[J, End, float], None],
+        on_group_end: Callable[[F, bool], None],
     ) -> None:
         self._env = env
         self._on_begin, self._on_end, self._on_group_end = on_begin, on_end, on_group_end
-        self._queues: list[deque[Job]] = [deque() for _ in range(n_drones)]
-        self._heads: dict[int, Job] = {}
-        self._deadlines: list[tuple[float, int, int, Job]] = []
+        self._queues: list[deque[J]] = [deque() for _ in range(n_drones)]
+        self._heads: dict[int, J] = {}
+        self._deadlines: list[tuple[float, int, int, J]] = []
         self._pushes = 0
         table = [contention(max(1, k)) for k in range(n_drones + 1)]
         self._idle_s = [c.idle_s for c in table]
@@ -129,7 +138,7 @@ class Medium:
         self._begin_s = env.now
         self._due_s = inf
         self._timer: simpy.Event | None = None
-        self._waiting: list[GroupFrame] = []
+        self._waiting: list[F] = []
         self._context_from_s = inf
         self._context_until_s = -inf
         self._context_fire_s = inf
@@ -141,20 +150,20 @@ class Medium:
 
     # --- data ------------------------------------------------------------------------------------
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job: J) -> None:
         """Queue a job behind its sender's others."""
-        self._pushes += 1
-        heappush(self._deadlines, (job.deadline_s, job.number, self._pushes, job))
         queue = self._queues[job.sender]
         queue.append(job)
+        self._expect(job)
         if len(queue) == 1:
-            self.sync()
-            self._serve(job)
-            self._arm()
+            now = self.sync()
+            self._serve(job, now)
+            self._arm(now)
         elif job.deadline_s < self._due_s:
-            self._set_timer(max(job.deadline_s, self._env.now))
+            now = self._env.now
+            self._set_timer(max(job.deadline_s, now), now)
 
-    def replace(self, old: Job, new: Job) -> None:
+    def replace(self, old: J, new: J) -> None:
         """Drop `old` (queued or in service) for `new`.
 
         A queued job's place is kept. One in service is cut short and the new one goes to the tail, so that
@@ -167,145 +176,144 @@ class Medium:
         old.live = False
         queue = self._queues[old.sender]
         queue[queue.index(old)] = new
-        self._pushes += 1
-        heappush(self._deadlines, (new.deadline_s, new.number, self._pushes, new))
+        self._expect(new)
         if new.deadline_s < self._due_s:
-            self._set_timer(max(new.deadline_s, self._env.now))
+            now = self._env.now
+            self._set_timer(max(new.deadline_s, now), now)
 
-    def withdraw(self, job: Job) -> None:
+    def withdraw(self, job: J) -> None:
         """Take a job out without a word; the next in its queue begins."""
-        self.sync()
-        self._remove(job)
-        self._arm()
+        now = self.sync()
+        self._remove(job, now)
+        self._arm(now)
 
     def retune(self) -> None:
         """Let every job in service set its demand anew (the links have changed)."""
         if self._heads:
-            self.sync()
+            now = self.sync()
             for job in self._heads.values():
-                self._on_begin(job)
-            self._arm()
+                self._on_begin(job, now)
+            self._arm(now)
 
-    def in_service(self, sender: int) -> Job | None:
+    def in_service(self, sender: int) -> J | None:
         """The job at the head of a sender's queue."""
         return self._heads.get(sender)
 
-    def queued(self, sender: int) -> Iterable[Job]:
+    def queued(self, sender: int) -> Iterable[J]:
         """A sender's jobs, the one in service first."""
         return self._queues[sender]
 
-    def _serve(self, job: Job) -> None:
-        self._heads[job.sender] = job
-        job.t_start_s = self._env.now
-        self._on_begin(job)
+    def _expect(self, job: J) -> None:
+        """Remember a job's deadline; of equal ones the older job's comes first."""
+        self._pushes += 1
+        heappush(self._deadlines, (job.deadline_s, job.number, self._pushes, job))
 
-    def _remove(self, job: Job) -> None:
+    def _serve(self, job: J, now_s: float) -> None:
+        self._heads[job.sender] = job
+        job.t_start_s = now_s
+        self._on_begin(job, now_s)
+
+    def _remove(self, job: J, now_s: float) -> None:
         job.live = False
         queue = self._queues[job.sender]
         if queue[0] is job:
             queue.popleft()
             if queue:
-                self._serve(queue[0])
+                self._serve(queue[0], now_s)
             else:
                 del self._heads[job.sender]
         else:
             queue.remove(job)
 
-    def sync(self) -> None:
-        """Bring every account up to now."""
-        now = self._env.now
+    def sync(self) -> float:
+        """Bring every account up to now, and return it."""
+        now: float = self._env.now
         dt = now - self._last_s
         if dt <= 0.0:
-            return
+            return now
         if self._waiting:
             blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
             if blocked > 0.0:
                 self.context_busy_s += blocked
                 dt -= blocked
         self._last_s = now
-        n = len(self._heads)
+        heads = self._heads
+        n = len(heads)
         if n == 0 or dt <= 0.0:
-            return
+            return now
         self.data_busy_s += dt
-        share = dt / n
-        idle, collisions, sends = self._idle_s[n], self._collisions[n], self._sends[n]
-        for sender, job in self._heads.items():
-            need = job.clean_s + job.count * idle + collisions * job.collided_s
-            left = job.remaining
+        share, sends, transmit_s = dt / n, self._sends[n], self.transmit_s
+        for sender, job in heads.items():
+            left, need = job.remaining, job.need_s
             done = share / need if need * left > share else left
             job.remaining = left - done
             job.granted_s += share
-            self.transmit_s[sender] += done * job.ppdu_s * sends
+            transmit_s[sender] += done * job.ppdu_s * sends
+        return now
 
-    def _arm(self) -> None:
-        """Set the timer to the earliest thing that can happen."""
-        deadlines = self._deadlines
+    def _arm(self, now: float) -> None:
+        """Who is served has changed, or at what cost: set the timer to the earliest thing that can happen."""
+        deadlines, heads = self._deadlines, self._heads
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
-        now = self._env.now
-        n = len(self._heads)
-        soonest = inf
+        due = inf
+        n = len(heads)
         if n:
             idle, collisions = self._idle_s[n], self._collisions[n]
-            for job in self._heads.values():
-                need = job.remaining * (job.clean_s + job.count * idle + collisions * job.collided_s)
-                if need < soonest:
-                    soonest = need
+            soonest = inf
+            for job in heads.values():
+                job.need_s = need = job.clean_s + job.count * idle + collisions * job.collided_s
+                left = job.remaining * need
+                if left < soonest:
+                    soonest = left
             soonest *= n
             if now + soonest > self._context_from_s:
                 soonest += self._context_until_s - max(now, self._context_from_s)
-        due = now + soonest
+            due = now + soonest
         if deadlines and deadlines[0][0] < due:
             due = max(deadlines[0][0], now)
         if due < self._due_s:
-            self._set_timer(due)
+            self._set_timer(due, now)
 
-    def _set_timer(self, due_s: float) -> None:
+    def _set_timer(self, due_s: float, now_s: float) -> None:
         self._due_s = due_s
-        timer = self._env.timeout(max(0.0, due_s - self._env.now))
+        self._timer = timer = self._env.timeout(max(0.0, due_s - now_s))
         timer.callbacks.append(self._on_timer)
-        self._timer = timer
 
     def _on_timer(self, event: simpy.Event) -> None:
         if event is not self._timer:
             return  # an earlier time was set meanwhile
         self._due_s = inf
-        self.sync()
-        now = self._env.now
-        ended: list[tuple[Job, End]] = []
-        n = len(self._heads)
-        if n:
-            idle, collisions = self._idle_s[n], self._collisions[n]
-            for job in tuple(self._heads.values()):
-                if n * job.remaining * (job.clean_s + job.count * idle + collisions * job.collided_s) <= _EPS_S:
-                    job.remaining = 0.0
-                    ended.append((job, End.SERVED))
-            if len(ended) > 1:
-                ended.sort(key=_by_number)
-            for job, _ in ended:
-                self._remove(job)
-        deadlines = self._deadlines
+        now = self.sync()
+        heads, deadlines = self._heads, self._deadlines
+        n = len(heads)
+        through = [job for job in heads.values() if n * job.remaining * job.need_s <= _EPS_S]
+        if len(through) > 1:
+            through.sort(key=_number)
+        ended = [(job, End.SERVED) for job in through]
+        for job in through:
+            job.remaining = 0.0
+            self._remove(job, now)
         while deadlines and (not deadlines[0][3].live or deadlines[0][0] <= now + _EPS_S):
             job = heappop(deadlines)[3]
             if job.live:
-                served = self._heads.get(job.sender) is job and job.t_start_s < now
-                self._remove(job)
+                served = heads.get(job.sender) is job and job.t_start_s < now
+                self._remove(job, now)
                 ended.append((job, End.DEADLINE_IN_SERVICE if served else End.DEADLINE_QUEUED))
-        self._arm()
+        self._arm(now)
         for job, how in ended:
-            self._on_end(job, how)
+            self._on_end(job, how, now)
 
     # --- context ---------------------------------------------------------------------------------
 
-    def announce(self, frame: GroupFrame, residual: float) -> None:
+    def announce(self, frame: F, residual: float) -> None:
         """Contend for the air with a context frame.
 
         Args:
             frame: its `slots` drawn, 0 … CW_CONTEXT.
             residual: uniform in [0, 1): how much of a running data exchange is still to come.
         """
-        self.sync()
-        now = self._env.now
+        now = self.sync()
         waiting = self._waiting
         if not waiting:
             self._context_from_s = now + residual * self._mean_exchange_s()
@@ -313,12 +321,11 @@ class Medium:
         if now >= self._context_fire_s:
             return  # heard the frame that is on the air; counts down after it
         frame.fire_s = max(now, self._context_from_s) + AIFS_CONTEXT_S + frame.slots * SLOT_S
-        self._plan_context()
+        self._plan_context(now)
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's waiting context frames; one that is on the air ends."""
-        now = self._env.now
-        self.sync()
+        now = self.sync()
         kept = [
             f
             for f in self._waiting
@@ -328,25 +335,31 @@ class Medium:
             return
         self._waiting = kept
         if now < self._context_fire_s:
-            self._plan_context()
-            self._arm()
+            self._plan_context(now)
+            self._arm(now)
 
     def _mean_exchange_s(self) -> float:
+        if not self._heads:
+            return 0.0
         jobs = [j for j in self._heads.values() if j.count > 0.0]
         return sum(j.ppdu_s / j.count for j in jobs) / len(jobs) if jobs else 0.0
 
-    def _plan_context(self) -> None:
+    def _plan_context(self, now: float) -> None:
         waiting = self._waiting
         if not waiting:
             self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
             self._context_timer = None
             return
-        fire = min([f.fire_s for f in waiting])
-        until = fire + max([f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2])
+        if len(waiting) == 1:
+            fire, longest_s = waiting[0].fire_s, waiting[0].airtime_s
+        else:
+            fire = min([f.fire_s for f in waiting])
+            longest_s = max([f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2])
+        until = fire + longest_s
         self._context_fire_s = fire
         if until != self._context_until_s or self._context_timer is None:
             self._context_until_s = until
-            timer = self._env.timeout(max(0.0, until - self._env.now))
+            timer = self._env.timeout(max(0.0, until - now))
             timer.callbacks.append(self._on_context_timer)
             self._context_timer = timer
 
@@ -354,17 +367,17 @@ class Medium:
         if event is not self._context_timer:
             return
         self._context_timer = None
-        self.sync()
-        now, fire = self._env.now, self._context_fire_s
-        sent = [f for f in self._waiting if f.fire_s <= fire + SLOT_S / 2]
-        self._waiting = [f for f in self._waiting if f.fire_s > fire + SLOT_S / 2]
+        now, fire = self.sync(), self._context_fire_s
+        sent, self._waiting = self._waiting, []
+        if len(sent) > 1:
+            self._waiting = [f for f in sent if f.fire_s > fire + SLOT_S / 2]
+            sent = [f for f in sent if f.fire_s <= fire + SLOT_S / 2]
         for f in self._waiting:
             if f.fire_s < inf:  # it had counted down to the moment the winner sent
                 f.slots = max(1, round((f.fire_s - fire) / SLOT_S))
             f.fire_s = now + AIFS_CONTEXT_S + f.slots * SLOT_S
-        if self._waiting:
             self._context_from_s = now
-        self._plan_context()
+        self._plan_context(now)
         for f in sent:
             self.transmit_s[f.sender] += f.airtime_s
             self._on_group_end(f, len(sent) > 1)
@@ -374,10 +387,9 @@ class Medium:
     @property
     def utilisation(self) -> float:
         """Fraction of the time so far in which the channel was claimed, contention included."""
-        self.sync()
-        elapsed = self._env.now - self._begin_s
+        elapsed = self.sync() - self._begin_s
         return (self.data_busy_s + self.context_busy_s) / elapsed if elapsed > 0 else 0.0
 
 
-def _by_number(ended: tuple[Job, End]) -> int:
-    return ended[0].number
+def _number(job: Job) -> int:
+    return job.number

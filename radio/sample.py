@@ -67,13 +67,14 @@ class Sample(Job):
         t_sent_s: float,
         deadline_s: float,
         on_done: Callable[[Transmission], None],
-        *,
         fragments: int,
         wire_bytes: int,
         luck: list[float],
         snr_db: float,
+        drained_bits: float,
     ) -> None:
-        """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; the rest as in `Air.send`."""
+        """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
+        the sender had got through when this was written; the rest as in `Air.send`."""
         super().__init__(number, sender, deadline_s)
         self.receiver = receiver
         self.kind = kind
@@ -98,7 +99,7 @@ class Sample(Job):
         self.mark_s = t_sent_s  # begin of the goodput measurement
         self.mark_left = 1.0  # `remaining` when progress was last booked
         self.mark_bits = 0.0  # acknowledged since mark_s, as goodput counts them
-        self.drained_bits = 0.0  # what the sender had got through when this was written
+        self.drained_bits = drained_bits
 
     def restart(self) -> None:
         """Begin a pass anew."""
@@ -106,10 +107,8 @@ class Sample(Job):
         self.loss_share = 0.0
 
     def book(self) -> float:
-        """Count what was acknowledged since the last time; returns it in bits as goodput counts them."""
+        """Count what was acknowledged since the last time, if anything; returns it in bits as goodput counts them."""
         done = self.mark_left - self.remaining
-        if done <= 0.0:
-            return 0.0
         bits = done * self.alone_s * self.full_mbps * 1e6
         self.mark_bits += bits
         self.wire_bytes += done * self.pass_bytes if not self.unreachable else 0.0
@@ -142,7 +141,9 @@ class Service:
         self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
         probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S)
         self._probe = probe.scaled(config.retry_limit + 1.0)
+        # both are the same again and again: links are looked up on a grid of SNR, payloads come in few sizes
         self._demands: dict[tuple[int, int, bool], Exchanges] = {}
+        self._qualities: dict[tuple[int, float], tuple[float, float, float]] = {}
 
     def begin(self, s: Sample, now_s: float, known_snr_db: float, snr_db: float, receiver_gone: bool) -> None:
         """Set what a sample at the head of its queue asks for, its progress up to now being booked.
@@ -174,14 +175,11 @@ class Service:
             s.unreachable = ""
             s.restart()
         s.mcs = mcs
-        limit = self._config.retry_limit
-        payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
         per = table.all_per[mcs][table.index(snr_db)]
+        payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
         if s.fragments == 1:
             per = rescale(per, frame_bytes(payload) / self._frame_bytes)
-        mean_tries = tries(per, limit)
-        s.loss_probability = residual_loss(per, limit)
-        s.full_mbps = self._full_mbps[mcs] / mean_tries * (1.0 - s.loss_probability)
+        mean_tries, s.loss_probability, s.full_mbps = self._quality(mcs, per)
         key = (payload, mcs, s.reliable)
         demand = self._demands.get(key)
         if demand is None:
@@ -189,6 +187,18 @@ class Service:
                 self._demands.clear()
             demand = self._demands[key] = self._demand(payload, mcs, s.reliable)
         s.demand(demand, mean_tries)
+
+    def _quality(self, mcs: int, per: float) -> tuple[float, float, float]:
+        """Mean tries, loss after all of them, and payload rate of full A-MPDUs, of frames that fail with `per`."""
+        key = (mcs, per)
+        known = self._qualities.get(key)
+        if known is None:
+            if len(self._qualities) > _MAX_DEMANDS:
+                self._qualities.clear()
+            limit = self._config.retry_limit
+            mean_tries, loss = tries(per, limit), residual_loss(per, limit)
+            known = self._qualities[key] = (mean_tries, loss, self._full_mbps[mcs] / mean_tries * (1.0 - loss))
+        return known
 
     def repair_payload(self, s: Sample) -> int:
         """Payload bytes of the fragments that are left."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -43,6 +45,18 @@ class Observer(Protocol):
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
 
 
+@contextmanager
+def _seldom_collecting() -> Iterator[None]:
+    """Look for reference cycles a hundred times less often: a flight makes few, and every look goes over its record."""
+    usual = gc.get_threshold()
+    gc.set_threshold(*(100 * often for often in usual))
+    try:
+        yield
+    finally:
+        gc.set_threshold(*usual)
+
+
+@_seldom_collecting()
 def run_sortie(
     scenario: Scenario,
     policy: str | Policy | None = None,

@@ -31,8 +31,8 @@ def test_fragments(payload_bytes: int, count: int) -> None:
 
 
 def test_wire_bytes_of_a_sample_are_its_fragments_headers() -> None:
-    assert airtime.sample_wire_bytes(1000, 1344) == 1000 + 20 + 12 + 16 + 28 + 28 + 38
-    assert airtime.sample_wire_bytes(2000, 1344) == 2000 + 2 * (20 + 12 + 16 + 36 + 28 + 38)
+    assert airtime.sample_wire(1000, 1344)[1] == 1000 + 20 + 12 + 16 + 28 + 28 + 38
+    assert airtime.sample_wire(2000, 1344)[1] == 2000 + 2 * (20 + 12 + 16 + 36 + 28 + 38)
     assert airtime.repair_wire_bytes(40) == 2 * (20 + 16 + 28 + 38) + 32 + 28 + 8
 
 

@@ -26,11 +26,11 @@ class Bench:
         self.demands: dict[int, Exchanges] = {}
         self.medium = Medium(self.env, n_drones, self._begin, self._end, self._group_end)
 
-    def _begin(self, job: Job) -> None:
+    def _begin(self, job: Job, now_s: float) -> None:
         job.demand(self.demands[job.number])
 
-    def _end(self, job: Job, how: End) -> None:
-        self.log.append((self.env.now, job.number, how))
+    def _end(self, job: Job, how: End, now_s: float) -> None:
+        self.log.append((now_s, job.number, how))
 
     def _group_end(self, frame: GroupFrame, collided: bool) -> None:
         self.heard.append((self.env.now, frame.sender, collided))
