@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from perception.detectors import DETECTORS
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
@@ -168,10 +169,8 @@ def list_(
         for name, path in library().items():
             out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
     elif what == "detectors":
-        out.print(
-            "[bold]torch[/bold]  the shipped network: encoder, DiscoNet-style fusion, centre head", soft_wrap=True
-        )
-        out.print("[bold]none[/bold]   traffic alone; boxes are counted from the scene", soft_wrap=True)
+        for name, kind in DETECTORS.items():
+            out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
     elif what == "schema":
         out.print_json(data=json_schema())
     else:

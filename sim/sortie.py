@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from pathlib import Path
 from typing import Protocol
 
 import pyarrow as pa
@@ -18,6 +17,7 @@ from fleet.agent import Agent, PlaneRules
 from fleet.auth import Sealer
 from fleet.battery import FleetBatteries
 from fleet.motion import fly
+from perception.detectors import make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
@@ -96,12 +96,7 @@ def run_sortie(
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
     keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
     ether = Ether(air, recorder, keys=keys)
-    detector = None
-    if config.detector == "torch":
-        from perception.detector import TorchDetector  # here, so that sorties without it never load torch
-
-        weights = None if config.weights is None else Path(config.weights)
-        detector = TorchDetector(scene, config, seed=seed, weights=weights)
+    detector = make_detector(scene, config, seed, replication)
 
     def count_boxes(capture: Capture, roi: Disc | None) -> int:
         assert detector is not None  # noqa: S101

@@ -1,0 +1,70 @@
+"""Detectors by name: what a sortie asks of one, and the table from which a scenario's `perception.detector` is made.
+
+Free of torch: a constructor imports what it needs when it is called, so that sorties without the network never load it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from perception.scene import SceneModel
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception
+
+
+class Detector(Protocol):
+    """What a sortie asks of a detector."""
+
+    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
+        """Each ego's boxes from its own look and what it was sent, ENU, best first."""
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        """What there is to find in the ego's square at `t_s`, ENU."""
+
+    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+        """How many detections the drone would send for this capture, inside a disc (x, y, radius) if there is one."""
+
+    def camera_views(self, capture: Capture) -> NDArray[Any]:
+        """The camera images [cameras, height, width, 3]; ValueError where there are none."""
+
+
+Constructor = Callable[[SceneModel, Perception, int, int], Detector]
+"""From the scene, the scenario's `perception` section, the sortie's seed and its replication."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One value of `perception.detector`."""
+
+    about: str
+    """One line for lists."""
+    make: Constructor | None
+    """None flies without a detector."""
+
+
+def make_detector(scene: SceneModel, config: Perception, seed: int, replication: int = 0) -> Detector | None:
+    """The detector that the scenario names; None where it flies the traffic alone.
+
+    Raises:
+        ValueError: weights or a recording that are missing or do not fit, naming the file.
+    """
+    make = DETECTORS[config.detector].make
+    return None if make is None else make(scene, config, seed, replication)
+
+
+def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+    from perception.detector import TorchDetector
+
+    return TorchDetector(scene, config, seed=seed, weights=None if config.weights is None else Path(config.weights))
+
+
+DETECTORS: dict[str, Kind] = {
+    "torch": Kind("the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch),
+    "none": Kind("traffic alone; boxes are counted from the scene", None),
+}
+"""A new detector is one constructor and one line here, and one word in the schema."""
