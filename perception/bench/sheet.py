@@ -10,7 +10,7 @@ import numpy as np
 from perception.bench.dataset import Benchmark
 from perception.bench.difficulty import Split
 from perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
-from perception.bench.visibility import SEEN, inside, visible, window_over
+from perception.bench.visibility import SEEN, inside, visible
 from perception.bev import lift
 from perception.render import CAMERAS, Renderer
 from perception.scene import SceneModel
@@ -41,8 +41,7 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
     views = Renderer(scene, scene_id(bench.seed, split, index)).render(captures)
     ground = lift(views, captures, bench.geometry).numpy()
     cars = scene.cars_at(captures[0].t_s)
-    window = window_over(scene, captures)
-    seen = np.stack([visible(window, c, cars) >= SEEN for c in captures])
+    seen = np.stack([visible(scene, c, cars) >= SEEN for c in captures])
 
     half = bench.geometry.half_extent_m
     figure = Figure(figsize=(16, 13.2), layout="constrained")

@@ -10,7 +10,7 @@ import numpy as np
 from perception.bench.dataset import Benchmark
 from perception.bench.difficulty import Split
 from perception.bench.scenes import AREA_M, draw_captures, draw_scene
-from perception.bench.visibility import SEEN, inside, visible, window_over
+from perception.bench.visibility import SEEN, inside, visible
 from perception.scene import SceneModel
 
 
@@ -34,14 +34,15 @@ class Counts:
 
 
 def survey(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Counts:
-    """Count one frame of a scene; about half a CPU second."""
+    """Count one frame of a scene; about a fifth of a CPU second."""
     config = draw_scene(bench.seed, split, index, bench.difficulty)
     scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
     cars = scene.cars_at(captures[0].t_s)
-    window = window_over(scene, captures)
-    seen = np.stack([visible(window, c, cars) >= SEEN for c in captures])
     asked = np.stack([inside(c, cars, bench.geometry.half_extent_m) for c in captures])
+    near = np.flatnonzero(asked.any(axis=0))
+    cars, asked = cars.where(near), asked[:, near]
+    seen = np.stack([visible(scene, c, cars) >= SEEN for c in captures])
     blocks = scene.town.blocks(-AREA_M, -AREA_M, AREA_M, AREA_M)
     lots, buildings = np.concatenate([b.lots for b in blocks]), np.concatenate([b.buildings for b in blocks])
     total = max(int(asked.sum()), 1)

@@ -1,44 +1,35 @@
-"""Who can see which car, by geometry: straight lines from a drone to points on roofs, past houses, trees and other cars.
+"""Who can see which car, by geometry: straight lines from a drone to points on roofs, past houses and trees.
 
-The renderer walks rays down from the cameras; this walks up from the cars, apart from it. It says how hard a frame
-is before any network looks: a car that no drone sees is still asked for by AP.
+Houses are boxes and crowns are domes, in closed form: nothing is rasterised, and no code is shared with the renderer
+but the cameras' axes. It says how hard a frame is before any network looks: a car that no drone sees is still asked for by AP.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.render import AXES, HALF_H, HALF_V, MAX_REACH_M, REACH, Window, rotation
+from perception.render import AXES, HALF_H, HALF_V, rotation
 from perception.scene import SceneModel
-from perception.town import RES_M, TILE_M, Floats
+from perception.town import Floats
 from perception.traffic import Cars
 from perception.types import Capture
 
 _ROOF = np.array([(0.0, 0.0), (0.3, 0.3), (0.3, -0.3), (-0.3, 0.3), (-0.3, -0.3)])
 """Points on a roof, as parts of its length and width."""
-_STEP_M = 0.2
 SEEN = 0.4
 """A car counts as seen from here on: two of its five points."""
+DOME = 0.35
+"""How much lower a crown is at its rim, as a part of its height (`town.Town`)."""
 
 
-def window_over(scene: SceneModel, captures: Sequence[Capture]) -> Window:
-    """The scenery and parked cars under a fleet, as far as its cameras reach."""
-    where = np.array([c.position_m for c in captures])
-    reach = np.minimum(where[:, 2] * REACH, MAX_REACH_M) + 1.0
-    low, high = (where[:, :2] - reach[:, None]).min(axis=0), (where[:, :2] + reach[:, None]).max(axis=0)
-    ix, iy = (range(int(np.floor(low[a] / TILE_M)), int(np.floor(high[a] / TILE_M)) + 1) for a in (0, 1))
-    return Window(scene, ix, iy)
-
-
-def visible(window: Window, capture: Capture, cars: Cars) -> Floats:
+def visible(scene: SceneModel, capture: Capture, cars: Cars) -> Floats:
     """[n] part of each car's roof, 0 … 1, that one drone's cameras see: in a camera's field, and nothing in between.
 
-    Moving cars hide nothing here.
+    Cars hide nothing here.
     """
-    eye = np.asarray(capture.position_m)
+    if not len(cars):
+        return np.zeros(0)
     along = _ROOF[None, :, 0] * cars.length_m[:, None]
     across = _ROOF[None, :, 1] * cars.width_m[:, None]
     cos, sin = np.cos(cars.yaw_rad)[:, None], np.sin(cars.yaw_rad)[:, None]
@@ -47,17 +38,50 @@ def visible(window: Window, capture: Capture, cars: Cars) -> Floats:
     z = np.broadcast_to(cars.height_m[:, None], x.shape)
     at = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     free = in_a_camera(capture, at)
-    rows, columns = window.height.shape
-    for top in np.arange(_STEP_M, window.top_m, _STEP_M):
-        height = at[:, 2] + top
-        part = top / (eye[2] - at[:, 2])
-        px = (at[:, 0] + part * (eye[0] - at[:, 0]) - window.x0_m) / RES_M
-        py = (at[:, 1] + part * (eye[1] - at[:, 1]) - window.y0_m) / RES_M
-        column = np.clip(px.astype(int), 0, columns - 1)
-        row = np.clip(py.astype(int), 0, rows - 1)
-        free &= window.height[row, column] <= height
+    eye = np.asarray(capture.position_m)
+    who = np.flatnonzero(free)
+    if len(who):
+        low, high = np.minimum(at[who].min(axis=0), eye) - 4.0, np.maximum(at[who].max(axis=0), eye) + 4.0
+        blocks = scene.town.blocks(low[0], low[1], high[0], high[1])
+        houses = np.concatenate([b.buildings for b in blocks])
+        trees = np.concatenate([b.trees for b in blocks])
+        free[who] = ~(past_houses(at[who], eye, houses) | past_trees(at[who], eye, trees))
     out: Floats = free.reshape(-1, len(_ROOF)).mean(axis=1)
     return out
+
+
+def past_houses(at: Floats, eye: Floats, houses: Floats) -> NDArray[np.bool_]:
+    """[n]: whether the line from each point [n, 3] to the eye [3] meets a house [m, 6] (`town.Block.buildings`).
+
+    By slabs: the parts of the line over the house in x, in y and below its roof have to overlap.
+    """
+    step = eye - at
+    with np.errstate(divide="ignore", invalid="ignore"):
+        enter, leave = np.zeros((len(at), len(houses))), np.ones((len(at), len(houses)))
+        for axis in (0, 1):
+            a = (houses[None, :, axis] - at[:, None, axis]) / step[:, None, axis]
+            b = (houses[None, :, axis + 2] - at[:, None, axis]) / step[:, None, axis]
+            enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+        leave = np.minimum(leave, (houses[None, :, 4] - at[:, None, 2]) / step[:, None, 2])
+    return np.asarray((enter < leave).any(axis=1))
+
+
+def past_trees(at: Floats, eye: Floats, trees: Floats) -> NDArray[np.bool_]:
+    """[n]: the same of trees [m, 5] (`town.Block.trees`), solid below a paraboloid that is highest in the middle."""
+    step = eye - at
+    dx, dy = at[:, None, 0] - trees[None, :, 0], at[:, None, 1] - trees[None, :, 1]
+    sx, sy, rise = step[:, None, 0], step[:, None, 1], step[:, None, 2]
+    radius, top = trees[None, :, 2], trees[None, :, 3]
+    # distance² from the trunk is a t² + 2 b t + c along the line, t from 0 at the point to 1 at the eye
+    a, b, c = np.maximum(sx * sx + sy * sy, 1e-9), dx * sx + dy * sy, dx * dx + dy * dy
+    root = b * b - a * (c - radius**2)
+    half = np.sqrt(np.maximum(root, 0.0))
+    first, last = np.clip((-b - half) / a, 0.0, 1.0), np.clip((-b + half) / a, 0.0, 1.0)
+    # height above the crown is a parabola in t; its lowest part over the crown decides
+    bend = DOME * top / radius**2
+    t = np.clip(-(bend * 2 * b + rise) / (2 * bend * a), first, last)
+    above = at[:, None, 2] + rise * t - top + bend * (a * t * t + 2 * b * t + c)
+    return np.asarray(((root > 0) & (first < last) & (above < 0)).any(axis=1))
 
 
 def in_a_camera(capture: Capture, points: Floats) -> NDArray[np.bool_]:

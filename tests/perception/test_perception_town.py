@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from perception_examples import capture
 
+from perception.render import Renderer
 from perception.scene import SceneModel
-from perception.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, block, zigzag
+from perception.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, _shadows, block, zigzag
 from scenarios.schema import Scene
 
 
@@ -62,27 +64,53 @@ def test_a_denser_town_keeps_what_the_sparser_one_has() -> None:
     assert {tuple(p) for p in sparse.parked} < {tuple(p) for p in dense.parked}
 
 
-def test_every_knob_of_the_scene_changes_what_is_there() -> None:
-    def look(scene: Scene) -> tuple[bytes, ...]:
-        model = SceneModel(scene, None, (0, 0, 50, 50))
-        tile, cars = model.town.tile(0, 0), model.cars_at(3.0)
-        return tile.height_m.tobytes(), tile.albedo.tobytes(), cars.x_m.tobytes(), cars.y_m.tobytes()
+OTHERS = {
+    "seed": 8,
+    "style": "suburb",
+    "block_m": 90.0,
+    "building_density": 0.3,
+    "building_height_m": 6.0,
+    "tree_density": 0.9,
+    "parked_density": 0.7,
+    "moving_cars_per_km": 30.0,
+    "moving_speed_mps": 3.0,
+    "sun_azimuth_deg": 30.0,
+    "sun_elevation_deg": 25.0,
+    "overcast": 0.5,
+    "brightness": 0.8,
+}
+LIGHT = ("sun_azimuth_deg", "sun_elevation_deg", "overcast", "brightness")
+"""Knobs that change what is seen and not what is there."""
 
-    default = look(Scene())
-    others = {
-        "seed": 8,
-        "block_m": 90.0,
-        "building_density": 0.3,
-        "building_height_m": 6.0,
-        "tree_density": 0.9,
-        "parked_density": 0.7,
-        "moving_cars_per_km": 30.0,
-        "moving_speed_mps": 3.0,
-    }
-    assert set(others) == set(Scene.model_fields)
-    for field, value in others.items():
-        assert look(Scene(**{field: value})) != default, field
-    assert look(Scene()) == default
+
+def there(scene: Scene) -> tuple[bytes, ...]:
+    """What stands where."""
+    model = SceneModel(scene, None, (0, 0, 50, 50))
+    cars = model.cars_at(3.0)
+    return model.town.tile(0, 0).height_m.tobytes(), cars.x_m.tobytes(), cars.y_m.tobytes()
+
+
+def look(scene: Scene) -> bytes:
+    """What one drone's cameras see of it."""
+    return Renderer(SceneModel(scene, None, (0, 0, 50, 50)), 1).render([capture(20.0, 20.0)]).tobytes()
+
+
+@pytest.fixture(scope="module")
+def default() -> tuple[tuple[bytes, ...], bytes]:
+    return there(Scene()), look(Scene())
+
+
+def test_the_table_names_every_knob_of_the_scene() -> None:
+    assert set(OTHERS) == set(Scene.model_fields)
+
+
+@pytest.mark.parametrize("field", OTHERS)
+def test_every_knob_of_the_scene_changes_what_is_there_or_only_how_it_is_lit(
+    field: str, default: tuple[tuple[bytes, ...], bytes]
+) -> None:
+    other = Scene(**{field: OTHERS[field]})
+    assert (there(other) == default[0]) == (field in LIGHT)
+    assert look(other) != default[1]
 
 
 def test_shadows_fall_away_from_the_sun_and_join_across_tiles() -> None:
@@ -90,4 +118,34 @@ def test_shadows_fall_away_from_the_sun_and_join_across_tiles() -> None:
     left, right = town.tile(0, 0), town.tile(1, 0)
     assert 0.02 < (left.light < 1).mean() < 0.5
     # a column either side of the seam agrees nearly everywhere, as any two neighbouring columns do
+    assert (left.light[:, TILE_PX - 1] == right.light[:, 0]).mean() > 0.95
+
+
+@pytest.mark.parametrize(("azimuth", "east", "north"), [(0.0, -1, 0), (90.0, 0, -1), (180.0, 1, 0), (270.0, 0, 1)])
+def test_a_shadow_lies_on_the_far_side_and_is_as_long_as_its_house_is_high(
+    azimuth: float, east: int, north: int
+) -> None:
+    height = np.zeros((200, 200), np.float32)
+    height[95:105, 95:105] = 8.0
+    light = _shadows(height, Scene(sun_azimuth_deg=azimuth, sun_elevation_deg=45.0))
+
+    def lit(metres: float) -> bool:
+        """Beyond the house's edge by this much on the side away from the sun (negative: towards it)."""
+        px = np.sign(metres) * 5 + metres / RES_M
+        return bool(light[round(99.5 + north * px), round(99.5 + east * px)] == 1)
+
+    assert [lit(m) for m in (1.0, 6.0, 10.0, -1.0, -6.0)] == [False, False, True, True, True]
+
+
+def test_an_overcast_sky_casts_no_shadow_and_a_half_clear_one_half_of_it() -> None:
+    darkest = [float(Town(Scene(overcast=part)).tile(0, 0).light.min()) for part in (0.0, 0.5, 1.0)]
+    assert darkest == pytest.approx([0.6, 0.8, 1.0])
+
+
+def test_long_shadows_join_across_tiles() -> None:
+    """The ground around a tile is drawn as far as the longest shadow reaches."""
+    town = Town(
+        Scene(tree_density=0, building_density=1, building_height_m=25, sun_elevation_deg=20.0, sun_azimuth_deg=180.0)
+    )
+    left, right = town.tile(0, 0), town.tile(1, 0)
     assert (left.light[:, TILE_PX - 1] == right.light[:, 0]).mean() > 0.95
