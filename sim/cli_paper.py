@@ -19,6 +19,8 @@ from sim.rundir import RunError
 if TYPE_CHECKING:
     from perception.harness.picture import Picture
 
+NARROW, PIPED_WIDTH = 150, 170
+"""Columns of a terminal that show both instruments, and those that a pipe or file is given."""
 COLOURS = {Verdict.REPRODUCED: "green", Verdict.NOT_REPRODUCED: "yellow", Verdict.OPPOSITE: "red"}
 
 
@@ -36,7 +38,10 @@ def paper(
     workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
     out_dir: Annotated[Path, typer.Option("--out", help="The report's folder.")] = Path("runs/paper"),
     work: Annotated[
-        Path | None, typer.Option(help="Keeps the benchmark and finished frames; left out, the user's cache.")
+        Path, typer.Option(help="Keeps the benchmark (bench/) and finished frames (harness/) between runs.")
+    ] = Path("runs"),
+    against: Annotated[
+        Path | None, typer.Option(help="Another report's folder: tell which verdicts differ from its.")
     ] = None,
     readme: Annotated[Path | None, typer.Option(help="Write this file's results section anew.")] = None,
     frame: Annotated[
@@ -50,8 +55,8 @@ def paper(
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
     from perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from perception.harness import figures
-    from perception.harness.paper import Asked
+    from perception.harness import figures, rows
+    from perception.harness.found import Asked
     from sim import paper as making
     from sim.cli import _progress, out
 
@@ -60,15 +65,20 @@ def paper(
         raise RunError(f"unsent is {unsent!r}, must be zero, masked or both")
     if cells_by not in ("confidence", "norm"):
         raise RunError(f"cells_by is {cells_by!r}, must be confidence or norm")
-    folder = making.default_work() if work is None else work
     try:
         asked = Asked(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
         job = making.Job(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context))
         if frame is not None:
-            _open_frame(making.frame_picture(job, folder, frame, ego), out_dir / f"frame_{frame}.rrd", out, show=show)
+            _open_frame(
+                making.frame_picture(job, work, frame, ego),
+                work / "frames" / f"seed{seed}_frame{frame}_ego{ego}.rrd",
+                out,
+                show=show,
+            )
             return
         making.ensure_writable(out_dir)
+        other = [] if against is None else rows.read(against / making.TABLE)[0]
         with _progress() as bar:
             bars: dict[str, Callable[[float], None]] = {}
 
@@ -77,28 +87,32 @@ def paper(
                     bars[stage] = bar(stage, of)
                 bars[stage](done)
 
-            result = making.make(job, folder, progress)
+            result = making.make(job, work, progress)
     except ValueError as error:
         raise RunError(str(error)) from error
     making.write(result, out_dir)
-    out.print(verdicts_table(result.rows))
+    wide = out if out.is_terminal else Console(width=PIPED_WIDTH)
+    wide.print(verdicts_table(result.rows, masked=wide.width >= NARROW))
     out.print(_tally(result.rows))
     if not figures.available():
         out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
     out.print(
         f"{result.facts['cpu_s']:.0f} CPU-seconds, {result.facts['wall_s']:.0f} s; kept in [bold]{out_dir}[/bold]"
     )
+    if against is not None:
+        out.print(_differences(result.rows, other, against))
     if readme is not None:
         link = _relative(out_dir / making.REPORT, readme.parent)
         making.put_into_readme(readme, result.rows, result.facts, link)
         out.print(f"results section of [bold]{readme}[/bold] written")
 
 
-def verdicts_table(rows: Sequence[Row]) -> Table:
-    """Every claim: the paper's figure, ours under each instrument, and the verdicts."""
-    shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
-    table = Table(title="the paper's Evaluation, AP differences in points with 95 % intervals")
-    table.add_column("claim")
+def verdicts_table(rows: Sequence[Row], *, masked: bool = True) -> Table:
+    """Every claim: the paper's figure, ours under each instrument (or the first alone), and the verdicts."""
+    shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)][: None if masked else 1]
+    more = None if masked else f"a terminal {NARROW} columns wide shows masked fusion too, and so does the report"
+    table = Table(title="the paper's Evaluation, AP differences in points with 95 % intervals", caption=more)
+    table.add_column("claim", min_width=30)
     table.add_column("paper", justify="right")
     for i in shown:
         table.add_column(INSTRUMENTS[i], justify="right")
@@ -128,6 +142,20 @@ def _tally(rows: Sequence[Row]) -> str:
         f"{name}: {report.tally(r for r in rows if r.instrument == i)}"
         for i, name in names.items()
         if any(r.instrument == i for r in rows)
+    )
+
+
+def _differences(ours: Sequence[Row], theirs: Sequence[Row], where: Path) -> str:
+    """Which claims came out otherwise in another report."""
+    judged = {(r.id, r.instrument): r.verdict for r in theirs}
+    lines = [
+        f"  {r.says} ({INSTRUMENTS.get(r.instrument, 'flown')}): {r.verdict}, there {judged[r.id, r.instrument]}"  # type: ignore[call-overload]
+        for r in ours
+        if judged.get((r.id, r.instrument), r.verdict) != r.verdict
+    ]
+    both = sum((r.id, r.instrument) in judged for r in ours)
+    return "\n".join(
+        [f"{both - len(lines)} of {both} verdicts are those of {where}" + (", but:" if lines else ""), *lines]
     )
 
 

@@ -14,15 +14,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from perception.harness import figure_frame, figures, report, rows
+from perception.harness.found import Asked
 from perception.harness.instrument import CarNetInstrument
-from perception.harness.paper import Asked, bench_frames, camera_views, measure
+from perception.harness.paper import bench_frames, camera_views, measure
 from perception.harness.picture import PAPER_BUDGETS, Picture, picture
 from perception.harness.rows import Point, Row
+from perception.harness.sensitivity import Varied, sensitivity
 from sim.plane import machine, measure_plane
 from sim.rundir import RunError
 from sim.sortie import VERSION
 
-REPORT, TABLE, POINTS = "README.md", "paper.parquet", "points.parquet"
+REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
 FIGURES = {
     "frontier.png": "AP over the bytes shared, full scene and mission disc; whiskers are 95 % intervals",
     "peers.png": "Peer selection at matched bytes: ▼ marks each budget's best",
@@ -56,13 +58,9 @@ class Result:
 
     rows: Sequence[Row]
     points: Sequence[Point]
+    varied: Sequence[Varied]
     facts: dict[str, Any]
     picture: Picture | None
-
-
-def default_work() -> Path:
-    """Where benchmarks and finished frames are kept between runs: the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sortie"
 
 
 def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None) -> Result:
@@ -74,17 +72,19 @@ def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None
     wall_s, cpu_s = time.perf_counter(), _cpu_s()
     instrument = CarNetInstrument.load(job.weights)
     frames = bench_frames(job.seed, job.frames, work / "bench", lambda done, of: progress("test scenes", done, of))
-    scores = measure(
+    found = measure(
         instrument,
         frames,
         job.asked,
-        store=work / "paper",
+        store=work / "harness",
         workers=job.workers,
         progress=lambda done, of: progress("frames", done, of),
     )
     plane = measure_plane(lambda t_s: progress("replay", round(t_s), 120))
     progress("verdicts", 0, 1)
+    scores = found.all_scores()
     table, points = rows.judge(scores, plane), rows.points(scores)
+    varied = sensitivity(found)
     seen = picture(instrument, frames, 0, tau=job.asked.tau, views=camera_views(job.seed, 0))
     progress("verdicts", 1, 1)
     facts = {
@@ -104,7 +104,7 @@ def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None
         "wall_s": round(time.perf_counter() - wall_s, 1),
         "machine": machine(),
     }
-    return Result(table, points, facts, seen)
+    return Result(table, points, varied, facts, seen)
 
 
 def frame_picture(job: Job, work: Path, frame: int, ego: int = 0, budgets: Sequence[float] = PAPER_BUDGETS) -> Picture:
@@ -143,9 +143,10 @@ def write(result: Result, path: Path) -> list[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         pq.write_table(rows.to_table(result.rows, result.facts), partial / TABLE)
-        pq.write_table(pa.Table.from_pylist([_plain(p) for p in result.points]), partial / POINTS)
+        for name, several in ((POINTS, result.points), (VARIED, result.varied)):
+            pq.write_table(pa.Table.from_pylist([_plain(p) for p in several]), partial / name)
         drawn = _draw(result, partial) if figures.available() else []
-        text = report.report(result.rows, result.facts, [(name, FIGURES[name]) for name in drawn])
+        text = report.report(result.rows, result.facts, [(name, FIGURES[name]) for name in drawn], result.varied)
         (partial / REPORT).write_text(text, encoding="utf-8")
         _replace(partial, path)
     except OSError as error:
@@ -183,7 +184,7 @@ def _draw(result: Result, folder: Path) -> list[str]:
     return list(drawings)
 
 
-def _plain(point: Point) -> dict[str, Any]:
+def _plain(point: Point | Varied) -> dict[str, Any]:
     return {name: getattr(point, name) for name in point.__slots__}
 
 

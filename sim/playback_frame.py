@@ -6,6 +6,7 @@ World frame ENU, metres. Entities: `world/truth` grey, `world/found` blue, `worl
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,8 @@ def save_frame(picture: Picture, path: Path) -> None:
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def log_frame(recording: rr.RecordingStream, picture: Picture) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from perception.harness.rows import INSTRUMENTS, Row
+from perception.harness.sensitivity import Varied
 from perception.harness.verdict import Verdict
 
 BEGIN, END = "<!-- paper:begin -->", "<!-- paper:end -->"
@@ -67,8 +69,13 @@ def tally(rows: Iterable[Row]) -> str:
     return ", ".join(f"{count[v]} {v}" for v in Verdict if count[v])
 
 
-def report(rows: Sequence[Row], facts: Mapping[str, Any], figures: Sequence[tuple[str, str]] = ()) -> str:
-    """The whole report; `figures` are file names beside it and what they show."""
+def report(
+    rows: Sequence[Row],
+    facts: Mapping[str, Any],
+    figures: Sequence[tuple[str, str]] = (),
+    varied: Sequence[Varied] = (),
+) -> str:
+    """The whole report; `figures` are file names beside it and what they show, `varied` claims at other settings."""
     shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
     lines = ["# The paper's Evaluation, claim by claim", "", _made(facts), ""]
     lines += [f"- {INSTRUMENTS[i]}: {tally(r for r in rows if r.instrument == i)}." for i in shown]
@@ -77,6 +84,8 @@ def report(rows: Sequence[Row], facts: Mapping[str, Any], figures: Sequence[tupl
         lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
     for section in dict.fromkeys(r.section for r in rows):
         lines += [f"## {section}", "", *_section([r for r in rows if r.section == section], shown), ""]
+    if varied:
+        lines += _sensitivity(rows, varied)
     return "\n".join(lines)
 
 
@@ -134,6 +143,11 @@ random-2 at that budget, chosen on all frames, as the paper does; the choice is 
 in the paper, but arithmetic on what it prints."""
 
 
+_SENSITIVITY = """\
+The paper names neither its score threshold nor the centre of its mission region. Here are the claims that could hang on
+them, over both, from the same detections; a star marks another verdict than above."""
+
+
 def _section(rows: Sequence[Row], shown: Sequence[str]) -> list[str]:
     if not any(r.instrument for r in rows):
         lines = ["| claim | sentence | paper | ours | verdict | |", "|---|---|---|---|---|---|"]
@@ -148,6 +162,35 @@ def _section(rows: Sequence[Row], shown: Sequence[str]) -> list[str]:
         )
         notes = list(dict.fromkeys(r.note for r in several.values() if r.note))
         lines.append(f"| {first.says} | {first.place} | {papers(first)} |{cells} {'; masked: '.join(notes)} |")
+    return lines
+
+
+def _sensitivity(rows: Sequence[Row], varied: Sequence[Varied]) -> list[str]:
+    """A table a knob and instrument, its settings in columns; a star where the verdict is not that of the table above."""
+    lines = ["## What the verdicts hang on", "", _SENSITIVITY, ""]
+    first = {(r.id, r.instrument): r for r in rows}
+    for knob, title in (("tau", "score threshold τ"), ("disc", "mission disc")):
+        for i, name in INSTRUMENTS.items():
+            its = [v for v in varied if (v.knob, v.instrument) == (knob, i)]
+            if not its:
+                continue
+            settings = list(dict.fromkeys(v.setting for v in its))
+            lines += [
+                f"**{title}**, {name}:",
+                "",
+                f"| claim | {' | '.join(settings)} |",
+                "|---|" + "---|" * len(settings),
+            ]
+            for claim in dict.fromkeys(v.id for v in its):
+                row = first[claim, i]
+                cells = {
+                    v.setting: ours(replace(row, value=v.value, low=v.low, high=v.high, verdict=v.verdict))
+                    + (" *" if v.verdict != row.verdict else "")
+                    for v in its
+                    if v.id == claim
+                }
+                lines.append(f"| {row.says} | {' | '.join(cells[s] for s in settings)} |")
+            lines.append("")
     return lines
 
 

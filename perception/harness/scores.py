@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from perception.harness.condition import CellsBy, Condition, Unsent
-from perception.harness.evaluate import Evaluation
+from perception.harness.evaluation import Evaluation
+from perception.harness.evaluation import Region as Evaluated
 from perception.harness.measures import Floats, Region, under
 from perception.harness.statistics import DRAWS, Ranked, rank, resamples
 from scenarios.streams import stream
@@ -22,6 +23,7 @@ class Bootstrap:
     Args:
         evaluation: it has to hold the conditions with `unsent` and `cells_by` put in.
         unsent, cells_by: what a cell that was not sent counts as, and what ranks cells.
+        disc: which of the evaluation's regions answers for the mission.
         by: what is resampled: frames, or whole scenes.
         draws: resamples, and as many random splits into halves.
     """
@@ -32,14 +34,16 @@ class Bootstrap:
         unsent: Unsent,
         cells_by: CellsBy = "confidence",
         *,
+        disc: Literal["mission", "ego"] = "mission",
         by: By = "frame",
         draws: int = DRAWS,
         seed: int = 0,
     ) -> None:
-        self._evaluation, self._unsent, self._cells_by, self._by = evaluation, unsent, cells_by, by
+        self._evaluation, self._unsent, self._cells_by = evaluation, unsent, cells_by
+        self._disc, self._by = disc, by
         self._draws, self._seed = draws, seed
-        self._ranked: dict[tuple[Condition, Region], Ranked] = {}
-        self._found: dict[tuple[Condition, Region], tuple[float, Floats]] = {}
+        self._ranked: dict[tuple[Condition, Evaluated], Ranked] = {}
+        self._found: dict[tuple[Condition, Evaluated], tuple[float, Floats]] = {}
         self._weights: dict[tuple[str, int], Floats] = {}
 
     def ap(self, condition: Condition, region: Region) -> float:
@@ -66,18 +70,21 @@ class Bootstrap:
     def _under(self, condition: Condition) -> Condition:
         return under(condition, self._unsent, self._cells_by)
 
-    def _get(self, condition: Condition, region: Region) -> tuple[float, Floats]:
-        key = (self._under(condition), region)
+    def _get(self, condition: Condition, asked: Region) -> tuple[float, Floats]:
+        key = self._key(condition, asked)
         if key not in self._found:
-            ranked = self._rank(condition, region)
+            ranked = self._rank(condition, asked)
             weights = self._once("resamples", len(ranked.truths))
             self._found[key] = (self._evaluation.ap(*key), ranked.ap(weights))
         return self._found[key]
 
-    def _rank(self, condition: Condition, region: Region) -> Ranked:
-        key = (self._under(condition), region)
+    def _key(self, condition: Condition, asked: Region) -> tuple[Condition, Evaluated]:
+        return self._under(condition), self._disc if asked == "mission" else asked
+
+    def _rank(self, condition: Condition, asked: Region) -> Ranked:
+        key = self._key(condition, asked)
         if key not in self._ranked:
-            self._ranked[key] = rank(self._evaluation.matched(*key), self._evaluation.groups(region, self._by))
+            self._ranked[key] = rank(self._evaluation.matched(*key), self._evaluation.groups(key[1], self._by))
         return self._ranked[key]
 
     def _once(self, what: str, groups: int) -> Floats:
