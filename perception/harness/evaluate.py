@@ -32,7 +32,7 @@ REGION_M = 32.0
 """Radius of the mission's disc, and of the one around the ego."""
 IOU = 0.5
 FLUSH_FRAMES = 4
-"""Frames that are lost when an evaluation is interrupted, at most."""
+"""Finished frames that are lost when the process is killed, at most; an exception loses none."""
 
 
 def evaluate(
@@ -90,12 +90,16 @@ def evaluate(
         return name, _frame(instrument, frames, f, keys[f], missing, regions, settings)
 
     results: list[FrameResult] = []
-    for name, found in _in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
-        results.append(found if kept is None else kept.add(name, found))
-        if kept is not None and (len(results) % FLUSH_FRAMES == 0 or len(results) == len(keys)):
+    try:
+        for name, found in _in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
+            results.append(found if kept is None else kept.add(name, found))
+            if kept is not None and len(results) % FLUSH_FRAMES == 0:
+                kept.flush()
+            if progress is not None:
+                progress(len(results), len(keys))
+    finally:
+        if kept is not None:
             kept.flush()
-        if progress is not None:
-            progress(len(results), len(keys))
     return assemble(results, conditions, regions, settings, np.asarray(frames.scene), plain)
 
 

@@ -1,0 +1,286 @@
+"""The evaluator over made frames: against the one-image functions, in every region, resumed, saved and read back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from harness_examples import MadeFrames, MadeInstrument, made_frames
+
+from perception.ap import CONVENTIONS, match, suppress
+from perception.harness import selection
+from perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from perception.harness.contract import Exchange
+from perception.harness.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
+from perception.types import Boxes
+
+BEST = Condition(0.1, "best-2", roi=True)
+THREE = (SINGLE, BEST, FULL_SHARING)
+EVERYWHERE = ("full", "mission", "ego")
+
+
+@pytest.fixture(scope="module")
+def frames() -> MadeFrames:
+    return made_frames([7, 7, 3, 9, 9])
+
+
+@pytest.fixture(scope="module")
+def whole(frames: MadeFrames) -> Evaluation:
+    return evaluate(MadeInstrument(), frames, THREE, regions=EVERYWHERE)
+
+
+def some(frames: MadeFrames, which: list[int]) -> MadeFrames:
+    return MadeFrames(*(getattr(frames, name)[which] for name in ("true_pose", "est_pose", "cars", "scene")))
+
+
+def alike(a: Evaluation, b: Evaluation, drop: int = 0) -> None:
+    """Equal to the bit, `drop` frames at the start of b left out."""
+    skip = drop * b.settings.egos
+    assert a.conditions == b.conditions
+    assert a.regions == b.regions
+    assert a.scene.tolist() == b.scene[drop:].tolist()
+    assert np.array_equal(a.target, b.target[drop:], equal_nan=True)
+    for key, units in a.units.items():
+        for one, other in zip(units, b.units[key][skip:], strict=True):
+            assert (one.score.tolist(), one.hit.tolist(), one.truths) == (
+                other.score.tolist(),
+                other.hit.tolist(),
+                other.truths,
+            )
+    for c in a.conditions:
+        for cost in ("cells", "payload_bytes", "index_bytes"):
+            assert getattr(a, cost)[c].tolist() == getattr(b, cost)[c][skip:].tolist()
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_all_images_at_once_are_one_after_another(frames: MadeFrames, name: str) -> None:
+    found = evaluate(MadeInstrument(), frames, [FULL_SHARING], regions=EVERYWHERE, convention=name)
+    hits = 0
+    for f, key in enumerate(frame_keys(frames)):
+        view = MadeInstrument().look(frames, f)
+        target = mission_target(frames, f, key)
+        for ego in range(5):
+            sent = np.ones((4, 64, 64), bool)
+            peers = tuple(p for p in range(5) if p != ego)
+            boxes = view.detect([Exchange(ego, peers, sent)], 0.01)[0]
+            x, y, yaw = frames.est_pose[f, ego]
+            c, s = np.cos(yaw), np.sin(yaw)
+            xy = np.stack([x + c * boxes[:, 0] - s * boxes[:, 1], y + s * boxes[:, 0] + c * boxes[:, 1]], axis=1)
+            world = suppress(Boxes(xy, boxes[:, 2:4], boxes[:, 4] + yaw, boxes[:, 5].astype(np.float32)), 0.15)
+            there = truth(frames, f, ego, MadeInstrument.geometry)
+            at = {
+                "full": None,
+                "ego": (*frames.true_pose[f, ego, :2], REGION_M),
+                "mission": target and (*target, REGION_M),
+            }
+            for region in EVERYWHERE:
+                ours = found.units[FULL_SHARING, region][f * 5 + ego]
+                if region == "mission" and target is None:
+                    assert (len(ours.score), ours.truths) == (0, 0)
+                    continue
+                plain = match(world, there, at[region], convention=CONVENTIONS[name])
+                assert ours.truths == plain.truths
+                assert ours.score.tolist() == plain.score.tolist()
+                assert ours.hit.tolist() == plain.hit.tolist()
+                hits += int(ours.hit.sum())
+    assert hits > 100
+
+
+def test_truth_is_what_stands_in_the_true_square(frames: MadeFrames) -> None:
+    for ego in range(5):
+        x, y, yaw = frames.true_pose[0, ego]
+        expected = []
+        for car in frames.cars[0, :-1]:
+            turned = np.exp(-1j * yaw) * complex(car[0] - x, car[1] - y)
+            if abs(turned.real) < 102.4 and abs(turned.imag) < 102.4:
+                expected.append(car.tolist())
+        there = truth(frames, 0, ego, MadeInstrument.geometry)
+        assert there.table().tolist() == expected
+        assert len(there) < 39 or ego != 1
+
+
+def test_a_target_is_near_the_fleet_and_the_frames_own(frames: MadeFrames) -> None:
+    keys = frame_keys(frames)
+    assert keys == [(7, 0), (7, 1), (3, 0), (9, 0), (9, 1)]
+    many = made_frames([5] * 200, seed=3)
+    chosen = []
+    for f, key in enumerate(frame_keys(many)):
+        centre = many.true_pose[f, :, :2].mean(axis=0)
+        away = np.hypot(*(many.cars[f, :, :2] - centre).T)
+        target = mission_target(many, f, key)
+        if not (away <= selection.FOOTPRINT_M).any():
+            assert target is None
+            continue
+        which = np.flatnonzero((many.cars[f, :, :2] == target).all(axis=1))
+        assert len(which) == 1
+        assert away[which[0]] <= selection.FOOTPRINT_M
+        chosen.append(np.count_nonzero(away[away <= selection.FOOTPRINT_M] < away[which[0]]) == 0)
+    assert 0.03 < np.mean(chosen) < 0.4, "drawn evenly, not the nearest"
+
+
+def test_frames_without_a_target_do_not_count_for_the_mission(frames: MadeFrames) -> None:
+    cars = frames.cars.copy()
+    cars[1, :, :2] += 500.0
+    found = evaluate(MadeInstrument(), replace(frames, cars=cars), [FULL_SHARING])
+    assert np.isnan(found.target[1]).all()
+    assert not np.isnan(found.target[[0, 2, 3, 4]]).any()
+    assert found.groups("mission").tolist() == [f for f in (0, 2, 3, 4) for _ in range(5)]
+    assert found.groups("mission", by="scene").tolist() == [s for s in (7, 3, 9, 9) for _ in range(5)]
+    assert len(found.matched(FULL_SHARING, "mission")) == 20
+    assert len(found.matched(FULL_SHARING, "full")) == len(found.groups()) == 25
+
+
+def test_bytes_of_a_fleet_frame(whole: Evaluation) -> None:
+    assert whole.payload_bytes[FULL_SHARING].reshape(-1, 5).sum(axis=1).tolist() == [13_107_200] * 5
+    assert whole.index_bytes[FULL_SHARING].tolist() == [0] * 25
+    assert whole.cells[BEST].tolist() == [1638] * 25
+    assert whole.payload_bytes[BEST].tolist() == [1638 * 160] * 25
+    assert whole.index_bytes[BEST].tolist() == [2 * 512] * 25
+    assert whole.cells[SINGLE].tolist() == [0] * 25
+
+
+def test_more_cells_find_more(whole: Evaluation) -> None:
+    assert whole.ap(SINGLE) < whole.ap(BEST) < whole.ap(FULL_SHARING)
+
+
+def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluation) -> None:
+    cut, floored = whole.at(0.3), evaluate(MadeInstrument(), frames, THREE, regions=EVERYWHERE, floor=0.3)
+    for key, units in cut.units.items():
+        for one, other in zip(units, floored.units[key], strict=True):
+            assert one.hit.tolist() == other.hit.tolist()
+            assert one.score.tolist() == other.score.tolist()
+    assert cut.ap(FULL_SHARING) < whole.ap(FULL_SHARING)
+    with pytest.raises(ValueError, match=r"tau is 0.2, must be at least the floor 0.3"):
+        cut.at(0.2)
+
+
+def test_what_differs_in_nothing_is_asked_once(frames: MadeFrames, whole: Evaluation) -> None:
+    instrument = MadeInstrument()
+    twins = (*THREE, Condition(0.1, "best-4"), Condition(0.1, "worst-4"), Condition(1.0, cells_by="norm"), SINGLE)
+    found = evaluate(instrument, frames, twins)
+    assert instrument.asked == 4 * 25
+    assert found.conditions == twins[:-1]
+    assert found.ap(Condition(1.0, cells_by="norm")) == whole.ap(FULL_SHARING)
+    assert found.cells[Condition(0.1, "worst-4")].tolist() == [1638] * 25
+
+
+def test_frames_in_another_order_are_the_same_frames(frames: MadeFrames, whole: Evaluation) -> None:
+    order = [2, 3, 4, 0, 1]
+    turned = evaluate(MadeInstrument(), some(frames, order), THREE, regions=EVERYWHERE)
+    for key, units in turned.units.items():
+        for place, f in enumerate(order):
+            for ego in range(5):
+                assert units[5 * place + ego].score.tolist() == whole.units[key][5 * f + ego].score.tolist()
+    for c in THREE:
+        for region in EVERYWHERE:
+            assert turned.ap(c, region) == pytest.approx(whole.ap(c, region), abs=1e-12)
+
+
+def test_workers_change_nothing(frames: MadeFrames, whole: Evaluation) -> None:
+    seen: list[tuple[int, int]] = []
+    several = evaluate(
+        MadeInstrument(), frames, THREE, regions=EVERYWHERE, workers=3, progress=lambda *done: seen.append(done)
+    )
+    alike(several, whole)
+    assert seen == [(k, 5) for k in range(1, 6)]
+
+
+def test_a_worker_is_told_to_start_and_its_error_comes_out(frames: MadeFrames) -> None:
+    class Broken(MadeInstrument):
+        started = 0
+
+        def start_worker(self) -> None:
+            Broken.started += 1
+
+        def look(self, frames: object, frame: int) -> object:
+            raise RuntimeError(f"no light in frame {frame}")
+
+    with pytest.raises(RuntimeError, match="no light in frame 0"):
+        evaluate(Broken(), frames, THREE, workers=2)
+    assert 1 <= Broken.started <= 2
+
+
+def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: Evaluation, tmp_path: Path) -> None:
+    class Tired(MadeInstrument):
+        def look(self, frames: MadeFrames, frame: int) -> object:
+            if frame == 3:
+                raise KeyboardInterrupt
+            return super().look(frames, frame)
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(Tired(), frames, THREE, regions=EVERYWHERE, store=tmp_path)
+    rest = MadeInstrument()
+    alike(evaluate(rest, frames, THREE, regions=EVERYWHERE, store=tmp_path), whole)
+    assert rest.looked == [3, 4], "three frames were kept"
+
+    more = MadeInstrument()
+    wider = evaluate(more, frames, (*THREE, Condition(0.02)), regions=EVERYWHERE, store=tmp_path)
+    assert more.asked == 25, "only the new condition"
+    assert wider.ap(BEST) == whole.ap(BEST)
+    again = MadeInstrument()
+    alike(evaluate(again, some(frames, [2, 3, 4]), THREE, regions=EVERYWHERE, store=tmp_path), whole, drop=2)
+    assert again.looked == []
+
+
+@pytest.mark.parametrize("change", ["floor", "seed", "convention", "fingerprint", "pose", "regions"])
+def test_a_store_answers_only_for_what_it_holds(frames: MadeFrames, tmp_path: Path, change: str) -> None:
+    evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+    instrument = MadeInstrument("other" if change == "fingerprint" else "made")
+    if change == "pose":
+        frames = replace(frames, est_pose=frames.est_pose + 1e-6)
+    knobs = {
+        "floor": {"floor": 0.02},
+        "seed": {"seed": 1},
+        "convention": {"convention": "uav3d"},
+        "regions": {"regions": ["ego"]},
+    }
+    evaluate(instrument, frames, [FULL_SHARING], store=tmp_path, **knobs.get(change, {}))
+    assert len(instrument.looked) == 5
+
+
+def test_a_broken_store_says_which_file(frames: MadeFrames, tmp_path: Path) -> None:
+    evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+    part = next(tmp_path.glob("*/*.parquet"))
+    part.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=rf"{part.name}: not part of an evaluation .* remove it to go on"):
+        evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+
+
+def test_saved_and_read_back(whole: Evaluation, tmp_path: Path) -> None:
+    whole.save(tmp_path / "deep" / "e.parquet")
+    back = Evaluation.load(tmp_path / "deep" / "e.parquet")
+    alike(back, whole)
+    assert back.settings == whole.settings
+    assert back.ap(BEST, "mission") == whole.ap(BEST, "mission")
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["e.parquet"], "no temporary file is left"
+
+
+def test_what_is_not_an_evaluation(tmp_path: Path) -> None:
+    (tmp_path / "e.parquet").write_bytes(b"nothing")
+    for name in ("e.parquet", "missing.parquet"):
+        with pytest.raises(ValueError, match=rf"{name}: not an evaluation of this project"):
+            Evaluation.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"egos": 6}, "egos is 6, must be 1 to the 5 drones of a frame"),
+        ({"egos": 0}, "egos is 0, must be"),
+        ({"regions": ["half"]}, "region is 'half', must be full or mission or ego"),
+        ({"convention": "coco"}, "convention is 'coco', must be rotated or opencood or uav3d"),
+        ({"conditions": [Condition(0.1, "best-5")]}, "peers is 'best-5', must fit a fleet with 4 peers"),
+    ],
+)
+def test_what_evaluate_refuses(frames: MadeFrames, knobs: dict, message: str) -> None:
+    conditions = knobs.pop("conditions", [FULL_SHARING])
+    with pytest.raises(ValueError, match=message):
+        evaluate(MadeInstrument(), frames, conditions, **knobs)
+
+
+def test_fewer_egos_are_the_first_ones(frames: MadeFrames, whole: Evaluation) -> None:
+    two = evaluate(MadeInstrument(), frames, [FULL_SHARING], egos=2)
+    assert len(two.units[FULL_SHARING, "full"]) == 10
+    assert two.units[FULL_SHARING, "full"][3].score.tolist() == whole.units[FULL_SHARING, "full"][6].score.tolist()
