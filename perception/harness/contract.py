@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class FleetFrames(Protocol):
-    """n fleet-frames of d drones: where they were, what was there. `perception.frames.Frames` is one."""
+    """n fleet-frames of d drones: where they were, what was there. `perception.bench.dataset.Frames` is one."""
 
     @property
     def true_pose(self) -> Floats:

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from perception.bench.dataset import Frames
+from perception.bench.scenes import DRONES
 from perception.decode import REFERENCE_SIZE_M
-from perception.frames import DRONES, Frames
-from perception.fusion.base import takes_part
-from perception.geometry import FULL, HEAD_PX, Geometry
+from perception.fusion.base import UnsentCells, takes_part
+from perception.geometry import CELLS, FULL, HEAD_PX, Geometry
 from perception.model import CarNet
+from perception.training.recipe import Recipe
 from perception.warp import warp
 from scenarios.streams import stream
 
@@ -122,11 +124,35 @@ def loss_of(out: Tensor, labels: list[NDArray[np.float64]], geometry: Geometry =
     return (positive + negative) / cars + regression
 
 
-def gradients(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device) -> tuple[float, list[Tensor]]:
+@dataclass(frozen=True, slots=True)
+class Thinning:
+    """Random cell dropout of one shard: which cells of which links arrive, and what the others count as."""
+
+    rng: np.random.Generator
+    probability: float
+    unsent: UnsentCells
+
+    @classmethod
+    def of(cls, recipe: Recipe, step: int, shard: int) -> Thinning | None:
+        """The recipe's, from a stream of its own, so that a run without dropout draws what it always drew."""
+        if not recipe.cell_dropout:
+            return None
+        return cls(stream(recipe.seed, 0, (step, shard), "train.cells"), recipe.cell_dropout, recipe.unsent)
+
+    def sent(self, links: int) -> Tensor:
+        """[links, 1, 64, 64] bool. A thinned link keeps a fraction of its cells that is log-uniform from 1 % to all."""
+        keep = np.where(self.rng.random(links) < self.probability, 0.01 ** self.rng.random(links), 1.0)
+        cells = self.rng.random((links, 1, CELLS, CELLS), dtype=np.float32)
+        return torch.from_numpy(cells < keep[:, None, None, None])
+
+
+def gradients(
+    net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device, thinning: Thinning | None = None
+) -> tuple[float, list[Tensor]]:
     """Loss and gradients of one shard, in the thread that calls."""
     if device.type == "cpu":
         torch.set_num_threads(1)  # of this thread: shards side by side beat two threads in every operation
-    loss = step_loss(net, batch, rng, device)
+    loss = step_loss(net, batch, rng, device, thinning)
     return loss.item(), list(torch.autograd.grad(loss, list(net.parameters())))
 
 
@@ -143,7 +169,9 @@ def apply(net: CarNet, replicas: list[CarNet], grads: list[list[Tensor]], optimi
         replica.load_state_dict(net.state_dict())
 
 
-def step_loss(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device) -> Tensor:
+def step_loss(
+    net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device, thinning: Thinning | None = None
+) -> Tensor:
     """The loss of one step: for each frame, `EGOS` drones that fuse all others and one that is alone."""
     b, k = batch.images.shape[:2]
     features = net.encoder(batch.images.flatten(0, 1).to(device))
@@ -153,15 +181,18 @@ def step_loss(net: CarNet, batch: Batch, rng: np.random.Generator, device: torch
     peers = np.array([[[i for i in range(k) if i != e] for e in row] for row in egos])
     agent = (first[:, :, None] + peers).ravel()
     est = torch.from_numpy(batch.est.reshape(-1, 3))
-    shape = (len(agent), 1, *features.shape[2:])
     delta = torch.stack([est[ego], est[agent]]).float()  # float64 poses are near the origin here
-    everywhere = torch.ones(shape, dtype=torch.bool, device=device)
+    links = len(agent)
+    let = torch.ones(links, 1, CELLS, CELLS, dtype=torch.bool) if thinning is None else thinning.sent(links)
     geometry = net.config.geometry
-    warped, sent, _ = warp(features[agent], everywhere, delta[0].to(device), delta[1].to(device), geometry.cell_m)
+    warped, sent, inside = warp(
+        features[agent], let.to(device), delta[0].to(device), delta[1].to(device), geometry.cell_m
+    )
     agents = torch.cat([features[ego[:: k - 1]][:, None], warped.view(b * EGOS, k - 1, *warped.shape[1:])], dim=1)
     weight = torch.ones(b * EGOS, k - 1, device=device)
-    arrived = sent.view(b * EGOS, k - 1, *sent.shape[2:])
-    fused = net.fusion(agents, takes_part(arrived, arrived, weight, "masked"), F.pad(weight, (1, 0), value=1.0))
+    shape = (b * EGOS, k - 1, CELLS, CELLS)
+    part = takes_part(sent.view(shape), inside.view(shape), weight, "masked" if thinning is None else thinning.unsent)
+    fused = net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0))
     alone = np.arange(b) * k + rng.integers(k, size=b)
     out = net.head(torch.cat([fused, features[alone]]))
     pose = batch.pose.reshape(-1, 3)

@@ -1,9 +1,9 @@
-"""Train the detector: `sortie train`, or `python -m perception.training.train`.
+"""Train the detector: what `sortie train` runs.
 
-Scenes are drawn and rendered once (`frames.py`), then encoder, edge network and head learn together under
-full sharing; a third of the supervised outputs are single-drone, so that the head works without peers.
-Every batch follows from (seed, step), checkpoints are safetensors written under a temporary name, and a
-run that was cut off goes on from its last checkpoint to the same end.
+Encoder, fusion and head learn together on the benchmark's train split; a third of the supervised outputs are
+single-drone, so that the head works without peers. Every batch follows from (seed, step), checkpoints are
+safetensors written under a temporary name, and a run that was cut off goes on from its last checkpoint to the
+same end.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +23,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perception.checkpoint import load_weights
-from perception.frames import PER_SCENE, TRAIN_SEED, VALIDATION_SEED, load_frames, make_frames
+from perception.bench.dataset import Benchmark, Frames, load_frames, make_split
+from perception.checkpoint import load_weights, read_config
 from perception.harness.statistics import Difference
-from perception.model import CarNet
-from perception.training.learn import SHARDS, apply, draw_batch, gradients
-from perception.training.validation import history, publish, validate_all
+from perception.model import CarNet, ModelConfig
+from perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
+from perception.training.recipe import PEAK_LR, Recipe, benchmark_root
+from perception.training.validation import history, publish, validate, validate_all
 from scenarios.streams import stream
 
-PEAK_LR = 2.5e-3
+CHECK_STEPS, CHECK_FRAMES, CHECK_EGOS = 100, 12, 2
+"""Validation AP is looked at every so many steps, on so many frames with so many egos each."""
 
 log_to_nowhere = logging.getLogger("sortie.train")
+Scalars = Callable[[int, dict[str, float]], None]
 
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Where the weights are, and what they reach on held-out towns under the schema's default pose errors (a alone, b all five)."""
+    """Where the weights are, and what they reach on the validation split (a alone, b all five)."""
 
     weights: Path
     steps: int
@@ -58,102 +61,140 @@ def learning_rate(step: int, steps: int, peak: float = PEAK_LR) -> float:
 
 def train(
     out: Path,
+    recipe: Recipe = Recipe(),  # noqa: B008 (frozen)
+    config: ModelConfig = ModelConfig(),  # noqa: B008 (frozen)
+    bench: Benchmark | None = None,
     *,
-    frames: int = 1200,
-    steps: int = 700,
-    seed: int = 0,
-    peak_lr: float = PEAK_LR,
+    root: Path | None = None,
+    work: Path | None = None,
+    warm_start: Path | None = None,
     minutes: float | None = None,
     resume: bool = True,
-    warm_start: Path | None = None,
-    work: Path = Path("runs/train"),
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    scalars: Scalars | None = None,
     log: logging.Logger = log_to_nowhere,
 ) -> TrainResult:
     """Train and validate; write the weights to `out` and their card beside them.
 
     Args:
         out: the safetensors file to write.
-        frames: training fleet-frames (rounded up to whole scenes of 12).
-        steps: optimiser steps of 4 frames.
-        peak_lr: the cycle's highest learning rate.
+        recipe, config, bench: the run, the network and the data; the benchmark of the config's range by default.
+        root: folder of benchmarks; splits that are missing are made.
+        work: where checkpoint and loss curve are kept; the folder of `out` by default.
+        warm_start: begin from these weights instead of from nothing, as far as tensors fit (the log names the others).
         minutes: stop training after this long, validate and write what there is; the checkpoint stays.
-        resume: go on from the checkpoint in `work`, if it belongs to the same seed, frames and steps.
-        warm_start: begin from these weights instead of from nothing.
-        work: where rendered frames, checkpoint and loss curve are kept.
+        resume: go on from the checkpoint in `work`, if it belongs to the same run.
         device: "cpu" or "cuda"; left out, cuda where there is one.
         progress: called with (stage, done, of).
+        scalars: called with (step, values by name) for loss curves: train/loss, train/lr, validation/ap_single, validation/ap_full.
 
     Raises:
-        ValueError: for a step or frame count below 1, or weights that do not fit.
+        ValueError: weights that cannot be read, or a benchmark of another range than the network's.
     """
-    for name, value in (("frames", frames), ("steps", steps)):
-        if value < 1:
-            raise ValueError(f"{name} is {value}, must be at least 1")
     begun = time.monotonic()
     tell = progress or (lambda stage, done, of: None)
+    show = scalars or (lambda step, values: None)
+    bench = Benchmark(geometry=config.geometry) if bench is None else bench
+    if bench.geometry != config.geometry:
+        raise ValueError(
+            f"the benchmark reaches ±{bench.geometry.half_extent_m:g} m, must be the network's ±{config.half_extent_m:g} m"
+        )
     where = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    scenes = -(-frames // PER_SCENE)
-    files = make_frames(work / "frames", TRAIN_SEED, scenes, PER_SCENE, lambda i, n: tell("rendering scenes", i, n))
-    held_out = make_frames(
-        work / "frames", VALIDATION_SEED, 12, 6, lambda i, n: tell("rendering validation scenes", i, n)
-    )
-    data = load_frames(files)
-    log.info("%d training frames in %d scenes", len(data.images), scenes)
+    root, work = root or benchmark_root(), work or out.parent
+    files = make_split(bench, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering scenes", i, n))
+    held_out = make_split(bench, "validation", root, progress=lambda i, n: tell("rendering validation", i, n))
+    data, validation = load_frames(files), load_frames(held_out)
+    check = _first(validation, CHECK_FRAMES)
+    log.info("%d training frames in %d scenes", len(data), len(files))
 
-    torch.manual_seed(seed)
-    net = (CarNet() if warm_start is None else load_weights(warm_start)).to(where).train()
-    optimiser = torch.optim.AdamW(net.parameters(), lr=PEAK_LR, weight_decay=1e-3)
-    run = {
-        "seed": seed,
-        "frames": scenes * PER_SCENE,
-        "steps": steps,
-        "peak_lr": peak_lr,
-        "warm_start": warm_start.name if warm_start else "",
-    }
+    torch.manual_seed(recipe.seed)
+    net = CarNet(config)
+    if warm_start is not None:
+        _begin_from(net, warm_start, log)
+    net = net.to(where).train()
+    optimiser = torch.optim.AdamW(net.parameters(), lr=recipe.peak_lr, weight_decay=1e-3)
+    run = {**asdict(recipe), "model": asdict(config), "benchmark": bench.key()}
+    work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
-    first, spent = _restore(checkpoint, run, net, optimiser, log) if resume else (0, 0.0)
+    done, spent = _restore(checkpoint, run, net, optimiser, log) if resume else (0, 0.0)
     curve = work / "loss.csv"
-    if first == 0:
-        curve.write_text("step,loss,lr\n")
+    if done == 0:
+        curve.write_text("step,loss,lr,ap_single,ap_full\n")
     replicas = [copy.deepcopy(net) for _ in range(SHARDS)]
-    pool = ThreadPoolExecutor(SHARDS)
-    recent: list[float] = []
-    loss, done = float("nan"), first
-    for step in range(first, steps):
-        rate = learning_rate(step, steps, peak_lr)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        jobs = [
-            pool.submit(gradients, r, draw_batch(data, seed, step, i), stream(seed, 0, (step, i), "train.egos"), where)
-            for i, r in enumerate(replicas)
-        ]
-        values, grads = zip(*(job.result() for job in jobs), strict=True)
-        apply(net, replicas, list(grads), optimiser)
-        done = step + 1
-        recent = [*recent[-49:], float(np.mean(values))]
-        loss = float(np.mean(recent))
-        if done % 10 == 0:
-            with curve.open("a", newline="") as file:
-                csv.writer(file).writerow([done, f"{loss:.4f}", f"{rate:.3g}"])
-            tell("training", done, steps)
-            log.info("step %d of %d, loss %.4f", done, steps, loss)
-        late = minutes is not None and time.monotonic() - begun > 60 * minutes
-        if done % 100 == 0 or done == steps or late:
-            _save(checkpoint, {**run, "step": done, "spent_s": spent + time.monotonic() - begun}, net, optimiser)
-        if late:
-            log.info("stopped after %.1f minutes at step %d of %d", minutes, done, steps)
-            break
-    pool.shutdown()
+    recent: list[float] = []  # a resumed run's mean begins anew; its weights do not know
+    loss = float("nan")
+    with ThreadPoolExecutor(SHARDS) as pool:
+        for step in range(done, recipe.steps):
+            rate = learning_rate(step, recipe.steps, recipe.peak_lr)
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            jobs = [
+                pool.submit(
+                    gradients,
+                    r,
+                    draw_batch(data, recipe.seed, step, i),
+                    stream(recipe.seed, 0, (step, i), "train.egos"),
+                    where,
+                    Thinning.of(recipe, step, i),
+                )
+                for i, r in enumerate(replicas)
+            ]
+            values, grads = zip(*(job.result() for job in jobs), strict=True)
+            apply(net, replicas, list(grads), optimiser)
+            done = step + 1
+            recent = [*recent[-49:], float(np.mean(values))]
+            loss = float(np.mean(recent))
+            late = minutes is not None and time.monotonic() - begun > 60 * minutes
+            if done % 10 == 0 or done == recipe.steps or late:
+                row = {"train/loss": loss, "train/lr": rate}
+                if done % CHECK_STEPS == 0 and done < recipe.steps:
+                    gain = validate(copy.deepcopy(net), check, where, CHECK_EGOS)
+                    row |= {"validation/ap_single": gain.ap_a, "validation/ap_full": gain.ap_b}
+                _note(curve, done, row)
+                show(done, row)
+                tell("training", done, recipe.steps)
+                log.info("step %d of %d, %s", done, recipe.steps, ", ".join(f"{k} {v:.4g}" for k, v in row.items()))
+            if done % 100 == 0 or done == recipe.steps or late:
+                _save(checkpoint, {**run, "step": done, "spent_s": spent + time.monotonic() - begun}, net, optimiser)
+            if late:
+                log.info("stopped after %.1f minutes at step %d of %d", minutes, done, recipe.steps)
+                break
     spent += time.monotonic() - begun
 
-    runs = [*history(warm_start), {**run, "done": done, "loss": round(loss, 4), "minutes": round(spent / 60, 1)}]
-    levels = validate_all(net, load_frames(held_out), where, lambda i, n: tell("validating", i, n))
-    publish(net.cpu(), out, runs, levels)
+    facts = {**asdict(recipe), "done": done, "loss": round(loss, 4), "minutes": round(spent / 60, 1)}
+    levels = validate_all(net, validation, bench, where, lambda i, n: tell("validating", i, n))
+    publish(net.cpu(), out, bench, [*history(warm_start), facts], levels)
     usual = levels[0].gain
+    show(done, {"validation/ap_single": usual.ap_a, "validation/ap_full": usual.ap_b})
     log.info("AP@0.5 single %.3f, full %.3f", usual.ap_a, usual.ap_b)
-    return TrainResult(out, done, loss, usual, len(data.images), spent / 60)
+    return TrainResult(out, done, loss, usual, len(data), spent / 60)
+
+
+def _first(frames: Frames, count: int) -> Frames:
+    """Some frames of different scenes."""
+    which = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
+    return Frames(*(getattr(frames, name)[which] for name in Frames.__slots__))
+
+
+def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
+    """Take over the tensors of `path` that the network has in the same shape."""
+    given = load_weights(path)
+    if read_config(path).geometry != net.config.geometry:
+        raise ValueError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")
+    mine, theirs = net.state_dict(), given.state_dict()
+    fit = {k: v for k, v in theirs.items() if k in mine and mine[k].shape == v.shape}
+    net.load_state_dict(fit, strict=False)
+    anew = sorted(set(mine) - set(fit))
+    if anew:
+        log.info("begin anew: %s", ", ".join(anew))
+
+
+def _note(path: Path, step: int, row: dict[str, float]) -> None:
+    """One more line of the loss curve."""
+    columns = ("train/loss", "train/lr", "validation/ap_single", "validation/ap_full")
+    with path.open("a", newline="") as file:
+        csv.writer(file).writerow([step, *(f"{row[c]:.4g}" if c in row else "" for c in columns)])
 
 
 def _save(path: Path, facts: dict[str, Any], net: CarNet, optimiser: torch.optim.Optimizer) -> None:
@@ -191,23 +232,3 @@ def _restore(
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     log.info("resuming at step %d", facts["step"])
     return int(facts["step"]), float(facts["spent_s"])
-
-
-if __name__ == "__main__":
-    import argparse
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "weights" / "disconet.safetensors")
-    parser.add_argument("--work", type=Path, default=Path("runs/train"))
-    parser.add_argument("--frames", type=int, default=1200)
-    parser.add_argument("--steps", type=int, default=700)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--peak-lr", type=float, default=PEAK_LR)
-    parser.add_argument("--minutes", type=float)
-    parser.add_argument("--warm-start", type=Path)
-    args = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    train(
-        args.out, frames=args.frames, steps=args.steps, seed=args.seed, peak_lr=args.peak_lr, minutes=args.minutes,
-        work=args.work, warm_start=args.warm_start, log=logging.getLogger("sortie.train"),
-    )  # fmt: skip

@@ -1,21 +1,28 @@
 """Training in miniature: batches keep their labels, a run that was cut off ends where the whole one does."""
 
+import json
+import logging
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file
 
+from perception.bench.dataset import Benchmark, Frames, load_frames, make_scene_file
+from perception.checkpoint import load_weights, read_facts, save_weights
+from perception.model import CarNet, ModelConfig
 from perception.training import train as training
-from perception.checkpoint import load_weights
-from perception.frames import Frames, load_frames, make_scene_file, random_captures, random_scene
-from perception.training.learn import draw_batch, local_cars
+from perception.training.learn import Thinning, draw_batch, local_cars
+from perception.training.recipe import Recipe, command
 from perception.training.train import learning_rate, train
+from perception.training.validation import card
 
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene_file(77, 2, tmp_path_factory.mktemp("frames") / "scene_77_2.npz")
+    return make_scene_file(Benchmark(), "train", 77, 2, tmp_path_factory.mktemp("frames") / "scene_77_2.npz")
 
 
 @pytest.fixture(scope="module")
@@ -26,21 +33,9 @@ def frames(scene_file: Path) -> Frames:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, scene_file: Path) -> None:
     """Training and validation on the two frames."""
-    monkeypatch.setattr(training, "make_frames", lambda *_, **__: [scene_file])
+    monkeypatch.setattr(training, "make_split", lambda *_, **__: [scene_file])
     monkeypatch.setattr("perception.training.validation.LEVELS", ((1.0, 1.0),))
     monkeypatch.setattr("perception.training.learn.SHARD_FRAMES", 1)
-
-
-def test_scenes_and_fleets_follow_from_their_seeds() -> None:
-    assert random_scene(5) == random_scene(5) != random_scene(6)
-    assert random_captures(5, 1) == random_captures(5, 1) != random_captures(5, 2)
-
-
-def test_a_scene_file_is_made_once(scene_file: Path) -> None:
-    before = scene_file.stat().st_mtime_ns
-    make_scene_file(77, 2, scene_file)
-    assert scene_file.stat().st_mtime_ns == before
-    assert [p.name for p in scene_file.parent.iterdir()] == [scene_file.name]
 
 
 def test_turning_and_mirroring_keep_cars_on_their_pixels(frames: Frames) -> None:
@@ -79,32 +74,86 @@ def test_the_rate_rises_and_falls() -> None:
     assert rates[-1] < 0.03 * rates[10]
 
 
-@pytest.mark.parametrize("field", ["frames", "steps"])
-def test_counts_below_one_are_refused(tmp_path: Path, field: str) -> None:
-    with pytest.raises(ValueError, match=f"{field} is 0, must be at least 1"):
-        train(tmp_path / "w.safetensors", work=tmp_path, **{field: 0})
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("steps", 0, "steps is 0, must be 1 to 1000000"),
+        ("scenes", 101, "scenes is 101, must be 1 to 100"),
+        ("peak_lr", 0.0, "peak_lr is 0.0, must be above 0 and at most 1"),
+        ("cell_dropout", 1.5, "cell_dropout is 1.5, must be 0 to 1"),
+        ("unsent", "half", "unsent is 'half', must be masked or zero"),
+    ],
+)
+def test_a_recipe_names_what_is_wrong(field: str, value: object, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        Recipe(**{field: value})  # type: ignore[arg-type]
+    assert str(caught.value) == message
+
+
+def test_thinning_drops_as_often_and_as_much_as_it_says() -> None:
+    assert Thinning.of(Recipe(), 3, 0) is None
+    half = Thinning.of(Recipe(cell_dropout=0.5, unsent="zero"), 3, 0)
+    assert half is not None
+    kept = half.sent(2000).float().mean(dim=(1, 2, 3)).numpy()
+    thinned = kept < 0.999  # all but the few that kept nearly everything
+    assert 0.46 < thinned.mean() < 0.54
+    quarters = np.log(kept[thinned]) / np.log(0.01)  # log-uniform: even between 0 and 1
+    assert np.histogram(quarters, bins=4, range=(0, 1))[0].min() > 0.2 * thinned.sum()
+    again = Thinning.of(Recipe(cell_dropout=0.5, unsent="zero"), 3, 0)
+    assert again is not None
+    assert np.array_equal(again.sent(2000).float().mean(dim=(1, 2, 3)).numpy(), kept)
+
+
+def test_the_command_repeats_the_run() -> None:
+    recipe = Recipe(steps=150, seed=2, cell_dropout=0.8, unsent="zero", warm_start="full-2.safetensors")
+    model = asdict(ModelConfig(decoder="deep", half_extent_m=51.2))
+    assert command({**asdict(recipe), "done": 150}, model, 3, "w.safetensors") == (
+        "sortie train --steps 150 --seed 2 --cell-dropout 0.8 --unsent zero --warm-start full-2.safetensors "
+        "--range 51.2 --decoder deep --bench-seed 3 --out w.safetensors"
+    )
+    assert command(asdict(Recipe()), asdict(ModelConfig()), 0, "w.safetensors") == "sortie train --out w.safetensors"
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
-def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(tmp_path: Path) -> None:
+    seen: list[tuple[int, dict[str, float]]] = []
+
     def run(name: str, **more: float) -> Path:
         out = tmp_path / name / "w.safetensors"
-        (tmp_path / name).mkdir(exist_ok=True)
-        train(out, frames=3, steps=2, work=tmp_path / name, device="cpu", **more)  # type: ignore[arg-type]
+        train(out, Recipe(steps=2, cell_dropout=0.5), device="cpu", scalars=lambda *a: seen.append(a), **more)  # type: ignore[arg-type]
         return out
 
     whole = load_file(run("whole"))
+    assert [step for step, _ in seen] == [2, 2]
+    assert set(seen[0][1]) == {"train/loss", "train/lr"}
+    assert set(seen[1][1]) == {"validation/ap_single", "validation/ap_full"}
     part = load_file(run("parts", minutes=1e-6))  # one step, then out of time
     resumed = load_file(run("parts"))
     assert any(not np.array_equal(whole[k], part[k]) for k in whole)
     for name, value in whole.items():
         assert np.array_equal(value, resumed[name]), name
-    net = load_weights(tmp_path / "whole" / "w.safetensors")
-    assert sum(p.numel() for p in net.parameters()) < 600_000
-    card = (tmp_path / "whole" / "README.md").read_text()
-    assert "perception.training.train --frames 12 --steps 2 --seed 0" in card
-    assert (tmp_path / "whole" / "loss.csv").read_text().startswith("step,loss,lr\n")
+    path = tmp_path / "whole" / "w.safetensors"
+    facts = read_facts(path)
+    assert facts["runs"][0]["done"] == 2
+    assert path.with_suffix(".md").read_text() == card("w.safetensors", asdict(ModelConfig()), facts)
+    assert "`sortie train --steps 2 --cell-dropout 0.5 --out w.safetensors`" in path.with_suffix(".md").read_text()
+    assert (path.parent / "loss.csv").read_text().startswith("step,loss,lr,ap_single,ap_full\n2,")
     assert not list(tmp_path.glob("**/*.part"))
+    json.dumps(facts)
+
+
+def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    torch.manual_seed(1)
+    old = CarNet()
+    save_weights(old, tmp_path / "old.safetensors")
+    deep = CarNet(ModelConfig(decoder="deep"))
+    with caplog.at_level(logging.INFO, "sortie.train"):
+        training._begin_from(deep, tmp_path / "old.safetensors", logging.getLogger("sortie.train"))
+    assert torch.equal(deep.encoder.stem[0].weight, old.encoder.stem[0].weight)
+    assert "begin anew: head.trunk.down_16.0.0.weight" in caplog.text
+    assert "encoder" not in caplog.text
+    small = CarNet(ModelConfig(half_extent_m=51.2))
+    with pytest.raises(ValueError, match="made for another range than ±51"):
+        training._begin_from(small, tmp_path / "old.safetensors", logging.getLogger("sortie.train"))
+    assert load_weights(tmp_path / "old.safetensors").config == ModelConfig()

@@ -1,0 +1,143 @@
+"""Train the study's networks and measure them: resumable job by job, and within a job."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from perception.bench.dataset import Benchmark, load_frames, make_split
+from perception.bench.difficulty import Density, Difficulty
+from perception.checkpoint import load_weights
+from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from perception.harness.evaluate import evaluate
+from perception.harness.evaluation import FLOOR, Evaluation
+from perception.harness.instrument import CarNetInstrument
+from perception.harness.measures import under
+from perception.model import ModelConfig
+from perception.study.measure import F1, Row, optimal_f1, rows_of
+from perception.study.plan import Measured, Plan, Variant
+from perception.training.train import TrainResult, train
+
+log_to_nowhere = logging.getLogger("sortie.study")
+Progress = Callable[[str, int, int], None]
+DEFAULT_DENSITY: tuple[Density, ...] = ("default",)
+
+
+def weights_of(job: str, *folders: Path) -> Path | None:
+    """The job's weights in the first folder that has them."""
+    return next((p for f in folders if (p := f / f"{job}.safetensors").is_file()), None)
+
+
+def train_job(
+    plan: Plan,
+    job: str,
+    folder: Path,
+    root: Path,
+    *,
+    shipped: Path | None = None,
+    progress: Progress | None = None,
+    log: logging.Logger = log_to_nowhere,
+) -> TrainResult | None:
+    """Train one network of the plan into `folder`, from its checkpoint if it has one; None if its weights are there.
+
+    Raises:
+        ValueError: a job that is not in the plan, or one that begins from weights that are not there.
+    """
+    found = next(((v, s) for v, s in plan.jobs() if v.job(s) == job), None)
+    if found is None:
+        raise ValueError(f"{job} is not in the plan, must be one of {', '.join(v.job(s) for v, s in plan.jobs())}")
+    folders = [folder] if shipped is None else [folder, shipped]
+    if weights_of(job, *folders) is not None:
+        return None
+    variant, seed = found
+    begins = variant.begins(seed)
+    warm_start = weights_of(begins, *folders) if begins else None
+    if begins and warm_start is None:
+        raise ValueError(f"{job} begins from {begins}, which has no weights in {folder}")
+    log.info("training %s: %s", job, variant.why)
+    return train(
+        folder / f"{job}.safetensors",
+        variant.recipe_for(seed),
+        ModelConfig(**variant.model),
+        root=root,
+        work=folder / job,
+        warm_start=warm_start,
+        progress=progress,
+        log=log,
+    )
+
+
+def measure(
+    plan: Plan,
+    folder: Path,
+    root: Path,
+    *,
+    shipped: Path | None = None,
+    frames: int = 80,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Iterator[tuple[str, list[Row]]]:
+    """Rows of every network that has weights, one network after the other; what has none gives no rows.
+
+    Finished frames are kept in `folder`, so that a run that was cut off goes on where it was.
+    """
+    tell = progress or (lambda stage, done, of: None)
+    folders = [folder] if shipped is None else [folder, shipped]
+    for variant, seed in plan.jobs():
+        job = variant.job(seed)
+        weights = weights_of(job, *folders)
+        if weights is None:
+            continue
+        instrument = CarNetInstrument(load_weights(weights))
+        first = variant is plan.variants[0] and seed == variant.seeds[0]
+        tau_f1 = _f1(instrument, root, folder, workers, partial(tell, f"{job}: tau split"))
+        rows: list[Row] = []
+        for density in plan.measured.densities if first else DEFAULT_DENSITY:
+            bench = Benchmark(difficulty=replace(Difficulty(), density=density))
+            data = load_frames(make_split(bench, "test", root, scenes=frames))
+            every = tuple(conditions(plan.measured, variant, density))
+            found = evaluate(
+                instrument,
+                data,
+                every,
+                regions=("full",),
+                store=folder / "frames",
+                workers=workers,
+                progress=partial(tell, f"{job}: {density}"),
+            )
+            rows += rows_of(plan.measured, variant, seed, density, found, tau_f1)
+        yield job, rows
+
+
+def conditions(measured: Measured, variant: Variant, density: Density) -> Iterator[Condition]:
+    """Everything that is evaluated of a network; cells by norm only for variants from scratch at the default density."""
+    yield from (SINGLE, FULL_SHARING)
+    ranks: tuple[CellsBy, ...] = measured.cells_by
+    if variant.begins_from or density != "default":
+        ranks = ranks[:1]
+    for unsent in measured.unsent:
+        for cells_by in ranks:
+            for c in measured.conditions():
+                yield under(c, unsent, cells_by)
+
+
+def _f1(
+    instrument: CarNetInstrument, root: Path, folder: Path, workers: int, progress: Callable[[int, int], None]
+) -> F1:
+    """The F1-optimal threshold at full sharing on the tau split, whose scenes are in no other."""
+    data = load_frames(make_split(Benchmark(), "tau", root))
+    found: Evaluation = evaluate(
+        instrument,
+        data,
+        (FULL_SHARING,),
+        regions=("full",),
+        store=folder / "frames",
+        workers=workers,
+        progress=progress,
+    )
+    return optimal_f1(found.matched(FULL_SHARING), np.arange(FLOOR, 0.9, 0.01))

@@ -1,0 +1,78 @@
+"""What a training run is, by its parameters, and the command that repeats it. Free of torch."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from perception.bench.dataset import SIZES, Benchmark
+
+PEAK_LR = 2.5e-3
+FULL_SIZE = SIZES["train"][0]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """One run. Everything that its weights follow from, beside the machine.
+
+    Raises:
+        ValueError: naming the field, its value and its bounds.
+    """
+
+    steps: int = 500
+    """Optimiser steps of four fleet-frames."""
+    seed: int = 0
+    """Of weights, batches and their order."""
+    scenes: int = FULL_SIZE
+    """The first so many scenes of the benchmark's train split."""
+    peak_lr: float = PEAK_LR
+    """The cycle's highest learning rate."""
+    cell_dropout: float = 0.0
+    """Probability that a link is thinned: only a fraction of its cells arrives, log-uniform from 1 % to all, cells at random."""
+    unsent: Literal["masked", "zero"] = "masked"
+    """What a dropped cell is in training: it has no say, or takes part as zeros. Full sharing knows no difference."""
+    warm_start: str = ""
+    """Name of the weights that it begins from; empty for none. Tensors that do not fit begin anew."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("steps", 1, 10**6), ("seed", 0, 2**31), ("scenes", 1, FULL_SIZE)):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} is {value}, must be {low} to {high}")
+        if not 0 < self.peak_lr <= 1:
+            raise ValueError(f"peak_lr is {self.peak_lr}, must be above 0 and at most 1")
+        if not 0 <= self.cell_dropout <= 1:
+            raise ValueError(f"cell_dropout is {self.cell_dropout}, must be 0 to 1")
+        if self.unsent not in ("masked", "zero"):
+            raise ValueError(f"unsent is {self.unsent!r}, must be masked or zero")
+
+
+def command(recipe: dict[str, Any], model: dict[str, Any], bench_seed: int, out: str) -> str:
+    """The command line that repeats a run; fields that stand at their defaults are left out."""
+    plain = asdict(Recipe())
+    flags = [
+        f"--{name.replace('_', '-')} {value:g}" if isinstance(value, float) else f"--{name.replace('_', '-')} {value}"
+        for name, value in recipe.items()
+        if name in plain and value != plain[name]
+    ]
+    usual = {"half_extent_m": 102.4, "fusion": "disconet", "exchange": "rectified", "decoder": "shallow"}
+    names = {"half_extent_m": "range"}
+    flags += [f"--{names.get(n, n)} {v}" for n, v in model.items() if v != usual.get(n, v)]
+    flags += [f"--bench-seed {bench_seed}"] if bench_seed else []
+    return " ".join(["sortie train", *flags, "--out", out])
+
+
+def benchmark_root() -> Path:
+    """Where benchmarks are kept unless said otherwise."""
+    return Path("runs/bench")
+
+
+def of_benchmark(bench: Benchmark) -> dict[str, Any]:
+    """What a weights file says of its data."""
+    return {
+        "key": bench.key(),
+        "seed": bench.seed,
+        "density": bench.difficulty.density,
+        "half_extent_m": bench.geometry.half_extent_m,
+    }
