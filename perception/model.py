@@ -129,10 +129,16 @@ class DeepTrunk(nn.Module):
 
 
 class CarNet(nn.Module):
-    """Encoder, fusion and head; about 0.27 M parameters as shipped."""
+    """Encoder, fusion and head; about 0.27 M parameters as shipped.
+
+    Raises:
+        ValueError: a fusion that is not there, naming those that are.
+    """
 
     def __init__(self, config: ModelConfig = ModelConfig()) -> None:
         super().__init__()
+        if config.fusion not in FUSIONS:
+            raise ValueError(f"fusion is {config.fusion!r}, must be one of {', '.join(FUSIONS)}")
         self.config = config
         self.encoder = Encoder(config)
         self.fusion = FUSIONS[config.fusion]()

@@ -18,7 +18,7 @@ from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
-from sim import cli_bench, cli_paper, rundir, tables
+from sim import cli_bench, cli_paper, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.expect import check as check_expectations
 from sim.outcome import outcome
@@ -157,7 +157,7 @@ def view(run: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
 
 @app.command("list")
 def list_(
-    what: Annotated[str, typer.Argument(help="policies, scenarios, detectors or schema (JSON Schema).")],
+    what: Annotated[str, typer.Argument(help="policies, scenarios, detectors, fusions or schema (JSON Schema).")],
 ) -> None:
     """List what there is."""
     if what == "policies":
@@ -171,49 +171,19 @@ def list_(
     elif what == "detectors":
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
+    elif what == "fusions":
+        from perception.fusion.registry import FUSIONS  # here: torch takes a second to import
+
+        for name, fusion in FUSIONS.items():
+            out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)
     elif what == "schema":
         out.print_json(data=json_schema())
     else:
-        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, detectors or schema")
+        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, detectors, fusions or schema")
 
 
-@app.command()
-def train(
-    out_file: Annotated[
-        Path, typer.Option("--out", help="Where the weights go (safetensors); their card lies beside.")
-    ] = Path("runs/train/disconet.safetensors"),
-    frames: Annotated[int, typer.Option(help="Fleet-frames to render and learn from.", min=12)] = 1200,
-    steps: Annotated[int, typer.Option(help="Optimiser steps of four frames.", min=1)] = 700,
-    minutes: Annotated[float | None, typer.Option(help="Stop after this much wall time.", min=0.1)] = None,
-    seed: Annotated[int, typer.Option(help="Seed of data and weights.", min=0)] = 0,
-    warm_start: Annotated[Path | None, typer.Option(help="Begin from these weights.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
-) -> None:
-    """Train the detector with full sharing on procedural scenes; a run that was cut off goes on where it was."""
-    from perception.training.train import train as train_detector
-
-    with _progress() as bar:
-        bars: dict[str, Callable[[float], None]] = {}
-
-        def progress(stage: str, done: int, of: int) -> None:
-            if stage not in bars:
-                bars[stage] = bar(stage, of)
-            bars[stage](done)
-
-        result = train_detector(
-            out_file,
-            frames=frames,
-            steps=steps,
-            minutes=minutes,
-            seed=seed,
-            warm_start=warm_start,
-            resume=resume,
-            work=out_file.parent,
-            progress=progress,
-        )
-    out.print(tables.training_table(result))
-
-
+app.command()(cli_train.train)
+app.add_typer(cli_train.study, name="study")
 app.command()(cli_paper.paper)
 
 

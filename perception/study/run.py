@@ -25,6 +25,8 @@ from perception.training.train import TrainResult, train
 
 log_to_nowhere = logging.getLogger("sortie.study")
 Progress = Callable[[str, int, int], None]
+SHIPPED = Path(__file__).parent / "weights"
+"""Networks that come with the project, so that the study can be measured without training."""
 DEFAULT_DENSITY: tuple[Density, ...] = ("default",)
 
 

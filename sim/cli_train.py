@@ -1,0 +1,191 @@
+"""`sortie train` and `sortie study`: the commands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim.rundir import RunError
+
+study = typer.Typer(
+    no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
+)
+
+
+class Exchange(StrEnum):
+    rectified = "rectified"
+    signed = "signed"
+
+
+class Decoder(StrEnum):
+    shallow = "shallow"
+    deep = "deep"
+
+
+class Unsent(StrEnum):
+    masked = "masked"
+    zero = "zero"
+
+
+class Range(StrEnum):
+    full = "102.4"
+    small = "51.2"
+
+
+def train(
+    out_file: Annotated[
+        Path, typer.Option("--out", help="Where the weights go (safetensors); their card lies beside.")
+    ] = Path("runs/train/disconet.safetensors"),
+    steps: Annotated[int, typer.Option(help="Optimiser steps of four fleet-frames.", min=1)] = 500,
+    scenes: Annotated[int, typer.Option(help="The first so many scenes of the train split.", min=1, max=100)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of weights and batches.", min=0)] = 0,
+    peak_lr: Annotated[float, typer.Option(help="The cycle's highest learning rate.")] = 2.5e-3,
+    cell_dropout: Annotated[float, typer.Option(help="Part of the links whose cells are thinned.", min=0, max=1)] = 0.0,
+    unsent: Annotated[Unsent, typer.Option(help="What a dropped cell counts as in training.")] = Unsent.masked,
+    fusion: Annotated[str, typer.Option(help="Fusion method, see `sortie list fusions`.")] = "disconet",
+    exchange: Annotated[Exchange, typer.Option(help="Features after or before the last ReLU.")] = Exchange.rectified,
+    decoder: Annotated[Decoder, typer.Option(help="The head's trunk.")] = Decoder.shallow,
+    range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
+    bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
+    bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
+    warm_start: Annotated[Path | None, typer.Option(help="Begin from these weights, as far as they fit.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this much wall time.", min=0.1)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; left out, cuda where there is one.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
+) -> None:
+    """Train the detector on the benchmark's train split; a run that was cut off goes on where it was.
+
+    Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
+    """
+    from perception.bench.dataset import Benchmark  # here: torch takes a second to import
+    from perception.geometry import Geometry
+    from perception.model import ModelConfig
+    from perception.training.recipe import Recipe
+    from perception.training.train import train as train_detector
+    from sim import tables
+    from sim.cli import out
+    from sim.playback_training import TrainingLog
+
+    half_extent_m = float(range_.value)
+    recipe = Recipe(
+        steps=steps,
+        seed=seed,
+        scenes=scenes,
+        peak_lr=peak_lr,
+        cell_dropout=cell_dropout,
+        unsent=unsent.value,
+        warm_start=warm_start.name if warm_start else "",
+    )
+    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value)
+    curves = TrainingLog(out_file.parent / "training.rrd", out_file.stem)
+    with _bars() as progress, _user_errors():
+        result = train_detector(
+            out_file,
+            recipe,
+            config,
+            Benchmark(bench_seed, geometry=Geometry(half_extent_m)),
+            root=bench_dir,
+            warm_start=warm_start,
+            minutes=minutes,
+            resume=resume,
+            device=device,
+            progress=progress,
+            scalars=curves.log,
+        )
+    curves.close()
+    out.print(tables.training_table(result))
+
+
+WorkOption = Annotated[Path, typer.Option("--work", help="Weights, checkpoints and finished frames.")]
+BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
+
+
+@study.command("train")
+def study_train(
+    jobs: Annotated[list[str] | None, typer.Argument(help="Networks, as in dropout-1; left out, all of them.")] = None,
+    work: WorkOption = Path("runs/study"),
+    bench_dir: BenchOption = Path("runs/bench"),
+) -> None:
+    """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
+    from perception.study.plan import read_plan
+    from perception.study.run import SHIPPED, train_job
+    from sim.cli import out
+
+    plan = read_plan()
+    with _user_errors():
+        for job in jobs or [v.job(s) for v, s in plan.jobs()]:
+            with _bars(f"{job}: ") as progress:
+                result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
+            if result is None:
+                out.print(f"[bold]{job}[/bold] has its weights")
+            else:
+                gain = result.validation
+                out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
+
+
+@study.command("run")
+def study_run(
+    work: WorkOption = Path("runs/study"),
+    bench_dir: BenchOption = Path("runs/bench"),
+    frames: Annotated[int, typer.Option(help="Frames of the test split.", min=2, max=80)] = 80,
+    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
+) -> None:
+    """Measure every network that has weights, and write the rows, the report and the notebook's data."""
+    from perception.study.measure import Row, to_table
+    from perception.study.plan import read_plan
+    from perception.study.run import SHIPPED, measure
+    from sim.cli import out
+
+    plan, rows = read_plan(), list[Row]()
+    with _user_errors(), _bars() as progress:
+        cores = workers or os.cpu_count() or 1
+        for job, some in measure(
+            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, progress=progress
+        ):
+            rows += some
+            out.print(f"[bold]{job}[/bold] measured")
+    if not rows:
+        raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
+    path = work / "study.parquet"
+    _write_table(to_table(rows), path)
+    out.print(f"kept in [bold]{path}[/bold], tell it with: sortie study report {path}")
+
+
+def _write_table(table: object, path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    pq.write_table(table, part)
+    part.replace(path)
+
+
+@contextmanager
+def _user_errors() -> Iterator[None]:
+    """A file, tensor or field that is not as it must be is the user's to mend: one line, no traceback."""
+    try:
+        yield
+    except ValueError as error:
+        raise RunError(str(error)) from error
+
+
+@contextmanager
+def _bars(prefix: str = "") -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar for every stage that reports."""
+    from sim.cli import _progress
+
+    with _progress() as bar:
+        bars: dict[str, Callable[[float], None]] = {}
+
+        def progress(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                bars[stage] = bar(prefix + stage, of)
+            bars[stage](done)
+
+        yield progress
