@@ -142,6 +142,26 @@ def survey(
     out.print(table)
 
 
+@app.command()
+def difficulty(
+    weights: Annotated[Path | None, typer.Option(help="A safetensors file; left out, the shipped weights.")] = None,
+    scenes: Annotated[int, typer.Option(help="How many scenes each row is measured on.", min=2)] = 12,
+    store: Annotated[Path, typer.Option(help="Where finished scenes are kept.")] = Path("runs/difficulty"),
+    readme: Annotated[Path | None, typer.Option(help="Put the table between this README's markers.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
+) -> None:
+    """Measure what each parameter of the difficulty does to AP; a run that was cut off goes on where it was."""
+    with _told(), _bars() as bar:
+        from perception.bench.effects import measure, table, write_table
+        from perception.detector import SHIPPED_WEIGHTS
+
+        used = weights or SHIPPED_WEIGHTS
+        text = table(measure(used, store, scenes=scenes, workers=workers, progress=bar("scenes")), used, scenes)
+        if readme is not None:
+            write_table(readme, text)
+    out.print(text, markup=False, soft_wrap=True)
+
+
 # --- helpers -------------------------------------------------------------------------------------
 
 
