@@ -63,8 +63,17 @@ def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -
     return TorchDetector(scene, config, seed=seed, weights=None if config.weights is None else Path(config.weights))
 
 
+def _recorded(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+    from perception.outside.detector import RecordedDetector
+
+    return RecordedDetector(config)
+
+
 DETECTORS: dict[str, Kind] = {
     "torch": Kind("the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch),
+    "recorded": Kind(
+        "what another model saw, from perception.recording; its features may be fused by its own code", _recorded
+    ),
     "none": Kind("traffic alone; boxes are counted from the scene", None),
 }
 """A new detector is one constructor and one line here, and one word in the schema."""

@@ -233,11 +233,20 @@ class Scene(Section):
 
 
 class Perception(Section):
-    detector: Literal["torch", "none"] = Field("torch", description="The detector; none flies the traffic alone.")
+    detector: Literal["torch", "recorded", "none"] = Field(
+        "torch", description="The detector: the network, a recording of another model, or none: the traffic alone."
+    )
     fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "where2comm"] = Field(
         "disconet", description="How what peers sent is fused; weights belong to a fusion, none and late take any."
     )
     weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights of the fusion.")
+    recording: str | None = Field(
+        None, description="What the recorded detector saw: an npz file or a Zarr folder (perception/outside)."
+    )
+    recorded_fusion: str | None = Field(
+        None,
+        description="path/to/file.py:function that fuses recorded features; left out, boxes arrive where their cells were sent.",
+    )
     sample_rate_hz: float = Field(
         2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
     )
@@ -254,6 +263,16 @@ class Perception(Section):
         description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
     )
     scene: Scene = Scene()
+
+    @model_validator(mode="after")
+    def _recording_where_recorded(self) -> Perception:
+        recorded = self.detector == "recorded"
+        if recorded and self.recording is None:
+            raise _inconsistent(("recording",), "missing", "given where detector is recorded")
+        for name in ("recording", "recorded_fusion"):
+            if not recorded and getattr(self, name) is not None:
+                raise _inconsistent((name,), f"{getattr(self, name)!r}", f"left out where detector is {self.detector}")
+        return self
 
 
 # --- policy, events, expectations ----------------------------------------------------------------

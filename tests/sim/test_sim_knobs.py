@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import types
 import typing
+from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
+from recording_examples import record_flight
 from sim_examples import example
 
 from scenarios.schema import Scenario
@@ -112,6 +114,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
 # These act through the detector, so their sorties fly with it, shortly.
 SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.fusion": ("late", ()),
+    "perception.recording": ("OTHER", ("perception.detector=recorded", "perception.recording=RECORDING")),
+    "perception.recorded_fusion": ("FUSION", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.weights": ("WEIGHTS", ()),
     "perception.sample_rate_hz": ("5", ()),
     "perception.fusion_delay_s": ("0.2", ()),
@@ -204,10 +208,25 @@ def test_a_knob_of_perception_changes_the_record(
     field: str, seen: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     value, shared = SEEN[field]
+    value, *shared = recorded(tmp_path_factory.mktemp("recorded"), value, *shared)
     before = run_sortie(example(*SHORT, *shared)).fingerprint if shared else seen
     if value == "WEIGHTS":
         value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
     assert run_sortie(example(*SHORT, *shared, f"{field}={value}")).fingerprint != before
+
+
+def recorded(folder: Path, *texts: str) -> list[str]:
+    """The texts with the names of a recording of the short flight, another of it, and a fusion put in."""
+    files = {name: folder / name.lower() for name in ("RECORDING", "OTHER", "FUSION")}
+    if any(name in text for text in texts for name in files):
+        flight = example(*SHORT)
+        record_flight(flight, files["RECORDING"].with_suffix(".npz"))
+        record_flight(flight, files["OTHER"].with_suffix(".npz"), lower=0.3)
+        code = "import numpy as np\n\ndef deaf(agents, takes_part, weight):\n    return np.zeros((0, 6))\n"
+        files["FUSION"].with_suffix(".py").write_text(code)
+    for name, suffix in (("RECORDING", ".npz"), ("OTHER", ".npz"), ("FUSION", ".py:deaf")):
+        texts = tuple(text.replace(name, f"{files[name]}{suffix}") for text in texts)
+    return list(texts)
 
 
 def other_weights(path):  # type: ignore[no-untyped-def]

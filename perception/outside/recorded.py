@@ -1,0 +1,387 @@
+"""A recording: what a model of the user's saw, frame by frame and drone by drone, on disk as npz or Zarr.
+
+The layout is the table in this folder's README. Everything is checked when a recording is opened, but for features
+and confidences, which may be larger than memory and are checked frame by frame as they are read.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from perception.geometry import CELLS, CHANNELS, Geometry
+
+FORMAT = 1
+NEEDED = ("format", "cell_m", "t_s", "pose", "boxes", "boxes_offset", "truth", "truth_offset")
+OPTIONAL = ("scene", "est_pose", "features", "confidence")
+LARGE = ("features", "confidence")
+"""Read a frame at a time."""
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class RecordingError(ValueError):
+    """A recording that is missing, broken, or asked for what it does not hold; the message names file, array, value and bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """n frames of d drones. Frames of one scene follow each other; poses are ENU, boxes in the drone's own frame."""
+
+    path: Path
+    t_s: Floats
+    """[n] ascending within a scene."""
+    scene: Ints
+    """[n]"""
+    pose: Floats
+    """[n, d, 3] x, y, yaw: where each drone was."""
+    est_pose: Floats
+    """[n, d, 3] where it believed it was."""
+    cell_m: float
+    """Side of a feature column (of an exchanged cell, where there are no features)."""
+    large: Mapping[str, Any]
+    """`features` [n, d, C, H, W] and `confidence` [n, d, H, W], each if recorded, sliced by frame."""
+    _boxes: Floats
+    _boxes_offset: Ints
+    _truth: Floats
+    _truth_offset: Ints
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    @property
+    def drones(self) -> int:
+        """d."""
+        return self.pose.shape[1]
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """C, H, W of the features; 80, 64, 64, as the radio carries them, where none were recorded."""
+        if "features" in self.large:
+            c, h, w = self.large["features"].shape[2:]
+            return c, h, w
+        if "confidence" in self.large:
+            h, w = self.large["confidence"].shape[2:]
+            return CHANNELS, h, w
+        return CHANNELS, CELLS, CELLS
+
+    @property
+    def columns_a_side(self) -> int:
+        """Feature columns along the side of an exchanged cell.
+
+        Raises:
+            RecordingError: a grid that the 64 × 64 exchanged cells do not divide.
+        """
+        _, h, w = self.grid
+        if h != w or h % CELLS:
+            name = "features" if "features" in self.large else "confidence"
+            raise self._error(name, f"has a grid of {h} × {w}", f"square and a multiple of {CELLS} to be exchanged")
+        return h // CELLS
+
+    @property
+    def geometry(self) -> Geometry:
+        """How far the grid reaches."""
+        return Geometry(self.cell_m * self.columns_a_side * CELLS / 2)
+
+    @property
+    def cell_bytes(self) -> int:
+        """One exchanged cell: C × 2 B for each of its columns."""
+        return self.grid[0] * 2 * self.columns_a_side**2
+
+    def boxes(self, frame: int, drone: int) -> Floats:
+        """[m, 6] x forward, y left of the drone, length, width, yaw, score."""
+        k = frame * self.drones + drone
+        return self._boxes[self._boxes_offset[k] : self._boxes_offset[k + 1]]
+
+    def truth(self, frame: int) -> Floats:
+        """[k, 5] x, y, length, width, yaw of every car there was, ENU."""
+        return self._truth[self._truth_offset[frame] : self._truth_offset[frame + 1]]
+
+    def features(self, frame: int, drone: int) -> NDArray[np.float32]:
+        """[C, H, W] of one drone.
+
+        Raises:
+            RecordingError: none were recorded, or this drone's are not finite.
+        """
+        if "features" not in self.large:
+            raise RecordingError(f"{self.path}: features are missing, must be there to be fused or ranked by norm")
+        return self._read("features", frame, drone).astype(np.float32)
+
+    def rank(self, frame: int, drone: int, by: str) -> Floats:
+        """[64, 64] what ranks the exchanged cells: their highest confidence, or the norm of their features.
+
+        Where no confidence was recorded a cell's is the highest score of the boxes centred in it, 0 without one.
+        """
+        s = self.columns_a_side
+        if by == "norm":
+            power = (self.features(frame, drone).astype(np.float64) ** 2).sum(axis=0)
+            return np.asarray(np.sqrt(power.reshape(CELLS, s, CELLS, s).sum(axis=(1, 3))))
+        if "confidence" in self.large:
+            plane = self._read("confidence", frame, drone).astype(np.float64)
+            return np.asarray(plane.reshape(CELLS, s, CELLS, s).max(axis=(1, 3)))
+        out = np.zeros((CELLS, CELLS))
+        boxes = self.boxes(frame, drone)
+        row, column, inside = cells_of(boxes, self.geometry)
+        np.maximum.at(out, (row[inside], column[inside]), boxes[inside, 5])
+        return out
+
+    def _read(self, name: str, frame: int, drone: int) -> NDArray[Any]:
+        values = np.asarray(self.large[name][frame, drone])
+        if not np.isfinite(values).all():
+            raise self._error(name, f"frame {frame}, drone {drone} is not finite", "finite everywhere")
+        return values
+
+    def _error(self, name: str, what: str, bound: str) -> RecordingError:
+        return RecordingError(f"{self.path}: {name} {what}, must be {bound}")
+
+
+def cells_of(boxes: Floats, geometry: Geometry) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+    """Row and column of the exchanged cell that holds each box's centre, and whether the grid reaches it."""
+    row, column = (np.floor((boxes[:, :2] + geometry.half_extent_m) / geometry.cell_m)).astype(np.int64).T
+    return row, column, (row >= 0) & (row < CELLS) & (column >= 0) & (column < CELLS)
+
+
+# --- reading ---------------------------------------------------------------------------------------
+
+
+def open_recording(path: Path | str) -> Recording:
+    """A recording on disk: a folder is Zarr (read as it is asked for), a file npz (in memory).
+
+    Raises:
+        RecordingError: naming the file, the array, its value and the bound; also where Zarr is not installed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return checked(path, *_from_zarr(path))
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such recording, must be an npz file or a Zarr folder") from None
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise RecordingError(f"{path}: cannot be read as npz ({error})") from error
+    return checked(
+        path,
+        {k: v for k, v in arrays.items() if k not in LARGE},
+        {k: arrays[k] for k in LARGE if k in arrays},
+    )
+
+
+def _from_zarr(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    try:
+        import zarr
+    except ImportError:
+        raise RecordingError(f"{path}: a folder is Zarr, which needs pip install 'sortie-sim[zarr]'") from None
+    try:
+        group = zarr.open_group(path, mode="r")
+        arrays = dict(group.arrays())
+        small = {name: np.asarray(array[...]) for name, array in arrays.items() if name not in LARGE}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{path}: cannot be read as a Zarr group ({error})") from error
+    return small, {name: arrays[name] for name in LARGE if name in arrays}
+
+
+def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, Any]) -> Recording:
+    """Arrays as a recording.
+
+    Raises:
+        RecordingError: the first thing that is wrong.
+    """
+    for name in NEEDED:
+        if name not in small:
+            raise RecordingError(f"{path}: {name} is missing, a recording must hold {', '.join(NEEDED)}")
+    for name in sorted({*small, *large} - {*NEEDED, *OPTIONAL}):
+        raise RecordingError(
+            f"{path}: {name} is unknown, beside what it must hold a recording may hold {', '.join(OPTIONAL)}"
+        )
+    look = _Look(path, small)
+    version = int(look.numbers("format", ()))
+    if version != FORMAT:
+        raise RecordingError(f"{path}: format is {version}, must be {FORMAT}")
+    cell_m = float(look.numbers("cell_m", ()))
+    look.hold("cell_m", cell_m > 0, f"is {cell_m:g}", "above 0")
+    t_s = look.numbers("t_s", (None,))
+    n = len(t_s)
+    look.hold("t_s", n > 0, "is empty", "at least one frame")
+    scene = look.whole("scene", (n,)) if "scene" in small else np.zeros(n, np.int64)
+    begins = np.flatnonzero(np.append(True, scene[1:] != scene[:-1]))
+    look.hold(
+        "scene", len(begins) == len(set(scene.tolist())), "comes back to a scene it left", "one run of frames a scene"
+    )
+    back = np.flatnonzero((np.diff(t_s) <= 0) & (scene[1:] == scene[:-1]))
+    if len(back):
+        at = int(back[0]) + 1
+        look.hold("t_s", False, f"is {t_s[at]:g} in frame {at}", f"above {t_s[at - 1]:g}, the frame before")
+    pose = look.numbers("pose", (n, None, 3))
+    d = pose.shape[1]
+    look.hold("pose", d > 0, "has no drones", "at least one")
+    est_pose = look.numbers("est_pose", (n, d, 3)) if "est_pose" in small else pose
+    parts = []
+    for name, width, count in (("boxes", 6, n * d), ("truth", 5, n)):
+        table = look.numbers(name, (None, width))
+        offset = look.whole(f"{name}_offset", (count + 1,))
+        ends = (int(offset[0]), int(offset[-1]))
+        look.hold(
+            f"{name}_offset",
+            ends == (0, len(table)),
+            f"runs from {ends[0]} to {ends[1]}",
+            f"0 to {len(table)}, the rows of {name}",
+        )
+        look.hold(f"{name}_offset", bool((np.diff(offset) >= 0).all()), "falls", "ascending")
+        flat = np.flatnonzero((table[:, 2:4] <= 0).any(axis=1))
+        look.hold(name, not len(flat), f"row {flat[0] if len(flat) else 0} has a length or width ≤ 0", "above 0 m")
+        parts += [table, offset]
+    wrong = np.flatnonzero((parts[0][:, 5] < 0) | (parts[0][:, 5] > 1))
+    if len(wrong):
+        look.hold("boxes", False, f"row {wrong[0]} has the score {parts[0][wrong[0], 5]:g}", "0 to 1")
+    _check_large(path, large, n, d)
+    return Recording(path, t_s, scene, pose, est_pose, cell_m, dict(large), *parts)
+
+
+def _check_large(path: Path, large: Mapping[str, Any], n: int, d: int) -> None:
+    for name, kind, rank in (("features", "float16", 5), ("confidence", "floating", 4)):
+        if name not in large:
+            continue
+        shape, dtype = tuple(large[name].shape), np.dtype(large[name].dtype)
+        names = "n, drones, C, H, W" if rank == 5 else "n, drones, H, W"
+        if len(shape) != rank or shape[:2] != (n, d) or 0 in shape:
+            raise RecordingError(
+                f"{path}: {name} has shape {list(shape)}, must be [{names}] with n = {n}, drones = {d}"
+            )
+        if (dtype != np.float16) if kind == "float16" else dtype.kind != "f":
+            raise RecordingError(f"{path}: {name} is {dtype}, must be {kind}")
+    if len(large) == 2 and large["features"].shape[3:] != large["confidence"].shape[2:]:
+        h, w = large["features"].shape[3:]
+        found = " × ".join(map(str, large["confidence"].shape[2:]))
+        raise RecordingError(f"{path}: confidence has a grid of {found}, must be the features' {h} × {w}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """Asks arrays of a file for what they must be."""
+
+    path: Path
+    arrays: Mapping[str, NDArray[Any]]
+
+    def hold(self, name: str, good: bool, what: str, bound: str) -> None:
+        if not good:
+            raise RecordingError(f"{self.path}: {name} {what}, must be {bound}")
+
+    def numbers(self, name: str, shape: tuple[int | None, ...]) -> Any:
+        """As float64 of a shape; None is any length."""
+        array = np.asarray(self.arrays[name])
+        self.hold(name, array.dtype.kind in "iuf", f"is {array.dtype}", "numbers")
+        fits = array.ndim == len(shape) and all(w is None or h == w for h, w in zip(array.shape, shape, strict=True))
+        told = ", ".join("any" if w is None else str(w) for w in shape)
+        self.hold(name, fits, f"has shape {list(array.shape)}", f"[{told}]")
+        good = np.isfinite(array)
+        if not good.all():
+            at = [int(i[0]) for i in np.nonzero(~good)]
+            self.hold(name, False, f"{at} is {array[tuple(at)]}", "finite")
+        return array.astype(np.float64)
+
+    def whole(self, name: str, shape: tuple[int | None, ...]) -> Any:
+        """As int64 of a shape."""
+        self.hold(
+            name, np.asarray(self.arrays[name]).dtype.kind in "iu", f"is {self.arrays[name].dtype}", "whole numbers"
+        )
+        return self.numbers(name, shape).astype(np.int64)
+
+
+# --- writing ---------------------------------------------------------------------------------------
+
+
+def write_recording(
+    path: Path | str,
+    *,
+    t_s: ArrayLike,
+    pose: ArrayLike,
+    boxes: Sequence[Sequence[ArrayLike]],
+    truth: Sequence[ArrayLike],
+    cell_m: float,
+    features: Iterable[ArrayLike] | None = None,
+    confidence: ArrayLike | None = None,
+    est_pose: ArrayLike | None = None,
+    scene: ArrayLike | None = None,
+) -> Path:
+    """Write a recording: npz where `path` ends in .npz, else a Zarr folder. Checked first, under a temporary name first.
+
+    Args:
+        t_s, pose, est_pose, scene, cell_m, confidence: as in the layout.
+        boxes: [n][drones] arrays [m, 6]; truth: [n] arrays [k, 5].
+        features: n arrays [drones, C, H, W]; a generator is written to Zarr frame by frame.
+
+    Raises:
+        RecordingError: what is to be written is no recording, or a Zarr folder of that name exists.
+    """
+    path = Path(path)
+    each = [np.asarray(b, np.float64).reshape(-1, 6) for frame in boxes for b in frame]
+    cars = [np.asarray(c, np.float64).reshape(-1, 5) for c in truth]
+    small: dict[str, NDArray[Any]] = {
+        "format": np.array(FORMAT), "cell_m": np.array(float(cell_m)), "t_s": np.asarray(t_s), "pose": np.asarray(pose),
+        "boxes": np.concatenate([np.zeros((0, 6)), *each]), "boxes_offset": np.cumsum([0, *map(len, each)]),
+        "truth": np.concatenate([np.zeros((0, 5)), *cars]), "truth_offset": np.cumsum([0, *map(len, cars)]),
+    }  # fmt: skip
+    small |= {k: np.asarray(v) for k, v in (("est_pose", est_pose), ("scene", scene)) if v is not None}
+    large = {} if confidence is None else {"confidence": np.asarray(confidence, np.float16)}
+    checked(path, small, large)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npz":
+        if features is not None:
+            large["features"] = np.stack([np.asarray(f, np.float16) for f in features])
+        checked(path, small, large)
+        part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+        np.savez_compressed(part, **small, **large)  # type: ignore[arg-type]
+        part.replace(path)
+        return path
+    _to_zarr(path, small, large, features)
+    return path
+
+
+def _to_zarr(
+    path: Path,
+    small: Mapping[str, NDArray[Any]],
+    large: Mapping[str, NDArray[Any]],
+    features: Iterable[ArrayLike] | None,
+) -> None:
+    if path.exists():
+        raise RecordingError(f"{path}: exists already, a Zarr recording must be written to a new folder")
+    try:
+        import zarr
+    except ImportError:
+        raise RecordingError(
+            f"{path}: Zarr needs pip install 'sortie-sim[zarr]', or a name that ends in .npz"
+        ) from None
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        group = zarr.open_group(part, mode="w")
+        for name, values in small.items():
+            group.create_array(name, data=values)
+        for name, values in large.items():
+            group.create_array(name, data=values, chunks=(1, 1, *values.shape[2:]))
+        n, d = small["pose"].shape[:2]
+        out: Any = None
+        for f, frame in enumerate(features if features is not None else ()):
+            values = np.asarray(frame, np.float16)
+            if f == 0 and values.ndim == 4:
+                shape, chunks = (n, *values.shape), (1, 1, *values.shape[1:])
+                out = group.create_array("features", shape=shape, chunks=chunks, dtype="float16")
+            if out is None or f >= n or values.shape != out.shape[1:]:
+                bound = f"[{d}, C, H, W], alike in all of {n} frames"
+                raise RecordingError(f"{path}: features of frame {f} have shape {list(values.shape)}, must be {bound}")
+            out[f] = values
+        if features is not None and (out is None or f + 1 != n):
+            raise RecordingError(f"{path}: features end after {0 if out is None else f + 1} frames, must be {n}")
+        checked(path, *_from_zarr(part))
+        part.rename(path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
