@@ -11,6 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
+from perception.errors import InputError
 from perception.fusion.registry import FUSIONS
 from perception.model import CarNet, ModelConfig
 
@@ -31,21 +32,21 @@ def load_weights(path: Path) -> CarNet:
     """A network in evaluation mode from a safetensors file.
 
     Raises:
-        ValueError: naming the file, and the tensor or configuration field that is missing, unknown or of another shape.
+        InputError: naming the file, and the tensor or configuration field that is missing, unknown or of another shape.
     """
     net = CarNet(read_config(path))
     found = load_file(path)
     wanted = {k: v for k, v in net.state_dict().items() if v.dtype.is_floating_point}
     for name, tensor in wanted.items():
         if name not in found:
-            raise ValueError(f"{path}: tensor {name} is missing")
+            raise InputError(f"{path}: tensor {name} is missing")
         if found[name].shape != tensor.shape:
-            raise ValueError(f"{path}: tensor {name} has shape {list(found[name].shape)}, must be {list(tensor.shape)}")
+            raise InputError(f"{path}: tensor {name} has shape {list(found[name].shape)}, must be {list(tensor.shape)}")
         if not bool(torch.isfinite(found[name]).all()):
-            raise ValueError(f"{path}: tensor {name} holds values that are not finite")
+            raise InputError(f"{path}: tensor {name} holds values that are not finite")
     extra = sorted(set(found) - set(wanted))
     if extra:
-        raise ValueError(f"{path}: tensor {extra[0]} is not part of the network")
+        raise InputError(f"{path}: tensor {extra[0]} is not part of the network")
     net.load_state_dict(found, strict=False)
     return net.eval()
 
@@ -56,7 +57,7 @@ def read_config(path: Path) -> ModelConfig:
     known = {f.name: f for f in fields(ModelConfig)}
     for name in given:
         if name not in known:
-            raise ValueError(f"{path}: model.{name} is not known, must be one of {', '.join(known)}")
+            raise InputError(f"{path}: model.{name} is not known, must be one of {', '.join(known)}")
     config = ModelConfig(**given)
     for name, value, allowed in (
         ("fusion", config.fusion, tuple(FUSIONS)),
@@ -65,7 +66,7 @@ def read_config(path: Path) -> ModelConfig:
         ("half_extent_m", config.half_extent_m, (102.4, 51.2)),
     ):
         if value not in allowed:
-            raise ValueError(f"{path}: model.{name} is {value!r}, must be one of {', '.join(map(str, allowed))}")
+            raise InputError(f"{path}: model.{name} is {value!r}, must be one of {', '.join(map(str, allowed))}")
     return config
 
 
@@ -77,9 +78,9 @@ def read_facts(path: Path) -> dict[str, Any]:
 
 def _metadata(path: Path) -> dict[str, dict[str, Any]]:
     if not path.is_file():
-        raise ValueError(f"{path}: no such weights file; `sortie train` makes one")
+        raise InputError(f"{path}: no such weights file; `sortie train` makes one")
     try:
         with safe_open(path, framework="pt") as file:
             return {k: json.loads(v) for k, v in (file.metadata() or {}).items() if k in ("model", "sortie")}
     except (SafetensorError, OSError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not a weights file of this project ({error})") from None
+        raise InputError(f"{path}: not a weights file of this project ({error})") from None

@@ -24,6 +24,7 @@ from perception.ap import suppress
 from perception.bev import lift
 from perception.checkpoint import load_weights
 from perception.decode import decode
+from perception.errors import InputError
 from perception.fusion.base import takes_part
 from perception.fusion.late import join_boxes, sendable
 from perception.fusion.registry import FUSIONS
@@ -110,11 +111,11 @@ class TorchDetector:
         path = shipped(config.fusion) if weights is None else weights
         net = load_weights(path)
         if self._fusion.shares == "features" and net.config.fusion != config.fusion:
-            raise ValueError(
+            raise InputError(
                 f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
             )
         if net.config.geometry != FULL:
-            raise ValueError(
+            raise InputError(
                 f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
             )
         self._net = folded(net)

@@ -13,7 +13,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from fleet.motion import MotionError
 from perception.detectors import DETECTORS
+from perception.errors import InputError
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
@@ -34,7 +36,7 @@ app.add_typer(cli_bench.app, name="bench")
 out = Console()
 err = Console(stderr=True, highlight=False)
 
-USER_ERRORS = (ScenarioError, PolicyError, rundir.RunError)
+USER_ERRORS = (ScenarioError, PolicyError, MotionError, InputError, rundir.RunError)
 """What a user can mend: one line and exit code 2, no traceback."""
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]

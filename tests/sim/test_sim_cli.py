@@ -242,3 +242,10 @@ def test_profile_tells_the_rooms_apart(scenario: Path, tmp_path: Path) -> None:
     done = sortie("fly", scenario, "--profile", "--no-recording", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert all(room in done.stdout for room in ("sim", "fleet", "radio", "policies"))
+
+
+def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
+    missing = tmp_path / "none.safetensors"
+    done = sortie("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")
+    assert done.returncode == 2
+    assert done.stderr.strip() == f"error: {missing}: no such weights file; `sortie train` makes one"

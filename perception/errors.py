@@ -1,0 +1,7 @@
+"""What a user can mend, told in one line by the command line."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """A file or setting that perception was given is not as it must be; the message names it, the value and the bound."""
