@@ -89,7 +89,7 @@ POINTS, AP = "AP points", "AP"
 SET_UP = (
     Claim(
         "bytes.full", "set-up, 6", "Full sharing sends 13.1 MB a fleet-frame", "MB",
-        Paper(13.1), FleetFrameBytes(FULL_SHARING), verdict.exact, headline=True,
+        Paper(13.1), FleetFrameBytes(FULL_SHARING), verdict.exact,
     ),
 )  # fmt: skip
 
@@ -143,7 +143,7 @@ MISSION = (
     ),
     Claim(
         "mission.tenth", "mission, 4", "Mission AP at ρ = 0.1 against full sharing", POINTS,
-        Paper(significant=False), _against_full(0.1, "mission"), headline=True,
+        Paper(significant=False), _against_full(0.1, "mission"),
     ),
     Claim(
         "mission.peak", "figure, a", "Mission AP peaks at 5–10 % of the bytes", "%",
@@ -162,7 +162,7 @@ PEERS = (
     ),
     Claim(
         "peers.worst-random", "peers, 3", "ρ = 0.25: worst-2 − random-2", POINTS,
-        Paper(0.1, -1.1, 1.3, significant=False), _pair(0.25, "worst-2", "random-2"), headline=True,
+        Paper(0.1, -1.1, 1.3, significant=False), _pair(0.25, "worst-2", "random-2"),
     ),
     Claim(
         "peers.best-random", "peers, 3", "ρ = 0.25: best-2 − random-2", POINTS,
@@ -244,13 +244,13 @@ OVERHEAD = (
     Claim("plane.data", "overhead, 4", "Data plane that it steers", "MB/s", Paper(105.0, digits=0), Elsewhere("data_mb_per_s"), verdict.same_order),
     Claim("plane.share", "overhead, 5", "Context over data", "%", Paper(0.01, digits=2), Elsewhere("context_percent"), verdict.at_most, headline=True),
     Claim("plane.median", "overhead, 6", "A policy decision, median", "ms", Paper(0.10, digits=2), Elsewhere("policy_ms_p50"), verdict.at_most, headline=True),
-    Claim("plane.p99", "overhead, 6", "A policy decision, 99th percentile", "ms", Paper(0.13, digits=2), Elsewhere("policy_ms_p99"), verdict.at_most, headline=True),
+    Claim("plane.p99", "overhead, 6", "A policy decision, 99th percentile", "ms", Paper(0.13, digits=2), Elsewhere("policy_ms_p99"), verdict.at_most),
     Claim("plane.deadline", "overhead, 7", "The 100 ms deadline over a decision's median", "×", Paper(1000.0, digits=0), Elsewhere("deadline_over_p50"), verdict.at_least),
     Claim("plane.core", "overhead, 8", "Of one core, the ROS 2 prototype uses", "%", Paper(9.0, digits=0), Elsewhere("ros2_core_percent"), verdict.at_most),
     Claim("plane.x86.data", "overhead, 9", "Data plane in an x86 container", "MB/s", Paper(62.0, digits=0), Elsewhere("x86_container_mb_per_s"), verdict.same_order),
     Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("policy_ms_p50"), verdict.at_most),
     Claim("plane.roi", "overhead, 11", "A phase change shrinks feature payloads", "×", Paper(10.0, digits=0), Elsewhere("roi_shrinks"), verdict.same_order, headline=True),
-    Claim("plane.battery", "overhead, 12", "Battery decay moves agent 1 down the rate ladder, rungs met", "of 3", Paper(3.0, digits=0), Elsewhere("battery_rungs"), verdict.exact, headline=True),
+    Claim("plane.battery", "overhead, 12", "Battery decay moves agent 1 down the rate ladder, rungs met", "of 3", Paper(3.0, digits=0), Elsewhere("battery_rungs"), verdict.exact),
     Claim("plane.link", "overhead, 12", "A link drop at 60 s leaves agent 2 with detections, after", "s", Paper(0.1), Elsewhere("link_drop_s"), verdict.at_most, headline=True),
 )  # fmt: skip
 
