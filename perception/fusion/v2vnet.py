@@ -19,10 +19,10 @@ MESSAGE = 40
 
 
 class V2VNet(Fusion):
-    """Two rounds; the mean of messages counts a peer by its link's weight, in all at most as one whole message.
+    """Two rounds; messages are averaged by the links' weights over who takes part in a cell.
 
-    The mean is Σ w·m / max(1, Σ w) over who takes part in the cell: with weights of one it is the plain mean, and one
-    peer at w = 0.3 gives 0.3 of its message. The candidate of the GRU is linear, since features are not in −1 … 1.
+    The cell then goes from the ego's features to the fused ones by the largest of those weights: with weights of one
+    it is the method as described, and as all weights go to 0 the ego is left alone.
     """
 
     name = "v2vnet"
@@ -48,7 +48,8 @@ class V2VNet(Fusion):
         if many == 1 or not bool(takes_part[:, 1:].any()):
             return own
         share = (weight[:, 1:, None, None] * takes_part[:, 1:])[:, :, None]
-        share = share / share.sum(dim=1, keepdim=True).clamp_min(1.0)
+        trust = share.amax(dim=1)
+        share = share / share.sum(dim=1, keepdim=True).clamp_min(1e-12)
         heard = self.from_peer(agents[:, 1:].flatten(0, 1)).unflatten(0, (n, many - 1))
         state = own
         for _ in range(ROUNDS):
@@ -56,5 +57,6 @@ class V2VNet(Fusion):
             update, reset = self.gates(torch.cat([state, message], dim=1)).sigmoid().chunk(2, dim=1)
             proposed = self.candidate(torch.cat([reset * state, message], dim=1))
             state = state + update * (proposed - state)
+        # the candidate of the GRU is linear, as features are not in −1 … 1
         anyone = takes_part[:, 1:].any(dim=1, keepdim=True)
-        return torch.where(anyone, self.last(state), own)
+        return torch.where(anyone, own + trust * (self.last(state) - own), own)

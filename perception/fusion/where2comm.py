@@ -22,7 +22,8 @@ HEADS = 4
 class Where2comm(PerCell):
     """Softmax over agents of query · key / √d, times the agent's confidence in the cell and its link's weight.
 
-    Values are the features themselves, a quarter of the channels to each head; a per-cell residual layer follows.
+    Values are the features themselves, a quarter of the channels to each head; a per-cell residual layer follows,
+    as far as the most trusted peer's weight goes.
     Receivers work out a peer's confidence from the features that came, so it costs no bytes.
     """
 
@@ -47,16 +48,21 @@ class Where2comm(PerCell):
         prior = F.logsigmoid(self.confidence(said)[..., 0]) + weight.clamp_min(1e-12).log()
         logit = (logit + prior[..., None]).masked_fill(~part[..., None], -math.inf)
         share = logit.softmax(dim=0)
-        heads = [
-            weighted_sum(share[..., h], value) for h, value in enumerate(said.chunk(HEADS, dim=-1))
-        ]  # each [p, channels / HEADS]
+        heads = [weighted_sum(share[..., h], value) for h, value in enumerate(said.chunk(HEADS, dim=-1))]
         mixed = torch.cat(heads, dim=-1)
-        out: Tensor = mixed + self.narrow(F.relu(self.widen(mixed)))
+        trust = (weight * part)[1:].amax(dim=0)[:, None]
+        out: Tensor = mixed + trust * self.narrow(F.relu(self.widen(mixed)))
         return out
 
     @classmethod
     def link_bytes(cls, cells: int = 0, boxes: int = 0, rounds: int = 1) -> LinkBytes:
-        """The first round sends by the sender's confidence alone; each later one costs a request map before it."""
+        """The first round sends by the sender's confidence alone; each later one costs a request map before it.
+
+        Raises:
+            ValueError: fewer than one round.
+        """
+        if rounds < 1:
+            raise ValueError(f"rounds is {rounds}, must be at least 1")
         return features_of(cells, requests=rounds - 1)
 
 
