@@ -6,7 +6,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import zipfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -202,13 +201,7 @@ def load_frames(paths: Sequence[Path]) -> Frames:
     """
     if not paths:
         raise ValueError("load_frames needs at least one file")
-    parts = []
-    for path in paths:
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                parts.append({k: file[k] for k in COLUMNS})
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+    parts = [manifest.read_arrays(path) for path in paths]
     most = max(p["cars"].shape[1] for p in parts)
     for p in parts:
         p["cars"] = np.pad(p["cars"], ((0, 0), (0, most - p["cars"].shape[1]), (0, 0)), constant_values=np.nan)

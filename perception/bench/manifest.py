@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.bench.difficulty import Split
 
@@ -27,6 +28,19 @@ class BenchmarkError(ValueError):
     """A benchmark on disk is missing, broken, or not what it says; the message names the file."""
 
 
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a scene's file.
+
+    Raises:
+        BenchmarkError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            return {name: file[name] for name in COLUMNS}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+
+
 def content_hash(path: Path) -> str:
     """SHA-256 of a scene file's arrays: names, types, shapes and values, in order.
 
@@ -34,14 +48,9 @@ def content_hash(path: Path) -> str:
         BenchmarkError: the file cannot be read.
     """
     digest = hashlib.sha256()
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            for name in COLUMNS:
-                array = np.ascontiguousarray(file[name])
-                digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-                digest.update(array.data)
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise BenchmarkError(f"{path}: cannot be read: {error}") from error
+    for name, array in read_arrays(path).items():
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
