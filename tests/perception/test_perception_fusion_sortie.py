@@ -1,0 +1,113 @@
+"""Fusion as a sortie flies it: the method by name, boxes joined late, late maps placed by the pose of then or of now."""
+
+import re
+
+import numpy as np
+import pytest
+from perception_examples import capture, cross
+
+from perception.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
+from perception.fusion.age import earlier, measure
+from perception.fusion.late import SCORE_ABOVE, join_boxes, sendable
+from perception.scene import SceneModel
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception, Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneModel:
+    return SceneModel(Scene(), None, (-50, -50, 50, 50))
+
+
+@pytest.fixture(scope="module")
+def fleet() -> list[Capture]:
+    return cross(10.0, 20.0, 0.3)
+
+
+def shares(captures: list[Capture], representation: str = "features", rho: float = 1.0) -> list[Share]:
+    return [Share(c, representation, rho, None, 1.0) for c in captures]
+
+
+def same(a: Boxes, b: Boxes) -> bool:
+    return len(a) == len(b) and all(np.array_equal(getattr(a, f), getattr(b, f)) for f in Boxes.__slots__)
+
+
+def test_none_is_a_drone_alone_and_late_joins_the_same_boxes_from_maps_as_from_boxes(
+    scene: SceneModel, fleet: list[Capture]
+) -> None:
+    single = TorchDetector(scene, Perception(), seed=1).detect([(fleet[0], [])])[0]
+    ignored = TorchDetector(scene, Perception(fusion="none"), seed=1).detect([(fleet[0], shares(fleet[1:]))])[0]
+    assert same(ignored, single)
+    late = TorchDetector(scene, Perception(fusion="late"), seed=1)
+    whole, boxes, starved, mute = late.detect(
+        [
+            (fleet[0], shares(fleet[1:])),
+            (fleet[0], shares(fleet[1:], "detections")),
+            (fleet[0], shares(fleet[1:], rho=0.1)),
+            (fleet[0], [Share(c, "features", 1.0, None, 0.0) for c in fleet[1:]]),
+        ]
+    )
+    assert same(whole, boxes)
+    assert len(whole) > len(single)
+    assert not same(starved, whole)
+    assert same(mute, single)
+
+
+def test_late_fusion_joins_what_is_sure_and_overlaps_once() -> None:
+    def boxes(*rows: tuple[float, float, float]) -> Boxes:
+        return Boxes.placed(np.array([(x, y, 4.5, 1.85, 0.0, score) for x, y, score in rows]), (0.0, 0.0, 0.0))
+
+    own, peer = boxes((0, 0, 0.5), (30, 0, 0.15)), boxes((0.3, 0, 0.8), (60, 0, 0.3), (90, 0, 0.2))
+    assert sendable(peer).score.tolist() == pytest.approx([0.8, 0.3])
+    assert sendable(boxes((0, 0, SCORE_ABOVE))).score.tolist() == []
+    joined = join_boxes(own, [sendable(peer)])
+    assert joined.score.tolist() == pytest.approx([0.8, 0.3, 0.15])
+    assert joined.xy_m[0, 0] == pytest.approx(0.3)
+
+
+def test_a_late_map_lies_where_its_sender_was_or_is(scene: SceneModel, fleet: list[Capture]) -> None:
+    now = fleet[:2]
+    then = earlier(fleet[1], 0.5, 10.0)
+    jobs = [(now[0], shares([then])), (now[1], [])]
+    compensated = TorchDetector(scene, Perception(), seed=1).detect(jobs)[0]
+    ignored = TorchDetector(scene, Perception(motion_compensation=False), seed=1)
+    assert not same(ignored.detect(jobs)[0], compensated)
+    assert same(ignored.detect(jobs[:1])[0], compensated)  # nobody knows where the sender is now
+    fresh = [(now[0], shares([now[1]])), (now[1], [])]
+    assert same(ignored.detect(fresh)[0], TorchDetector(scene, Perception(), seed=1).detect(fresh)[0])
+
+
+def test_weights_of_another_fusion_are_refused(scene: SceneModel) -> None:
+    with pytest.raises(ValueError) as caught:
+        TorchDetector(scene, Perception(fusion="v2vnet"), seed=1, weights=SHIPPED_WEIGHTS)
+    assert str(caught.value) == (
+        f"{SHIPPED_WEIGHTS}: made for fusion 'disconet', perception.fusion is 'v2vnet', must be the same"
+    )
+    assert shipped("late") == shipped("none") == shipped("disconet") == SHIPPED_WEIGHTS
+    assert shipped("fcooper").name == "fcooper.safetensors"
+
+
+def test_earlier_is_where_a_straight_flight_was() -> None:
+    c = capture(100.0, 50.0, yaw=np.pi / 2, t_s=20.0, est=(100.5, 49.0, 60.0, 1.5))
+    was = earlier(c, 0.5, 10.0)
+    assert was.t_s == 19.5
+    assert was.position_m == pytest.approx((100.0, 45.0, 60.0))
+    assert was.est_position_m == pytest.approx((100.5, 44.0, 60.0))
+    assert (was.orientation_xyzw, was.est_yaw_rad) == (c.orientation_xyzw, c.est_yaw_rad)
+
+
+def test_ages_begin_fresh() -> None:
+    from perception.checkpoint import load_weights
+
+    with pytest.raises(ValueError, match=re.escape("ages_s is (0.1,), must begin with 0 and hold no negative age")):
+        measure(load_weights(SHIPPED_WEIGHTS), ages_s=(0.1,))
+
+
+@pytest.mark.slow
+def test_compensation_gains() -> None:
+    from perception.checkpoint import load_weights
+
+    fresh, late = measure(load_weights(SHIPPED_WEIGHTS), scenes=2, frames=1, ages_s=(0.0, 0.5))
+    assert fresh.gain.delta == 0.0
+    assert late.gain.delta > 0.05
+    assert late.gain.ap_b < fresh.gain.ap_b
