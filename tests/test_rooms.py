@@ -35,6 +35,8 @@ HOMES = {
 """Third-party libraries with one home each."""
 
 NOT_IMPORTED = {"pickle", "dill", "cloudpickle", "shelve", "marshal"}
+RESTRICTED_UNPICKLER = "perception/outside/unpickle.py"
+"""The one file that imports pickle: it looks names up in a table of its own and refuses the rest."""
 NOT_CALLED = {"print", "eval", "exec"}
 
 
@@ -51,7 +53,7 @@ def violations(source: str, path: str) -> list[str]:
                 found.append((node, f"{room} must not import tests"))
             if top in HOMES and not any(fnmatch(path, home) for home in HOMES[top]):
                 found.append((node, f"{top} is at home in {', '.join(HOMES[top])}"))
-            if top in NOT_IMPORTED:
+            if top in NOT_IMPORTED and (top, path) != ("pickle", RESTRICTED_UNPICKLER):
                 found.append((node, f"{top} is not used: it runs what it reads"))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in NOT_CALLED:
             found.append((node, f"{node.func.id}() is not called in a room"))
@@ -110,6 +112,8 @@ def test_every_package_at_the_root_is_a_room() -> None:
         ("sim/sortie.py", "import rerun as rr", "rerun is at home in sim/playback.py, sim/playback_*.py"),
         ("fleet/agent.py", "from pymavlink.dialects import v20", "pymavlink is at home in fleet/mavlink.py"),
         ("scenarios/nodes.py", "import yaml", "yaml is at home in scenarios/load.py"),
+        ("perception/outside/uav3d.py", "import pickle", "pickle is not used: it runs what it reads"),
+        ("perception/outside/unpickle.py", "import dill", "dill is not used: it runs what it reads"),
         ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),
         ("sim/cli.py", "print('done')", "print() is not called in a room"),
         ("policies/registry.py", "f = eval(name)", "eval() is not called in a room"),

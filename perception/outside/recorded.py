@@ -60,7 +60,7 @@ class Recording:
     @property
     def drones(self) -> int:
         """d."""
-        return self.pose.shape[1]
+        return int(self.pose.shape[1])
 
     @property
     def grid(self) -> tuple[int, int, int]:
