@@ -26,7 +26,7 @@ DENSITIES: dict[Density, Cars] = {
     "default": Cars((0.1, 0.3), (3.0, 8.0)),
     "dense": Cars((0.35, 0.65), (9.0, 16.0)),
 }
-"""About 10, 25 and 75 cars within ±102.4 m of a drone; the middle one is near what UAV3D's frames hold."""
+"""About 10, 25 and 60 cars within ±102.4 m of a drone; the middle one is near what UAV3D's frames hold."""
 
 
 @dataclass(frozen=True, slots=True)
