@@ -86,6 +86,16 @@ class AgentLog(Protocol):
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
 
 
+class _Link:
+    """An outgoing link: what its gate enforces, and what was last asked of it while its peer was fresh."""
+
+    __slots__ = ("asked", "state")
+
+    def __init__(self, me: int, peer: int) -> None:
+        self.state = LinkState(nothing(me, peer, ""))
+        self.asked: Directive | None = None
+
+
 class Agent:
     """A drone from take-off until it lands, is lost, or the sortie ends."""
 
@@ -121,7 +131,7 @@ class Agent:
         self._fresh_s = rules.period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
         self._known: dict[int, Descriptor] = {}
         self._heard_at_s: dict[int, float] = {}
-        self._links: dict[int, LinkState] = {}
+        self._links: dict[int, _Link] = {}
         self.gate = Gate()
 
     def start(self) -> None:
@@ -232,27 +242,26 @@ class Agent:
             if peer == me:
                 continue
             peer_ages_s.append(age_s)
+            link = links.get(peer)
+            if link is None:
+                link = links[peer] = _Link(me, peer)
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
-            before = links.get(peer) or LinkState(nothing(me, peer, ""))
-            if asked is not before.enforced or age_s > fresh_s or before.asking_since_s is not None:
-                self._enforce(before, asked, age_s, now_s)
+            if asked is not link.asked or age_s > fresh_s or link.state.asking_since_s is not None:
+                self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
-    def _enforce(self, before: LinkState, asked: Directive, age_s: float, now_s: float) -> None:
+    def _enforce(self, link: _Link, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
-        rules, peer = self._rules, asked.destination
-        link, capped = LinkHealth.FRESH, asked
+        rules, before = self._rules, link.state
+        fidelity, link.asked, capped = LinkHealth.FRESH, asked, asked
         if age_s > self._fresh_s:
-            link = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
-            capped = cap_by_age(asked, link, age_s)
-        after = damp(before, capped, now_s, rules.dwell_s)
-        if after is before:
-            return
-        self._links[peer] = after
+            fidelity = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            link.asked, capped = None, cap_by_age(asked, fidelity, age_s)
+        link.state = after = damp(before, capped, now_s, rules.dwell_s)
         if after.enforced is not before.enforced and after.enforced != before.enforced:
             enforced = decode_directive(encode_directive(after.enforced))
             self.gate.enforce(enforced)
-            self._log.directive(now_s, asked, enforced, link, after.enforced.reason)
+            self._log.directive(now_s, asked, enforced, fidelity, after.enforced.reason)
 
     # --- the data plane ------------------------------------------------------------------------
 

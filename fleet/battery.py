@@ -16,7 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import PchipInterpolator
 
 from scenarios.schema import Battery, DroneOverride
 
@@ -30,9 +29,43 @@ CAUSES = ("rotor", "avionics", "compute", "radio", "ohmic", "fault")
 
 _SOC = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 _CELL_V = (3.2, 3.68, 3.74, 3.79, 3.87, 3.98, 4.20)
-_CELL_CURVE = PchipInterpolator(_SOC, _CELL_V)
-_CELL_ENERGY = _CELL_CURVE.antiderivative()  # in volts × full charge
-_MEAN_CELL_V = float(_CELL_ENERGY(1.0))
+_CELL_SLOPE_V = (
+    6.9, 1.0666666666666673, 0.36986301369862934, 0.30769230769230715, 0.46315789473684216, 0.733333333333333,
+    1.3750000000000022,
+)  # fmt: skip
+"""Slopes of the monotone cubic through the points (PCHIP: Fritsch & Butland 1984), as scipy.interpolate has them;
+importing that for seven numbers would take longer than a sortie's batteries do."""
+
+
+def _cell_curve() -> tuple[Array, Array]:
+    """Each piece of the cell's curve and of its integral as a polynomial, [4, 6] and [5, 6], lowest power first."""
+    x, y, slope = np.array(_SOC), np.array(_CELL_V), np.array(_CELL_SLOPE_V)
+    width, rise = np.diff(x), np.diff(y) / np.diff(x)
+    bend = (slope[:-1] + slope[1:] - 2 * rise) / width
+    curve = np.stack([y[:-1], slope[:-1], (rise - slope[:-1]) / width - bend, bend / width])
+    energy = np.concatenate([np.zeros((1, len(width))), curve / np.arange(1, 5)[:, None]])
+    for piece in range(1, len(width)):
+        energy[0, piece] = _polynomial(energy[:, piece - 1], width[piece - 1])
+    return curve, energy
+
+
+def _polynomial(coefficients: Array, x: Array) -> Array:
+    """c0 + c1·x + c2·x² + …"""
+    total, power = np.zeros_like(x), np.ones_like(x)
+    for c in coefficients:
+        total, power = total + c * power, power * x
+    return total
+
+
+def _at_soc(pieces: Array, soc: npt.ArrayLike) -> Array:
+    """A piecewise polynomial over the state of charge, any shape."""
+    soc = np.asarray(soc, dtype=float)
+    piece = np.clip(np.searchsorted(_SOC, soc, side="right") - 1, 0, len(_SOC) - 2)
+    return _polynomial(pieces[:, piece], soc - np.array(_SOC)[piece])
+
+
+_CELL_CURVE, _CELL_ENERGY = _cell_curve()
+_MEAN_CELL_V = float(_at_soc(_CELL_ENERGY, 1.0))
 
 
 def rotor_power_w(air_speed_mps: npt.ArrayLike) -> Array:
@@ -61,14 +94,12 @@ def climb_power_w(climb_mps: npt.ArrayLike) -> Array:
 
 def open_circuit_cell_v(soc: npt.ArrayLike) -> Array:
     """Voltage of a LiPo cell at rest by state of charge 0 … 1 (monotone cubic through seven points)."""
-    voltage: Array = _CELL_CURVE(np.asarray(soc, dtype=float))
-    return voltage
+    return _at_soc(_CELL_CURVE, soc)
 
 
 def energy_fraction(soc: npt.ArrayLike) -> Array:
     """Share of a full pack's energy that is left at a state of charge (by charge) of 0 … 1."""
-    fraction: Array = _CELL_ENERGY(np.asarray(soc, dtype=float)) / _MEAN_CELL_V
-    return fraction
+    return _at_soc(_CELL_ENERGY, soc) / _MEAN_CELL_V
 
 
 def current_a(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float | None:

@@ -8,6 +8,7 @@ each payload carries a header with capture stamp and pose, and the directive it 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 from fleet.wire import DIRECTIVE_BYTES
@@ -20,6 +21,7 @@ RAW_BYTES = 5 * 800 * 450 * 3
 """Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
 _EPSILON_S = 1e-6
+_RELIABLE = tuple(rung in (Representation.TRACKS, Representation.DETECTIONS) for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
 """How many boxes the drone's own detector reports in a region right now."""
@@ -40,7 +42,7 @@ class Payload(NamedTuple):
     @property
     def reliable(self) -> bool:
         """Compact payloads go reliably, high-rate ones best effort (the paper's QoS mapping)."""
-        return self.representation in (Representation.TRACKS, Representation.DETECTIONS)
+        return _RELIABLE[self.representation]
 
 
 def make_payload(
@@ -55,8 +57,7 @@ def make_payload(
         cells = budget.cells_sent(rho, roi, est_x_m, est_y_m, est_yaw_rad)
         if cells == 0:
             return None
-        index_bytes = budget.index_bytes(cells)
-        content = budget.payload_bytes(cells) + index_bytes
+        content, index_bytes = _feature_bytes(cells)
     elif rung == Representation.RAW:
         content = RAW_BYTES
     else:
@@ -69,6 +70,13 @@ def make_payload(
     # the directive rides along, so that the receiver knows rung, ROI and fusion weight
     size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + content
     return Payload(rung, rho, roi, directive.fusion_weight, cells, boxes, index_bytes, size_bytes)
+
+
+@lru_cache(maxsize=budget.CELLS + 1)
+def _feature_bytes(cells: int) -> tuple[int, int]:
+    """Of so many cells with their index, and of the index."""
+    index_bytes = budget.index_bytes(cells)
+    return budget.payload_bytes(cells) + index_bytes, index_bytes
 
 
 class Gate:

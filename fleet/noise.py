@@ -19,7 +19,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 from scipy.special import gammainc
 
 Array = npt.NDArray[np.float64]
@@ -75,7 +74,11 @@ def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[
 
 
 def _lag(driven: Array, decay: float) -> Array:
-    lagged: Array = lfilter([1.0], [1.0, -decay], driven, axis=0)
+    """y[t] = driven[t] + decay · y[t − 1]; scipy's lfilter does the same, but to import it takes half a second."""
+    lagged = np.empty_like(driven)
+    before = np.zeros_like(driven[0])
+    for t, step in enumerate(driven):
+        lagged[t] = before = decay * before + step
     return lagged
 
 

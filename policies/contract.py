@@ -134,7 +134,7 @@ class Directive(NamedTuple):
         return isinstance(other, Directive) and self[:-1] == other[:-1]
 
     def __ne__(self, other: object) -> bool:
-        return not self == other
+        return not (isinstance(other, Directive) and self[:-1] == other[:-1])
 
     def __hash__(self) -> int:
         return hash(self[:-1])

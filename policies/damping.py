@@ -39,9 +39,12 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
         directive is `proposed`, or the lower of both in every part while an upgrade waits.
     """
     current = state.enforced
-    if proposed is current or proposed == current:
-        return state if state.asking_since_s is None else LinkState(current)
-    if state.asking_since_s is None and _level(proposed) == _level(current):
+    if state.asking_since_s is not None:
+        if proposed == current:
+            return LinkState(current)
+    elif proposed is current:
+        return state
+    elif _level(proposed) == _level(current):
         # A disc that follows its target, a deadline: no step on the ladder.
         return state if _hardly_moved(proposed, current) else LinkState(proposed)
     lower = _lower_of(current, proposed)
@@ -81,10 +84,12 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
 
 
 def _hardly_moved(proposed: Directive, current: Directive) -> bool:
-    """Whether two directives of one level differ by a small step of their disc alone."""
+    """Whether two directives of one level are equal, or differ by a small step of their disc alone."""
     a, b = proposed.roi, current.roi
-    if a is None or b is None or proposed.deadline_s != current.deadline_s:
+    if proposed.deadline_s != current.deadline_s:
         return False
+    if a is None or b is None:
+        return a is b
     return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) < SAME_DISC_M
 
 

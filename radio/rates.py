@@ -13,7 +13,7 @@ from math import exp, expm1, log1p
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import ncx2
+from scipy.special import chndtr
 
 FloatArray = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def fading_weights(k_db: float) -> tuple[FloatArray, FloatArray]:
     k = 10.0 ** (k_db / 10.0)
     centres = np.arange(_FADE_LOW_DB, _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
     edges = 10.0 ** (np.append(centres - _STEP_DB / 2, centres[-1] + _STEP_DB / 2) / 10.0)
-    cdf = ncx2.cdf(edges * 2.0 * (k + 1.0), 2, 2.0 * k)
+    cdf = chndtr(edges * 2.0 * (k + 1.0), 2, 2.0 * k)  # non-central χ² with two degrees of freedom
     cdf[0], cdf[-1] = 0.0, 1.0
     return centres, np.diff(cdf)
 

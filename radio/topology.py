@@ -1,4 +1,7 @@
-"""The fleet as a graph of usable links: who is connected, who is cut off, where the bottleneck is."""
+"""The fleet as a graph of usable links: who is connected, who is cut off, where the bottleneck is.
+
+networkx is imported where it is used: a sortie needs only `linked_drones`, and the import a fifth of a second.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -24,6 +26,8 @@ def link_graph(quality: ArrayLike, threshold: float) -> Any:
     Raises:
         ValueError: if `quality` is not square.
     """
+    import networkx as nx
+
     matrix = np.asarray(quality, dtype=float)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ValueError(f"quality has shape {matrix.shape}, must be square")
@@ -46,11 +50,15 @@ def linked_drones(quality: ArrayLike, threshold: float) -> list[int]:
 
 def is_connected(graph: Any) -> bool:
     """Whether every drone reaches every other, over several hops if need be."""
+    import networkx as nx
+
     return len(graph) <= 1 or bool(nx.is_strongly_connected(graph))
 
 
 def cut_drones(graph: Any) -> list[int]:
     """Drones outside the largest strongly connected group (of equals, that with the lowest id), ascending."""
+    import networkx as nx
+
     groups = sorted(nx.strongly_connected_components(graph), key=lambda g: (-len(g), min(g)))
     return sorted(set(graph) - groups[0]) if groups else []
 
@@ -69,6 +77,8 @@ def bottleneck(graph: Any, path: Sequence[int]) -> tuple[int, int, float]:
 
 def widest_path(graph: Any, source: int, target: int) -> list[int]:
     """The path whose weakest link is strongest; fewest hops among equals; empty if there is none."""
+    import networkx as nx
+
     strengths = sorted({quality for _, _, quality in graph.edges(data="quality")}, reverse=True)
     low, high = 0, len(strengths)  # the strongest threshold at which a path is left, by bisection
     while low < high:
@@ -83,4 +93,6 @@ def widest_path(graph: Any, source: int, target: int) -> list[int]:
 
 
 def _at_least(graph: Any, quality: float) -> Any:
+    import networkx as nx
+
     return nx.subgraph_view(graph, filter_edge=lambda a, b: graph.edges[a, b]["quality"] >= quality)

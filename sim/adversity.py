@@ -15,7 +15,7 @@ from fleet.wire import decode_descriptor, encode_descriptor
 from scenarios.schema import BatteryFault, ClockSkew, DroneLost, Event, Jam, LinkDrop, Scenario, Spoof
 from scenarios.streams import stream
 from sim.ether import Ether
-from sim.world import World, apply_event_loss, at
+from sim.world import World, at
 
 OVERSIZED_BYTES = 2000
 
@@ -50,7 +50,7 @@ class _Begin:
             case LinkDrop():
                 whom = f"{event.drone}" + ("" if event.peer is None else f"–{event.peer}")
                 world.note(event.drone, "link_drop", f"links of {whom} lose {event.loss_db:g} dB")
-                apply_event_loss(world.extra_loss_db, event.drone, event.peer, event.loss_db)
+                world.add_loss(event.drone, event.peer, event.loss_db)
                 if event.until_s is not None:
                     at(env, event.until_s, self._end_link_drop)
             case Jam():
@@ -76,7 +76,7 @@ class _Begin:
     def _end_link_drop(self) -> None:
         event = self.event
         assert isinstance(event, LinkDrop)  # noqa: S101
-        apply_event_loss(self.world.extra_loss_db, event.drone, event.peer, -event.loss_db)
+        self.world.add_loss(event.drone, event.peer, -event.loss_db)
         self.world.note(event.drone, "link_back", f"links of {event.drone} are back")
 
     def _end_jam(self) -> None:

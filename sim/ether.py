@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 from fleet.agent import Agent, Received
 from fleet.auth import Dropped, Opened, open_datagram
@@ -15,8 +16,6 @@ from fleet.gate import Payload
 from perception.types import Capture
 from radio import Air, Status, Transmission
 from sim.record import REPRESENTATIONS, Recorder
-
-NAN = float("nan")
 
 
 class Ether:
@@ -31,6 +30,7 @@ class Ether:
         self._recorder = recorder
         self._keys = keys
         self._pending: dict[int, tuple[Payload, Capture]] = {}
+        recorder.unfold["transmissions"] = _unfold_transmissions
 
     def modem(self, drone: int) -> _Modem:
         """The drone's end of the air."""
@@ -79,14 +79,22 @@ class Ether:
         if transmission.status is Status.DELIVERED:
             self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s))
 
-    def _write(self, t: Transmission, payload: Payload, capture: Capture) -> None:
-        self._recorder.rows["transmissions"].append(
-            (
-                t.t_sent_s, t.sender, t.receiver, t.kind, capture.t_s, payload.rho, payload.cells, payload.boxes,
-                payload.index_bytes, t.payload_bytes, t.wire_bytes, t.deadline_s, t.t_start_s, t.t_done_s,
-                t.status.value, t.reason, t.fragments, t.fragments_lost, t.repairs, t.mcs, t.snr_db, t.airtime_s,
-            )
-        )  # fmt: skip
+    def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
+        self._recorder.rows["transmissions"].append((transmission, payload, capture.t_s))
+
+
+def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    """What the radio, the gate and the sensors each know of a transmission, side by side."""
+    transmissions, payloads, captured_s = zip(*rows, strict=True)
+    t = dict(zip(Transmission._fields, zip(*transmissions, strict=True), strict=True))
+    p = dict(zip(Payload._fields, zip(*payloads, strict=True), strict=True))
+    t["status"] = tuple(status.value for status in t["status"])
+    return [
+        t["t_sent_s"], t["sender"], t["receiver"], t["kind"], captured_s, p["rho"], p["cells"], p["boxes"],
+        p["index_bytes"], t["payload_bytes"], t["wire_bytes"], t["deadline_s"], t["t_start_s"], t["t_done_s"],
+        t["status"], t["reason"], t["fragments"], t["fragments_lost"], t["repairs"], t["mcs"], t["snr_db"],
+        t["airtime_s"],
+    ]  # fmt: skip
 
 
 class _Modem:

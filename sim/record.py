@@ -154,6 +154,17 @@ def _columns(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     return list(zip(*rows, strict=True))
 
 
+def _unfold_descriptors(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    t_s, wire_bytes, descriptors = zip(*rows, strict=True)
+    d = dict(zip(Descriptor._fields, zip(*descriptors, strict=True), strict=True))
+    region = zip(*(disc or _NO_DISC for disc in d["region"]), strict=True)
+    return [
+        t_s, d["agent_id"], d["stamp_ns"], wire_bytes, d["battery_soc"], d["cpu_headroom"], d["gpu_headroom"],
+        d["peer_goodput_mbps"], [_PHASES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
+        d["coverage_grid"],
+    ]  # fmt: skip
+
+
 def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     """A decision's ages stand in one row."""
     t_s, drones, ages_s = zip(*rows, strict=True)
@@ -166,19 +177,14 @@ class AgentNotes:
 
     def __init__(self, recorder: Recorder) -> None:
         self._rows = recorder.rows
-        recorder.unfold["ages"] = _unfold_ages
+        recorder.unfold |= {"descriptors": _unfold_descriptors, "ages": _unfold_ages}
         self._eval_ns: list[int] = []
         self._descriptor_bytes = self._directives = 0
 
     def descriptor(self, t_s: float, d: Descriptor, wire_bytes: int) -> None:
         """One descriptor was published."""
         self._descriptor_bytes += wire_bytes
-        self._rows["descriptors"].append(
-            (
-                t_s, d.agent_id, d.stamp_ns, wire_bytes, d.battery_soc, d.cpu_headroom, d.gpu_headroom,
-                d.peer_goodput_mbps, _PHASES[d.task_phase], *(d.region or _NO_DISC), d.novelty_flags, d.coverage_grid,
-            )
-        )  # fmt: skip
+        self._rows["descriptors"].append((t_s, wire_bytes, d))
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
         """A gate enforces something new."""

@@ -58,7 +58,8 @@ class World:
         )  # fmt: skip
         self.agents: Sequence[Agent] = ()
         n = scenario.fleet.drones
-        self.extra_loss_db = np.zeros((n, n))
+        self.extra_loss_db: np.ndarray | None = None
+        """[N, N] what scenario events add to the path loss; None until one does."""
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self.on_second: Callable[[float], None] | None = None
         """Called once a simulated second; must not change anything."""
@@ -89,7 +90,7 @@ class World:
             self.drain()
             self._frame = frame
             self.now = self.plan.at(env.now)
-            self.air.advance(self.extra_loss_db if self.extra_loss_db.any() else None, list(self.jammers.values()))
+            self.air.advance(self.extra_loss_db, list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
@@ -124,6 +125,15 @@ class World:
         self.air.silence(drone)
         self.batteries.land(drone)
         self.note(drone, kind, text)
+
+    def add_loss(self, drone: int, peer: int | None, loss_db: float) -> None:
+        """Add loss to both directions of a link, or of every link of a drone."""
+        n = len(self.agents)
+        loss = np.zeros((n, n)) if self.extra_loss_db is None else self.extra_loss_db.copy()
+        others = slice(None) if peer is None else peer
+        loss[drone, others] += loss_db
+        loss[others, drone] += loss_db
+        self.extra_loss_db = loss if loss.any() else None
 
     def note(self, drone: int, kind: str, text: str) -> None:
         """Write an event down; drone −1 is the whole fleet."""
@@ -189,16 +199,6 @@ class _OwnSenses:
         if roi is not None:
             x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
         return self._world.scene.cars_near(capture.t_s, x_m, y_m, radius_m)
-
-
-def apply_event_loss(extra_loss_db: np.ndarray, drone: int, peer: int | None, loss_db: float) -> None:
-    """Add loss to both directions of a link, or of every link of a drone; in place."""
-    if peer is None:
-        extra_loss_db[drone, :] += loss_db
-        extra_loss_db[:, drone] += loss_db
-    else:
-        extra_loss_db[drone, peer] += loss_db
-        extra_loss_db[peer, drone] += loss_db
 
 
 def route_bounds(motion: Motion) -> tuple[float, float, float, float]:

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
+from fleet import battery
 from fleet.battery import (
     CAUSES,
     FleetBatteries,
@@ -241,3 +243,12 @@ def test_the_tables_are_good_to_a_millionth(soc: float) -> None:
     b.fault(0, 0.0)  # reads charge and voltage off the energy
     assert b.soc[0] == pytest.approx(soc, abs=1e-6)
     assert b.voltage_v[0] == pytest.approx(4 * float(open_circuit_cell_v(soc)), abs=2e-3 if soc < 0.01 else 2e-5)
+
+
+def test_the_cells_curve_is_the_monotone_cubic_through_its_points() -> None:
+    curve = PchipInterpolator(battery._SOC, battery._CELL_V)
+    energy = curve.antiderivative()
+    soc = np.linspace(0.0, 1.0, 10_001)
+    np.testing.assert_allclose(battery.open_circuit_cell_v(soc), curve(soc), rtol=1e-15)
+    np.testing.assert_allclose(battery.energy_fraction(soc), energy(soc) / energy(1.0), rtol=1e-14)
+    assert np.diff(battery.open_circuit_cell_v(soc)).min() > 0

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from radio.topology import bottleneck, cut_drones, is_connected, link_graph, widest_path
+from radio.topology import bottleneck, cut_drones, is_connected, link_graph, linked_drones, widest_path
 
 NAN = np.nan
 CHAIN = np.array([[NAN, 9.0, 1.0, 0.0], [9.0, NAN, 6.0, 0.0], [1.0, 6.0, NAN, 0.0], [0.0, 0.0, 0.0, NAN]])
@@ -23,6 +23,12 @@ def test_who_is_connected_and_who_is_cut() -> None:
     assert cut_drones(link_graph(CHAIN, 100.0)) == [1, 2, 3]
     one_way = np.array([[NAN, 9.0], [0.0, NAN]])
     assert not is_connected(link_graph(one_way, 5.0))
+
+
+@given(arrays(float, st.integers(1, 6).map(lambda n: (n, n)), elements=st.floats(-10, 10) | st.just(NAN)))
+def test_linked_drones_are_those_with_an_edge(quality: np.ndarray) -> None:
+    graph = link_graph(quality, 0.0)
+    assert linked_drones(quality, 0.0) == [i for i in sorted(graph) if graph.degree(i)]
 
 
 def test_the_widest_path_goes_round_the_weak_link() -> None:

@@ -1,0 +1,21 @@
+"""What a sortie loads: a command's user waits for it, and so does every worker of a campaign."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+HEAVY = {"torch", "scipy.stats", "scipy.signal", "scipy.interpolate", "networkx", "rerun", "matplotlib"}
+"""Each takes from a fifth of a second to some seconds."""
+
+
+def test_flying_without_a_detector_loads_nothing_heavy() -> None:
+    fly = (
+        "import sys; from scenarios.load import load; from sim.sortie import run_sortie\n"
+        "run_sortie(load('track_target', ['perception.detector=none', 'duration_s=2', "
+        "'mission.phases=[{at_s: 0, phase: search}]']))\n"
+        "print(*sys.modules, sep='\\n')"
+    )
+    loaded = subprocess.run([sys.executable, "-c", fly], capture_output=True, text=True, check=True).stdout
+    assert "sim.sortie" in loaded.split()
+    assert HEAVY & set(loaded.split()) == set()
