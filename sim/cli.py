@@ -20,7 +20,7 @@ from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
-from sim import cli_bench, cli_paper, cli_train, rundir, tables
+from sim import cli_bench, cli_paper, cli_recording, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.expect import check as check_expectations
 from sim.outcome import outcome
@@ -33,6 +33,7 @@ app = typer.Typer(
     help="Fly drone fleets that share what they see, and tell what they saw and what it cost.",
 )
 app.add_typer(cli_bench.app, name="bench")
+app.add_typer(cli_recording.app, name="recording")
 out = Console()
 err = Console(stderr=True, highlight=False)
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from perception.errors import InputError
 from perception.geometry import CELLS, CHANNELS, Geometry
 
 FORMAT = 1
@@ -28,7 +29,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-class RecordingError(ValueError):
+class RecordingError(InputError):
     """A recording that is missing, broken, or asked for what it does not hold; the message names file, array, value and bound."""
 
 
@@ -162,7 +163,7 @@ def open_recording(path: Path | str) -> Recording:
     if path.is_dir():
         return checked(path, *_from_zarr(path))
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such recording, must be an npz file or a Zarr folder") from None

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from perception.errors import InputError
 from perception.geometry import FULL
 from perception.outside.recorded import Floats, write_recording
 from perception.outside.unpickle import UnpickleError, load_data
@@ -37,7 +38,7 @@ REACH_Z_M = 10.0
 _SIDE = re.compile(r"CAM(?:ERA)?_(FRONT|BACK|LEFT|RIGHT|BOTTOM)_id_([0-4])")
 
 
-class Uav3dError(ValueError):
+class Uav3dError(InputError):
     """Files that are missing or broken; the message names file, record, field, value and bound."""
 
 

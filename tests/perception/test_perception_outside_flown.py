@@ -216,3 +216,12 @@ evaluate_recording({str(path)!r} and __import__("pathlib").Path({str(path)!r}), 
 assert "torch" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_readmes_example_runs(tmp_path: Path) -> None:
+    """As it stands there: alone each drone finds one of two cars, with sharing both find both."""
+    readme = Path(__file__).parents[2] / "perception" / "outside" / "README.md"
+    code = readme.read_text("utf-8").split("```python\n")[1].split("```")[0]
+    done = subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, capture_output=True, text=True)
+    aps = eval(done.stdout)  # noqa: S307 (our own dict)
+    assert (aps["single"], aps["all-1@1"]) == (0.5, 1.0)

@@ -1,0 +1,80 @@
+"""`sortie recording`: look at a recording of another model, evaluate it in the harness, make one of UAV3D's files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from perception.outside.recorded import open_recording
+from sim.rundir import RunError
+
+app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")
+out = Console()
+
+RecordingArgument = Annotated[Path, typer.Argument(help="An npz file or a Zarr folder.")]
+
+
+@app.command()
+def show(path: RecordingArgument) -> None:
+    """Check a recording and say what it holds."""
+    rec = open_recording(path)
+    c, h, w = rec.grid
+    out.print(f"{len(rec)} frames of {rec.drones} drones in {len(set(rec.scene.tolist()))} scenes", soft_wrap=True)
+    held = ", ".join(rec.large) or "no features: cells are counted as the radio carries them"
+    out.print(f"cells {c} × {h} × {w} of {rec.cell_m:g} m; {held}", soft_wrap=True)
+    boxes = sum(len(rec.boxes(f, d)) for f in range(len(rec)) for d in range(rec.drones))
+    out.print(f"{boxes} boxes, {sum(len(rec.truth(f)) for f in range(len(rec)))} cars", soft_wrap=True)
+
+
+@app.command()
+def evaluate(
+    path: RecordingArgument,
+    fusion: Annotated[str | None, typer.Option(help="path/to/file.py:function; left out, boxes by cell.")] = None,
+    conditions: Annotated[
+        str | None, typer.Option(help="Labels separated by spaces, as in 'single best-2@0.02 all-4@1'.")
+    ] = None,
+    tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
+    save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
+) -> None:
+    """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
+    from perception.harness.condition import Condition
+    from perception.outside.instrument import evaluate_recording
+    from sim.cli import _progress
+
+    try:
+        asked = None if conditions is None else [Condition.parse(label) for label in conditions.split()]
+        with _progress() as bar:
+            found = evaluate_recording(
+                path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None
+            )
+        shown = found.at(tau)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    table = Table(title=f"{path.name}, AP@0.5 at τ = {tau:g}")
+    for name in ("condition", "full scene", "mission", "payload B an ego", "index B an ego"):
+        table.add_column(name, justify="left" if name == "condition" else "right")
+    for c in shown.conditions:
+        aps = (f"{shown.ap(c, region):.3f}" for region in shown.regions)
+        bytes_ = (f"{b[c].mean():.0f}" for b in (shown.payload_bytes, shown.index_bytes))
+        table.add_row(c.label, *aps, *bytes_)
+    out.print(table)
+    if save is not None:
+        found.save(save)
+        out.print(f"kept in [bold]{save}[/bold]")
+
+
+@app.command("from-uav3d")
+def from_uav3d(
+    root: Annotated[Path, typer.Argument(help="The folder with uav3d_infos_val.pkl and the tables' folder.")],
+    out_path: Annotated[Path, typer.Option("--out", help="An npz file, or a new Zarr folder.")],
+    split: Annotated[str, typer.Option(help="train or val.")] = "val",
+) -> None:
+    """Scenes, times, poses and cars of a UAV3D split as a recording; detections are yours to add."""
+    from perception.outside.uav3d import convert
+
+    convert(root, split, out_path)
+    out.print(f"kept in [bold]{out_path}[/bold]")

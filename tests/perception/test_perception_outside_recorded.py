@@ -1,0 +1,195 @@
+"""The layout on disk: round trips, npz and Zarr alike, and every rule broken once with its message."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_examples import score_map, small
+
+from perception.outside.exchange import moved
+from perception.outside.recorded import RecordingError, cells_of, open_recording, write_recording
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return small(tmp_path / "small.npz")
+
+
+@pytest.mark.parametrize("name", ["small.npz", "small.zarr"])
+def test_what_is_written_is_read(name: str, tmp_path: Path) -> None:
+    rec = open_recording(small(tmp_path / name, confidence=np.full((2, 2, 64, 64), 0.25)))
+    assert (len(rec), rec.drones, rec.grid, rec.cell_bytes, rec.geometry.half_extent_m) == (2, 2, (3, 64, 64), 6, 102.4)
+    assert (rec.t_s.tolist(), rec.scene.tolist()) == ([0.0, 0.1], [0, 0])
+    np.testing.assert_allclose(rec.boxes(1, 1), [(-1, 20, 4.5, 1.9, 0.2, 0.8)])
+    np.testing.assert_allclose(rec.truth(0)[:, 0], [8, 10])
+    np.testing.assert_array_equal(rec.features(0, 0), score_map(rec.boxes(0, 0), 3))
+    assert (rec.rank(0, 0, "confidence") == 0.25).all()
+    assert rec.rank(0, 0, "norm").argmax() == rec.features(0, 0)[0].argmax()
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_zarr_reads_only_what_is_asked_for(tmp_path: Path) -> None:
+    """One chunk a frame and drone: with the others gone, it still reads; so memory holds one at a time."""
+
+    def frames() -> Iterator[np.ndarray]:
+        for k in range(3):
+            yield np.full((2, 4, 64, 64), k, np.float16)
+
+    none = [[np.zeros((0, 6))] * 2] * 3
+    rec = open_recording(
+        write_recording(tmp_path / "r", t_s=[0, 1, 2], pose=np.zeros((3, 2, 3)), boxes=none, truth=[np.zeros((0, 5))] * 3, cell_m=3.2, features=frames())
+    )  # fmt: skip
+    chunks = sorted(p for p in (tmp_path / "r" / "features").rglob("*") if p.is_file() and p.name != "zarr.json")
+    assert len(chunks) == 4  # of six, as frame 0 is all zeros
+    for chunk in chunks:
+        if "/2/1/" not in chunk.as_posix():
+            chunk.write_bytes(b"broken")
+    assert (rec.features(2, 1) == 2).all()
+    with pytest.raises(Exception):  # noqa: B017 (whatever the codec says)
+        rec.features(1, 1)
+
+
+def test_confidence_left_out_is_the_score_of_the_boxes(path: Path) -> None:
+    rank = open_recording(path).rank(0, 1, "confidence")
+    assert np.argwhere(rank).tolist() == [[32, 38]]  # the car 20 m to the left, 0 m ahead
+    assert rank.max() == pytest.approx(0.8)
+
+
+def test_finer_grids_are_exchanged_in_blocks(tmp_path: Path) -> None:
+    """128 × 128 columns of 1.6 m: an exchanged cell of 3.2 m holds four, its norm is that of all four."""
+    fine = np.zeros((2, 2, 3, 128, 128), np.float16)
+    fine[:, :, 0, 10:12, 20:22] = 2
+    confidence = np.zeros((2, 2, 128, 128))
+    confidence[:, :, 11, 20] = 0.7
+    rec = open_recording(small(tmp_path / "x.npz", features=fine, confidence=confidence, cell_m=1.6))
+    assert (rec.geometry.half_extent_m, rec.cell_bytes) == (102.4, 24)
+    for by, value in (("norm", 4.0), ("confidence", 0.7)):
+        rank = rec.rank(0, 0, by)
+        assert np.argwhere(rank).tolist() == [[5, 10]]
+        assert rank.max() == pytest.approx(value, rel=1e-3)
+
+
+def spoiled(path: Path, **changes: Any) -> Path:
+    with np.load(path) as file:
+        arrays = {k: file[k] for k in file.files}
+    for name, value in changes.items():
+        if value is None:
+            del arrays[name]
+        else:
+            arrays[name] = value(arrays[name]) if callable(value) else value
+    np.savez(path, **arrays)
+    return path
+
+
+def put(at: Any, value: Any) -> Any:
+    def change(array: np.ndarray) -> np.ndarray:
+        array = array.copy()
+        array[at] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (dict(t_s=None), "t_s is missing, a recording must hold format, cell_m, t_s, pose, boxes, boxes_offset, truth, truth_offset"),
+        (dict(speed=np.zeros(2)), "speed is unknown, beside what it must hold a recording may hold scene, est_pose, features, confidence"),
+        (dict(format=np.array(2)), "format is 2, must be 1"),
+        (dict(cell_m=np.array(0.0)), "cell_m is 0, must be above 0"),
+        (dict(cell_m=np.array("a")), "cell_m is <U1, must be numbers"),
+        (dict(t_s=np.array([0.1, 0.1])), "t_s is 0.1 in frame 1, must be above 0.1, the frame before"),
+        (dict(t_s=np.array([0.0, np.nan])), "t_s [1] is nan, must be finite"),
+        (dict(t_s=np.zeros((2, 1))), "t_s has shape [2, 1], must be [any]"),
+        (dict(scene=np.array([0.0, 1.0])), "scene is float64, must be whole numbers"),
+        (dict(pose=np.zeros((3, 2, 3))), "pose has shape [3, 2, 3], must be [2, any, 3]"),
+        (dict(pose=put((0, 1, 2), np.inf)), "pose [0, 1, 2] is inf, must be finite"),
+        (dict(pose=np.zeros((2, 0, 3))), "pose has no drones, must be at least one"),
+        (dict(est_pose=np.zeros((2, 1, 3))), "est_pose has shape [2, 1, 3], must be [2, 2, 3]"),
+        (dict(boxes=np.ones((4, 7))), "boxes has shape [4, 7], must be [any, 6]"),
+        (dict(boxes=put((2, 3), 0.0)), "boxes row 2 has a length or width ≤ 0, must be above 0 m"),
+        (dict(boxes=put((3, 5), 1.5)), "boxes row 3 has the score 1.5, must be 0 to 1"),
+        (dict(boxes_offset=np.array([0, 1, 2, 3, 5])), "boxes_offset runs from 0 to 5, must be 0 to 4, the rows of boxes"),
+        (dict(boxes_offset=np.array([0, 3, 2, 3, 4])), "boxes_offset falls, must be ascending"),
+        (dict(boxes_offset=np.array([0, 4])), "boxes_offset has shape [2], must be [5]"),
+        (dict(truth_offset=np.array([0, 2, 4, 4])), "truth_offset has shape [4], must be [3]"),
+        (dict(features=lambda a: a.astype(np.float32)), "features is float32, must be float16"),
+        (dict(features=lambda a: a[:, :1]), "features has shape [2, 1, 3, 64, 64], must be [n, drones, C, H, W] with n = 2, drones = 2"),
+        (dict(confidence=np.zeros((2, 2, 32, 64))), "confidence has a grid of 32 × 64, must be the features' 64 × 64"),
+        (dict(confidence=np.zeros((2, 2, 64, 64), int)), "confidence is int64, must be floating"),
+    ],
+)  # fmt: skip
+def test_a_broken_recording_is_told(changes: dict[str, Any], told: str, path: Path) -> None:
+    with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {told}')}$"):
+        open_recording(spoiled(path, **changes))
+
+
+def test_scenes_come_in_runs_and_have_clocks_of_their_own(tmp_path: Path) -> None:
+    frames = dict(pose=np.zeros((3, 1, 3)), boxes=[[np.zeros((0, 6))]] * 3, truth=[np.zeros((0, 5))] * 3, cell_m=3.2)
+    write_recording(tmp_path / "a.npz", t_s=[5, 6, 0], scene=[1, 1, 0], **frames)  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match="scene comes back to a scene it left, must be one run of frames a scene"):
+        write_recording(tmp_path / "b.npz", t_s=[5, 0, 6], scene=[1, 0, 1], **frames)  # type: ignore[arg-type]
+    assert not (tmp_path / "b.npz").exists()
+
+
+def test_large_arrays_are_checked_when_they_are_read(path: Path) -> None:
+    rec = open_recording(spoiled(path, features=put((1, 0, 2, 3, 4), np.nan)))
+    assert rec.features(0, 0).shape == (3, 64, 64)
+    with pytest.raises(
+        RecordingError, match=r"small\.npz: features frame 1, drone 0 is not finite, must be finite every"
+    ):
+        rec.features(1, 0)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda p: None, "no such recording, must be an npz file or a Zarr folder"),
+        (lambda p: p.write_bytes(b"PK\x03\x04 torn"), "cannot be read as npz"),
+        (lambda p: p.write_text("x"), "cannot be read as npz"),
+        (lambda p: p.mkdir(), "cannot be read as a Zarr group"),
+        (lambda p: np.savez(p, t_s=np.array([None])), "cannot be read as npz"),  # would need a pickle
+    ],
+)
+def test_no_recording_is_told(make: Any, told: str, tmp_path: Path) -> None:
+    make(tmp_path / "r.npz")
+    with pytest.raises(RecordingError, match=rf"r\.npz: {told}"):
+        open_recording(tmp_path / "r.npz")
+
+
+def test_writing_zarr_is_whole_or_not_at_all(tmp_path: Path) -> None:
+    few = [np.zeros((2, 3, 64, 64))]
+    with pytest.raises(RecordingError, match="features end after 1 frames, must be 2"):
+        small(tmp_path / "r", features=few)
+    with pytest.raises(
+        RecordingError, match=r"features of frame 1 have shape \[2, 4, 64, 64\], must be \[2, C, H, W\]"
+    ):
+        small(tmp_path / "r", features=[*few, np.zeros((2, 4, 64, 64))])
+    assert not list(tmp_path.iterdir())
+    small(tmp_path / "r")
+    with pytest.raises(RecordingError, match="r: exists already, a Zarr recording must be written to a new folder"):
+        small(tmp_path / "r")
+
+
+def test_grids_that_cells_do_not_divide_are_told(tmp_path: Path) -> None:
+    rec = open_recording(small(tmp_path / "x.npz", features=np.zeros((2, 2, 3, 50, 50))))
+    with pytest.raises(RecordingError, match="features has a grid of 50 × 50, must be square and a multiple of 64"):
+        _ = rec.geometry
+
+
+def test_moved_is_its_own_inverse_and_cells_follow_the_grid() -> None:
+    rng = np.random.Generator(np.random.PCG64(3))
+    boxes = rng.uniform(-50, 50, (20, 6))
+    a, b = rng.uniform(-3, 3, 3), rng.uniform(-3, 3, 3)
+    np.testing.assert_allclose(moved(moved(boxes, a, b), b, a), boxes, atol=1e-12)
+    here = moved(np.array([(1.0, 0, 4, 2, 0, 1)]), (10.0, 5.0, np.pi / 2), (10.0, 0.0, 0.0))
+    np.testing.assert_allclose(here[0, [0, 1, 4]], (0, 6, np.pi / 2), atol=1e-12)
+    from perception.geometry import FULL
+
+    row, column, inside = cells_of(np.array([(-102.4, 102.3, 4, 2, 0, 1), (102.4, 0, 4, 2, 0, 1)]), FULL)
+    assert (row[0], column[0], inside.tolist()) == (0, 63, [True, False])

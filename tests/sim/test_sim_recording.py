@@ -1,0 +1,68 @@
+"""`sortie recording`, and a recording flown from the command line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from recording_examples import record_flight, small
+from sim_examples import example
+from typer.testing import CliRunner
+
+from perception.outside.recorded import RecordingError
+from sim.cli import app
+from sim.compare import compare
+from sim.sortie import run_sortie
+
+RECORDED = "perception.detector=recorded"
+SHORT = ("duration_s=2", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.2")
+
+
+def say(*arguments: str) -> str:
+    done = CliRunner().invoke(app, list(arguments), env={"COLUMNS": "160"})
+    assert done.exit_code == 0, done.output + repr(done.exception)
+    return done.output
+
+
+def test_a_recording_is_shown_and_evaluated(tmp_path: Path) -> None:
+    path = small(tmp_path / "mine.npz")
+    shown = say("recording", "show", str(path))
+    assert "2 frames of 2 drones in 1 scenes" in shown
+    assert "cells 3 × 64 × 64 of 3.2 m; features" in shown
+    table = say(
+        "recording", "evaluate", str(path), "--conditions", "single all-1@1", "--out", str(tmp_path / "all.parquet")
+    )
+    assert re.search(r"single\s+│\s+0\.500\s", table)
+    assert re.search(r"all-1@1\s+│\s+1\.000\s.*│\s+24576\s+│\s+0\s", table)
+    assert (tmp_path / "all.parquet").is_file()
+
+
+def test_wrong_questions_are_told(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["recording", "show", str(tmp_path / "none.npz")])
+    assert isinstance(done.exception, RecordingError)
+    assert "no such recording" in str(done.exception)
+    done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--conditions", "most@2"])
+    assert "condition is 'most@2', must be like" in str(done.exception)
+
+
+def test_sharing_gains_over_silence_on_a_recording(tmp_path: Path) -> None:
+    """The made model sees 45 m far, so that peers know cars that the ego does not; and the same flight twice is the same."""
+    path = record_flight(example(*SHORT), tmp_path / "flight.npz", features=False)
+    flight = (*SHORT, RECORDED, f"perception.recording={path}")
+    sharing = example(*flight, "policy.name=all-4", "policy.params={rho: 0.05}")
+    silent = example(*flight, "policy.name=silence", "policy.params={}")
+    rows = compare([("silence", silent), ("all-4", sharing)])
+    _, low, _ = rows[1].gain["full_scene"] or (0.0, 0.0, 0.0)
+    assert low > 0.0
+    assert rows[1].outcome["ap50"]["detector"] == "recorded"
+    assert run_sortie(sharing).fingerprint == rows[1].outcome["fingerprint"]
+
+
+def test_another_flight_than_the_recorded_one_is_refused(tmp_path: Path) -> None:
+    path = record_flight(example(*SHORT), tmp_path / "flight.npz", features=False)
+    away = example(*SHORT, RECORDED, f"perception.recording={path}", "fleet.route.waypoints_m=[[500, 0]]")
+    with pytest.raises(
+        RecordingError, match=r"drone 0 at 0 s flies \d+\.\d m from where it was recorded, must be within"
+    ):
+        run_sortie(away)
