@@ -77,6 +77,8 @@ def test_units_stand_in_names() -> None:
         "path_loss_exponent",
         "retry_limit",
         "max_ampdu_frames",
+        "overcast",
+        "brightness",
         "degraded_after_periods",
         "detached_after_periods",
         "score_threshold",
