@@ -138,7 +138,8 @@ def _make(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -
     }
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
+    """For a worker process: one thread each, as there are as many workers as cores."""
     torch.set_num_threads(1)
 
 
@@ -175,7 +176,7 @@ def make_split(
     if todo:
         entries: list[tuple[str, dict[str, Any]]] = []
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=_start_worker)
+        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=start_worker)
         try:
             jobs = [pool.submit(_make, bench, split, k, frames, paths[k]) for k in todo]
             for done, job in enumerate(as_completed(jobs), 1):

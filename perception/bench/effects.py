@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from perception.ap import Matched
-from perception.bench.dataset import FORMAT, Frames, _start_worker
+from perception.bench.dataset import FORMAT, Frames, start_worker
 from perception.bench.difficulty import Difficulty
 from perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
 from perception.bev import lift
@@ -117,7 +117,7 @@ def measure(
     todo = [k for k, path in enumerate(paths) if not path.exists()]
     if todo:
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=_start_worker)
+        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=start_worker)
         try:
             jobs = [pool.submit(evaluate_scene, weights, k, rows, paths[k]) for k in todo]
             for done, job in enumerate(as_completed(jobs), 1):
