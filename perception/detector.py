@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +30,7 @@ from perception.fusion.late import join_boxes, sendable
 from perception.fusion.registry import FUSIONS
 from perception.geometry import CELLS, FULL
 from perception.model import folded
-from perception.render import Renderer
+from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
 from perception.town import Bytes
 from perception.types import Boxes, Capture, Share
@@ -136,10 +136,10 @@ class TorchDetector:
             jobs = [(ego, ()) for ego, _ in jobs]
         self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        alone = [s.capture for s in shared if s.representation in LATE]
-        alone += [ego for ego, shares in jobs if not any(self._is_fused(s) for s in shares)]
-        self._each(self._look_alone, dict.fromkeys(alone))
-        self._each(self._head_alone, dict.fromkeys(s.capture for s in shared if self._must_rank(s)))
+        look = {s.capture for s in shared if s.representation in LATE}
+        look |= {ego for ego, shares in jobs if not any(self._is_fused(s) for s in shares)}
+        rank = [s.capture for s in shared if self._must_rank(s)]
+        self._each(lambda c: self._look_alone(c) if c in look else self._head_alone(c), dict.fromkeys([*look, *rank]))
         if self._fusion.shares == "boxes":
             self._each(
                 self._head_in_part, {(s.capture, s.rho, s.roi): s for s in shared if s.representation in MAPS}.values()
@@ -175,14 +175,24 @@ class TorchDetector:
         """Render and encode what is not kept yet; then drop the oldest beyond the limit."""
         wanted = list(dict.fromkeys(captures))
         missing = [c for c in wanted if c not in self._kept]
-        views = self._renderer.render(missing, self._pool.map)
+        views = np.empty((len(missing), *VIEWS_SHAPE), np.uint8)
+        features: dict[int, Future[Tensor]] = {}
 
-        def one(i: int) -> Tensor:
-            features: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
-            return features
+        def encode(i: int, seen: Future[None]) -> Tensor:
+            seen.result()  # under way or done: tasks begin in the order in which they were handed in
+            with torch.inference_mode():
+                out: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
+            return out
 
-        for capture, features in zip(missing, self._each(one, range(len(missing))), strict=True):
-            self._kept[capture] = _Encoded(features)
+        def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
+            """Render, and encode what is rendered while the last views are on their way."""
+            sights = {i: self._pool.submit(see, i) for i in over}
+            features.update({i: self._pool.submit(encode, i, seen) for i, seen in sights.items()})
+            return [seen.result() for seen in sights.values()]
+
+        self._renderer.render(missing, side_by_side, views)
+        for i, capture in enumerate(missing):
+            self._kept[capture] = _Encoded(features[i].result())
         for capture in wanted:
             self._kept.move_to_end(capture)
         while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):

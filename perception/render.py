@@ -24,6 +24,7 @@ from scenarios.streams import stream
 
 CAMERAS = ("front", "left", "right", "back", "nadir")
 WIDTH_PX, HEIGHT_PX = 160, 90
+VIEWS_SHAPE = (len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3)
 HALF_H = float(np.tan(np.radians(35.0)))
 """Tangent of half the horizontal field of view."""
 HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
@@ -168,12 +169,15 @@ class Renderer:
         self._window: Window | None = None
         self._span: tuple[range, range] = (range(0), range(0))
 
-    def render(self, captures: Sequence[Capture], each: Callable[..., Iterable[None]] = map) -> Bytes:
+    def render(
+        self, captures: Sequence[Capture], each: Callable[..., Iterable[None]] = map, into: Bytes | None = None
+    ) -> Bytes:
         """Camera images of all captures, uint8 [n, 5, 90, 160, 3], in the order of `CAMERAS`.
 
-        `each` runs a function over captures, `map` or a pool's `map`; the images are the same.
+        `each` runs a function over captures, `map` or a pool's `map`; the images are the same. They are written `into`
+        an array of that shape, where one is given, each whole when its function is done.
         """
-        out = np.empty((len(captures), len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+        out = np.empty((len(captures), *VIEWS_SHAPE), np.uint8) if into is None else into
         if not captures:
             return out
         window = self._window_over(captures)
