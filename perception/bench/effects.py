@@ -184,7 +184,8 @@ def table(effects: Sequence[Effect], weights: Path, scenes: int) -> str:
     lines = [
         f"Measured {datetime.now(UTC):%Y-%m-%d} with `{weights.name}` (SHA-256 {digest}…): {scenes} scenes of seed {SEED}'s test layouts, "
         f"one fleet-frame × five egos each, AP@0.5 without a threshold. Change: of AP under full sharing against the first row, "
-        "paired by scene, 95 %; bold where the interval leaves out 0.",
+        "paired by scene, 95 %; bold where the interval leaves out 0. A bootstrap over few scenes is too sure of itself: "
+        "below twenty, take small changes for hints.",
         "",
         "| parameter | moved to | AP alone | AP sharing all | cooperation | change |",
         "|---|---|---|---|---|---|",
