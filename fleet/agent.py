@@ -129,7 +129,7 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._fresh_s = rules.period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
-        self._known: dict[int, Descriptor] = {}
+        self._known: dict[int, Descriptor] = {}  # by ascending id
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, _Link] = {}
         self.gate = Gate()
@@ -156,10 +156,11 @@ class Agent:
         return None
 
     def _hold(self, descriptor: Descriptor) -> None:
-        sender = descriptor.agent_id
-        if sender not in self._known:  # by ascending id, so that the order of hearing decides nothing
-            self._known = dict(sorted([*self._known.items(), (sender, descriptor)]))
-        self._known[sender] = descriptor
+        known, sender = self._known, descriptor.agent_id
+        met = sender in known
+        known[sender] = descriptor
+        if not met:  # by ascending id, so that the order of hearing decides nothing
+            self._known = dict(sorted(known.items()))
         self._heard_at_s[sender] = self.env.now
 
     def receive(self, received: Received) -> None:
@@ -222,11 +223,7 @@ class Agent:
         """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
         now_s = self.env.now
         clock_s, heard_at_s = now_s + self.clock_skew_s, self._heard_at_s
-        ages_s = {}
-        for i, descriptor in self._known.items():
-            by_stamp_s, by_arrival_s = clock_s - descriptor.stamp_ns * 1e-9, now_s - heard_at_s[i]
-            ages_s[i] = by_stamp_s if by_stamp_s > by_arrival_s else by_arrival_s
-        return ages_s
+        return {i: max(clock_s - d.stamp_ns * 1e-9, now_s - heard_at_s[i]) for i, d in self._known.items()}
 
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self.env.now, self.drone, self._links, self._fresh_s

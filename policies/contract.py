@@ -81,8 +81,9 @@ class Descriptor(NamedTuple):
 
     def goodput_to(self, peer: int) -> float:
         """Goodput to `peer`, Mb/s, as this drone measured it (0 if it is not on the roster)."""
-        slot = peer - (peer > self.agent_id)
-        return self.peer_goodput_mbps[slot] if peer != self.agent_id and slot < len(self.peer_goodput_mbps) else 0.0
+        me, known = self.agent_id, self.peer_goodput_mbps
+        slot = peer - (peer > me)
+        return known[slot] if peer != me and slot < len(known) else 0.0
 
 
 class FleetView(NamedTuple):

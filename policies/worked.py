@@ -35,16 +35,16 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     roi = me.region if me.task_phase == TaskPhase.TRACK else None
     if roi is not None:
         why += f", track: ROI {roi.radius_m:.0f} m"
-    chosen = peers_by_overlap(view)[:TOP_PEERS]
+    ego, chosen = view.ego, peers_by_overlap(view)[:TOP_PEERS]
+    budget = rho if rung == Representation.FEATURES else 0.0
     directives = []
     for peer in view.peers:
         if peer not in chosen:
-            directives.append(nothing(view.ego, peer, NOT_CHOSEN))
+            directives.append(nothing(ego, peer, NOT_CHOSEN))
         elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
             weak = f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
             low = min(rung, Representation.DETECTIONS)
-            directives.append(Directive(view.ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
+            directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
         else:
-            budget = rho if rung == Representation.FEATURES else 0.0
-            directives.append(Directive(view.ego, peer, rung, budget, roi, rate_hz, reason=why))
+            directives.append(Directive(ego, peer, rung, budget, roi, rate_hz, reason=why))
     return directives

@@ -22,20 +22,21 @@ class Goodput:
     """The estimates of every ordered link, Mb/s."""
 
     def __init__(self, n_drones: int) -> None:
-        self._mbps: list[list[float | None]] = [[None] * n_drones for _ in range(n_drones)]
+        self._mbps = [[0.0] * n_drones for _ in range(n_drones)]
+        self._known = [[False] * n_drones for _ in range(n_drones)]
 
     def measured(self, sender: int, receiver: int, mbps: float) -> None:
         """A measurement: down at once, up by `RISE` of the gap; the first one is taken as it is."""
-        row = self._mbps[sender]
-        known = row[receiver]
-        row[receiver] = mbps if known is None or mbps <= known else known + RISE * (mbps - known)
+        row, known = self._mbps[sender], self._known[sender]
+        before = row[receiver]
+        row[receiver] = before + RISE * (mbps - before) if known[receiver] and mbps > before else mbps
+        known[receiver] = True
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
         """A link cannot be said to be better than this now; an unmeasured link stays unmeasured."""
-        known = self._mbps[sender][receiver]
-        if known is not None and mbps < known:
+        if self._known[sender][receiver] and mbps < self._mbps[sender][receiver]:
             self._mbps[sender][receiver] = mbps
 
     def read(self, sender: int) -> list[float]:
         """The estimates to all drones (0 where unmeasured, and to itself)."""
-        return [0.0 if v is None else v for v in self._mbps[sender]]
+        return self._mbps[sender].copy()

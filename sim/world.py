@@ -69,7 +69,8 @@ class World:
         self._rotor_w: list[list[float]] = rotor_w.tolist()
         self._flight = FlightSenses(motion, scenario.frame_s)
         recorder.unfold["states"] = self._unfold_states
-        self._busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
+        self.busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
+        """Share of a frame in which a drone's computer runs perception, when it senses: its compute delay."""
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
@@ -106,12 +107,13 @@ class World:
         airtime_s = list(self.air.airtime_s)
         self.airtime_share = [min(1.0, (a - b) / dt_s) for a, b in zip(airtime_s, self._airtime_s, strict=True)]
         self._airtime_s = airtime_s
-        self.batteries.step(dt_s, self._rotor_w[self._frame], [self.duty(a) for a in self.agents], self.airtime_share)
+        self.batteries.step(
+            dt_s,
+            self._rotor_w[self._frame],
+            [self.busy_sensing if a.sensed else 0.0 for a in self.agents],
+            self.airtime_share,
+        )
         self.ground_landed()
-
-    def duty(self, agent: Agent) -> float:
-        """Share of a frame in which the drone's computer runs perception: its compute delay, when it senses."""
-        return self._busy_sensing if agent.sensed else 0.0
 
     def ground_landed(self) -> None:
         """Take drones whose battery gave out off the plane and the air."""
@@ -178,19 +180,21 @@ class _OwnSenses:
 
     def __init__(self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> None:
         self._world, self._drone, self._count_boxes = world, drone, count_boxes
+        self._sensed = world._flight.at(0)[drone]
 
     def sense(self, frame: int) -> Sensed:
-        return self._world._flight.at(frame)[self._drone]
+        self._sensed = sensed = self._world._flight.at(frame)[self._drone]
+        return sensed
 
     def platform(self) -> Platform:
         """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
         world, i = self._world, self._drone
-        return Platform(world.batteries.soc[i], 1.0 - world.airtime_share[i], 1.0 - world.duty(world.agents[i]))
+        sensing = world.busy_sensing if world.agents[i].sensed else 0.0
+        return Platform(world.batteries.soc[i], 1.0 - world.airtime_share[i], 1.0 - sensing)
 
     def task(self) -> Task:
-        world = self._world
-        sensed = world._flight.at(world._frame)[self._drone]
-        return world.now.task(sensed.capture.position_m, sensed.footprint_radius_m)
+        sensed = self._sensed
+        return self._world.now.task(sensed.capture.position_m, sensed.footprint_radius_m)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:
