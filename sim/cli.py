@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fleet.motion import MotionError
 from perception.detectors import DETECTORS
@@ -22,6 +20,7 @@ from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
 from sim import cli_bench, cli_paper, cli_recording, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
+from sim.console import bars, err, out
 from sim.expect import check as check_expectations
 from sim.outcome import outcome
 from sim.sortie import VERSION, Observer, run_sortie
@@ -34,8 +33,6 @@ app = typer.Typer(
 )
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_recording.app, name="recording")
-out = Console()
-err = Console(stderr=True, highlight=False)
 
 USER_ERRORS = (ScenarioError, PolicyError, MotionError, InputError, rundir.RunError)
 """What a user can mend: one line and exit code 2, no traceback."""
@@ -87,7 +84,7 @@ def fly(
         from sim.playback import LiveViewer  # here: importing the viewer costs a third of a second
 
         observer = LiveViewer()
-    with _profiled(profile) as report, _progress() as bar:
+    with _profiled(profile) as report, bars() as bar:
         record = run_sortie(flown, None, seed, progress=bar(flown.name, flown.duration_s), observer=observer)
     path = out_dir or rundir.default_path(record)
 
@@ -115,9 +112,9 @@ def compare(
 ) -> None:
     """Fly a scenario under several policies, same seed and draws, and print them side by side."""
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
-    with _progress() as bar:
-        bars = {label: bar(label, s.duration_s) for label, s in flown}
-        rows = compare_policies(flown, seed, progress=lambda label, t_s: bars[label](t_s))
+    with bars() as bar:
+        each = {label: bar(label, s.duration_s) for label, s in flown}
+        rows = compare_policies(flown, seed, progress=lambda label, t_s: each[label](t_s))
     out.print(tables.comparison_table(rows))
     for line in tables.explanations(rows):
         out.print(line)
@@ -136,7 +133,7 @@ def check(
     loaded = [load(name, set_ or []) for name in names]
     failed = 0
     for flown in loaded:
-        with _progress() as bar:
+        with bars() as bar:
             record = run_sortie(flown, progress=bar(flown.name, flown.duration_s))
         verdicts = check_expectations(flown, record, outcome(record))
         failed += sum(not v.holds for v in verdicts)
@@ -242,19 +239,6 @@ def _write_json(path: Path, data: Any) -> None:
         partial.rename(path)
     except OSError as error:
         raise rundir.RunError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
-    """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
-
-        def add(label: str, total: float) -> Callable[[float], None]:
-            task = progress.add_task(label, total=round(total))
-            return lambda done: progress.update(task, completed=round(done))
-
-        yield add
 
 
 @contextmanager

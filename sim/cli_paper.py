@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ from rich.table import Table
 from perception.harness import report
 from perception.harness.rows import INSTRUMENTS, Row
 from perception.harness.verdict import Verdict
+from sim.console import out, stages
 from sim.rundir import RunError
 
 if TYPE_CHECKING:
@@ -58,7 +59,6 @@ def paper(
     from perception.harness import figures, rows
     from perception.harness.found import Asked
     from sim import paper as making
-    from sim.cli import _progress, out
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
     if chosen is None:
@@ -79,14 +79,7 @@ def paper(
             return
         making.ensure_writable(out_dir)
         other = [] if against is None else rows.read(against / making.TABLE)[0]
-        with _progress() as bar:
-            bars: dict[str, Callable[[float], None]] = {}
-
-            def progress(stage: str, done: int, of: int) -> None:
-                if stage not in bars:
-                    bars[stage] = bar(stage, of)
-                bars[stage](done)
-
+        with stages() as progress:
             result = making.make(job, work, progress)
     except ValueError as error:
         raise RunError(str(error)) from error

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from perception.outside.recorded import open_recording
+from sim.console import bars, out
 from sim.rundir import RunError
 
 app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")
-out = Console()
 
 RecordingArgument = Annotated[Path, typer.Argument(help="An npz file or a Zarr folder.")]
 
@@ -43,11 +42,10 @@ def evaluate(
     """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
     from perception.harness.condition import Condition
     from perception.outside.instrument import evaluate_recording
-    from sim.cli import _progress
 
     try:
         asked = None if conditions is None else [Condition.parse(label) for label in conditions.split()]
-        with _progress() as bar:
+        with bars() as bar:
             found = evaluate_recording(
                 path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None
             )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from sim.console import out, stages, user_errors
 from sim.rundir import RunError
 
 study = typer.Typer(
@@ -69,7 +68,6 @@ def train(
     from perception.training.recipe import Recipe
     from perception.training.train import train as train_detector
     from sim import tables
-    from sim.cli import out
     from sim.playback_training import TrainingLog
 
     half_extent_m = float(range_.value)
@@ -84,7 +82,7 @@ def train(
     )
     config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value)
     curves = TrainingLog(out_file.parent / "training.rrd", out_file.stem)
-    with _bars() as progress, _user_errors():
+    with stages() as progress, user_errors():
         result = train_detector(
             out_file,
             recipe,
@@ -115,12 +113,11 @@ def study_train(
     """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
     from perception.study.plan import read_plan
     from perception.study.run import SHIPPED, train_job
-    from sim.cli import out
 
     plan = read_plan()
-    with _user_errors():
+    with user_errors():
         for job in jobs or [v.job(s) for v, s in plan.jobs()]:
-            with _bars(f"{job}: ") as progress:
+            with stages(f"{job}: ") as progress:
                 result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
             if result is None:
                 out.print(f"[bold]{job}[/bold] has its weights")
@@ -140,10 +137,9 @@ def study_run(
     from perception.study.measure import Row, to_table
     from perception.study.plan import read_plan
     from perception.study.run import SHIPPED, measure
-    from sim.cli import out
 
     plan, rows = read_plan(), list[Row]()
-    with _user_errors(), _bars() as progress:
+    with user_errors(), stages() as progress:
         cores = workers or os.cpu_count() or 1
         for job, some in measure(
             plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, progress=progress
@@ -164,28 +160,3 @@ def _write_table(table: object, path: Path) -> None:
     part = path.with_name(path.name + ".part")
     pq.write_table(table, part)
     part.replace(path)
-
-
-@contextmanager
-def _user_errors() -> Iterator[None]:
-    """A file, tensor or field that is not as it must be is the user's to mend: one line, no traceback."""
-    try:
-        yield
-    except ValueError as error:
-        raise RunError(str(error)) from error
-
-
-@contextmanager
-def _bars(prefix: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar for every stage that reports."""
-    from sim.cli import _progress
-
-    with _progress() as bar:
-        bars: dict[str, Callable[[float], None]] = {}
-
-        def progress(stage: str, done: int, of: int) -> None:
-            if stage not in bars:
-                bars[stage] = bar(prefix + stage, of)
-            bars[stage](done)
-
-        yield progress
