@@ -148,6 +148,7 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", type=int, default=30, help="scenes of the test split, one frame each")
     parser.add_argument("--bench", type=Path, default=Path("runs/bench"))
     args = parser.parse_args()
-    nets = {net.config.fusion: net for net in map(load_weights, args.weights)}
+    files = [path for path in args.weights if path.name != "checkpoint.safetensors"]  # lies beside weights, is none
+    nets = {net.config.fusion: net for net in map(load_weights, files)}
     split = make_split(Benchmark(), "test", args.bench, scenes=args.scenes)
     sys.stdout.write(table(measure(nets, load_frames(split))))
