@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from perception.bench.difficulty import Difficulty
-from perception.bench.manifest import BenchmarkError, complaints, read
+from perception.bench.manifest import complaints, read
 from perception.geometry import Geometry
-from sim.rundir import RunError
+from sim.console import err, out, stages, user_errors
 
 app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
-out = Console()
-err = Console(stderr=True, highlight=False)
 
 
 class SplitName(StrEnum):
@@ -61,10 +55,10 @@ def make(
     from perception.bench.dataset import SIZES, Benchmark, make_split
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
-    with _told(), _bars() as bar:
+    with user_errors(), stages() as report:
         for name in dict.fromkeys(s.value for s in split) if split else SIZES:
             count = min(scenes or SIZES[name][0], SIZES[name][0])
-            make_split(bench, name, out_dir, scenes=count, workers=workers, progress=bar(f"{name} scenes"))
+            make_split(bench, name, out_dir, scenes=count, workers=workers, progress=partial(report, f"{name} scenes"))
     folder = bench.folder(out_dir)
     table = Table("split", "scenes", "fleet-frames", title=f"seed {seed}, {density.value}, ±{range_.value} m")
     for name, files in read(folder)["splits"].items():
@@ -82,7 +76,7 @@ def show(
     out_file: Annotated[Path | None, typer.Option("--out", help="The PNG; left out, beside the splits.")] = None,
 ) -> None:
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
-    with _told():
+    with user_errors():
         from perception.bench.dataset import SIZES, Benchmark
         from perception.bench.sheet import save, sheet
 
@@ -100,11 +94,11 @@ def show(
 @app.command()
 def verify(folder: FolderArgument) -> None:
     """Hold every file against the manifest; exit code 1 if one is missing or holds other data."""
-    with _told(), _bars() as bar:
+    with user_errors(), stages() as report:
         from perception.bench.dataset import Benchmark
 
         Benchmark.at(folder)
-        found = complaints(folder, bar("files"))
+        found = complaints(folder, partial(report, "files"))
     for line in found:
         err.print(f"[red]{line}[/red]", soft_wrap=True)
     if found:
@@ -127,9 +121,9 @@ def survey(
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
     table = Table("split", "style", "scenes", "cars a view", "seen alone", "by the fleet", "built", "height m", "lot m")
-    with _bars() as bar:
+    with stages() as report:
         for split in SIZES:
-            done = bar(f"{split} scenes")
+            done = partial(report, f"{split} scenes")
             rows = []
             for k in range(min(scenes, SIZES[split][0])):
                 rows.append(survey_scene(bench, split, k))
@@ -151,43 +145,14 @@ def difficulty(
     workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
 ) -> None:
     """Measure what each parameter of the difficulty does to AP; a run that was cut off goes on where it was."""
-    with _told(), _bars() as bar:
+    with user_errors(), stages() as report:
         from perception.bench.effects import measure, table, write_table
         from perception.detector import SHIPPED_WEIGHTS
 
         used = weights or SHIPPED_WEIGHTS
-        text = table(measure(used, store, scenes=scenes, workers=workers, progress=bar("scenes")), used, scenes)
+        text = table(
+            measure(used, store, scenes=scenes, workers=workers, progress=partial(report, "scenes")), used, scenes
+        )
         if readme is not None:
             write_table(readme, text)
     out.print(text, markup=False, soft_wrap=True)
-
-
-# --- helpers -------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    """What a user can mend as one line: the command's entry point prints it and leaves with code 2."""
-    try:
-        yield
-    except ImportError as error:
-        if error.name != "matplotlib":
-            raise
-        raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
-    except OSError as error:
-        raise RunError(f"{error.filename}: {error.strerror}") from error
-    except (BenchmarkError, ValueError, json.JSONDecodeError) as error:
-        raise RunError(str(error)) from error
-
-
-@contextmanager
-def _bars() -> Iterator[Callable[[str], Callable[[int, int], None]]]:
-    """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
-
-        def add(label: str) -> Callable[[int, int], None]:
-            task = progress.add_task(label, total=None)
-            return lambda done, of: progress.update(task, completed=done, total=of)
-
-        yield add

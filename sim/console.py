@@ -43,8 +43,14 @@ def stages(prefix: str = "") -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """A file, tensor or field that is not as it must be is the user's to mend: one line, no traceback."""
+    """A file, field or missing extra is the user's to mend: one line, no traceback."""
     try:
         yield
+    except ImportError as error:
+        if error.name != "matplotlib":
+            raise
+        raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
+    except OSError as error:
+        raise RunError(f"{error.filename}: {error.strerror}") from error
     except ValueError as error:
         raise RunError(str(error)) from error
