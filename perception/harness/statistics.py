@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import false_discovery_control
 
 from perception.ap import Matched, area, average_precision
 from scenarios.streams import stream
@@ -113,6 +112,8 @@ def p_value(draws: Floats) -> float:
 
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:
     """Adjusted p-values: below q, at most a part q of the differences called real are expected to be none."""
+    from scipy.stats import false_discovery_control  # here: it takes most of a second to import
+
     return [float(q) for q in false_discovery_control(p)] if len(p) else []
 
 
