@@ -1,0 +1,230 @@
+"""Fleet views to try a policy on: drawn from a seed, made smaller where one fails, kept as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from scenarios.streams import stream
+
+MAX_DRONES = 20
+GRID_BYTES = 64
+
+_SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
+_SPECIAL_GOODPUT_MBPS = (0.0, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
+_SPECIAL_AGE_PERIODS = (0.0, 1.0, 3.0, 3.1, 10.0, 10.1, 600.0)
+_PERIODS_S = (0.1, 0.2, 1.0)
+
+
+class ViewError(ValueError):
+    """A view's file is not one; the message names the field."""
+
+
+# --- drawing -------------------------------------------------------------------------------------
+
+
+def draw_view(seed: int, number: int) -> FleetView:
+    """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
+
+    Half of all numbers are drawn evenly, the other half from values where rules tend to change their mind.
+    """
+    rng = stream(seed, number, (), "verify.view")
+    n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
+    ego = int(rng.integers(n))
+    reach = float(rng.choice([1.0, 0.7]))
+    heard = [i for i in range(n) if i == ego or rng.random() < reach]
+    rng.shuffle(heard)
+    period_s = float(rng.choice(_PERIODS_S))
+    spread_m = float(rng.choice([0.0, 30.0, 100.0, 2000.0]))
+    descriptors = {i: _draw_descriptor(rng, i, n, spread_m) for i in heard}
+    age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
+    return FleetView(ego, period_s, descriptors, age_s)
+
+
+def draw_views(seed: int, count: int) -> Iterator[FleetView]:
+    """The first `count` views of a seed."""
+    return (draw_view(seed, number) for number in range(count))
+
+
+def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, spread_m: float) -> Descriptor:
+    x_m, y_m, vx_mps, vy_mps, yaw = rng.uniform(-1, 1, 5).tolist()
+    region = None
+    if rng.random() < 0.5:
+        away_m = 0.0 if rng.random() < 0.5 else 3000.0  # the region is here, or far from everyone
+        region = Disc(spread_m * x_m + away_m, spread_m * y_m, float(rng.choice([1.0, 32.0, 500.0])))
+    return Descriptor(
+        stamp_ns=int(rng.integers(0, 10**12)),
+        agent_id=agent_id,
+        position_m=(spread_m * x_m, spread_m * y_m, float(rng.uniform(0, 120))),
+        orientation_xyzw=(0.0, 0.0, math.sin(yaw), math.cos(yaw)),
+        velocity_mps=(20 * vx_mps, 20 * vy_mps, 0.0),
+        footprint_radius_m=float(rng.choice([0.0, 20.0, 42.0, 100.0])),
+        battery_soc=_mixed(rng, 0.0, 1.0, _SPECIAL_SOC),
+        cpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
+        gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
+        peer_goodput_mbps=tuple(_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(drones - 1)),
+        coverage_grid=rng.bytes(GRID_BYTES) if rng.random() < 0.7 else bytes(GRID_BYTES),
+        novelty_flags=int(rng.integers(4)),
+        task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
+        region=region,
+        priority_target_ids=tuple(rng.integers(0, 1000, int(rng.choice([0, 0, 1, 5]))).tolist()),
+    )
+
+
+def _mixed(rng: np.random.Generator, low: float, high: float, special: tuple[float, ...]) -> float:
+    return float(rng.uniform(low, high)) if rng.random() < 0.5 else float(rng.choice(special))
+
+
+# --- making smaller ------------------------------------------------------------------------------
+
+_PLAIN: dict[str, Any] = {
+    "stamp_ns": 0,
+    "orientation_xyzw": (0.0, 0.0, 0.0, 1.0),
+    "velocity_mps": (0.0, 0.0, 0.0),
+    "cpu_headroom": 1.0,
+    "gpu_headroom": 1.0,
+    "coverage_grid": bytes(GRID_BYTES),
+    "novelty_flags": 0,
+    "region": None,
+    "priority_target_ids": (),
+    "task_phase": TaskPhase.SEARCH,
+    "battery_soc": 1.0,
+    "footprint_radius_m": 42.0,
+    "position_m": (0.0, 0.0, 60.0),
+}
+
+
+def smaller(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
+    """A view that still fails, with as few drones and as plain fields as one pass over them finds.
+
+    Args:
+        view: a view that fails.
+        fails: whether a view fails; asked some twenty times a drone.
+    """
+
+    def kept(candidate: FleetView) -> bool:
+        nonlocal view
+        if candidate != view and fails(candidate):
+            view = candidate
+            return True
+        return False
+
+    for peer in view.peers:
+        kept(view._replace(descriptors=_without(view.descriptors, peer), age_s=_without(view.age_s, peer)))
+    for i in list(view.descriptors):
+        kept(view._replace(age_s={**view.age_s, i: 0.0}))
+        for field, plain in _PLAIN.items():
+            kept(view._replace(descriptors={**view.descriptors, i: view.descriptors[i]._replace(**{field: plain})}))
+        flat = (100.0,) * len(view.descriptors[i].peer_goodput_mbps)
+        kept(view._replace(descriptors={**view.descriptors, i: view.descriptors[i]._replace(peer_goodput_mbps=flat)}))
+    return view
+
+
+def _without(mapping: Mapping[int, Any], key: int) -> dict[int, Any]:
+    return {k: v for k, v in mapping.items() if k != key}
+
+
+# --- JSON ----------------------------------------------------------------------------------------
+
+
+def to_json(view: FleetView) -> str:
+    """The view as JSON, one drone a line; every number comes back exactly."""
+    drones = []
+    for i, d in view.descriptors.items():
+        fields = d._asdict() | {
+            "coverage_grid": d.coverage_grid.hex(),
+            "task_phase": TaskPhase(d.task_phase).name.lower(),
+            "region": None if d.region is None else list(d.region),
+        }
+        drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
+    inner = ",\n  ".join(drones)
+    return (
+        f'{{"ego": {view.ego}, "period_s": {view.period_s!r}, "drones": ['
+        + (f"\n  {inner}\n" if inner else "")
+        + "]}\n"
+    )
+
+
+def from_json(text: str) -> FleetView:
+    """The view that `to_json` wrote.
+
+    Raises:
+        ViewError: naming the field that is missing or wrong.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ViewError(f"not JSON: {error}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("drones"), list):
+        raise ViewError("a view is an object with ego, period_s and a list of drones")
+    descriptors: dict[int, Descriptor] = {}
+    age_s: dict[int, float] = {}
+    for k, entry in enumerate(data["drones"]):
+        if not isinstance(entry, dict):
+            raise ViewError(f"drones[{k}] must be an object")
+        descriptor = _descriptor(entry, f"drones[{k}]")
+        if descriptor.agent_id in descriptors:
+            raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id} for the second time")
+        descriptors[descriptor.agent_id] = descriptor
+        age_s[descriptor.agent_id] = _number(entry, "age_s", f"drones[{k}]", 0.0)
+    ego = _number(data, "ego", "view", 0, 255)
+    period_s = _number(data, "period_s", "view", 0.0)
+    if period_s == 0:
+        raise ViewError("view.period_s is 0, must be above 0")
+    return FleetView(int(ego), float(period_s), descriptors, age_s)
+
+
+def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
+    try:
+        phase = TaskPhase[str(entry.get("task_phase")).upper()]
+    except KeyError as error:
+        known = ", ".join(p.name.lower() for p in TaskPhase)
+        raise ViewError(f"{where}.task_phase is {entry.get('task_phase')!r}, must be one of {known}") from error
+    try:
+        grid = bytes.fromhex(entry.get("coverage_grid", ""))
+    except (TypeError, ValueError) as error:
+        raise ViewError(f"{where}.coverage_grid must be hexadecimal") from error
+    if len(grid) != GRID_BYTES:
+        raise ViewError(f"{where}.coverage_grid has {len(grid)} bytes, must have {GRID_BYTES}")
+    region = entry.get("region")
+    x_m, y_m, z_m = _numbers(entry, "position_m", where, 3)
+    vx_mps, vy_mps, vz_mps = _numbers(entry, "velocity_mps", where, 3)
+    qx, qy, qz, qw = _numbers(entry, "orientation_xyzw", where, 4)
+    return Descriptor(
+        stamp_ns=int(_number(entry, "stamp_ns", where)),
+        agent_id=int(_number(entry, "agent_id", where, 0, 255)),
+        position_m=(x_m, y_m, z_m),
+        orientation_xyzw=(qx, qy, qz, qw),
+        velocity_mps=(vx_mps, vy_mps, vz_mps),
+        footprint_radius_m=_number(entry, "footprint_radius_m", where, 0.0),
+        battery_soc=_number(entry, "battery_soc", where, 0.0, 1.0),
+        cpu_headroom=_number(entry, "cpu_headroom", where, 0.0, 1.0),
+        gpu_headroom=_number(entry, "gpu_headroom", where, 0.0, 1.0),
+        peer_goodput_mbps=_numbers(entry, "peer_goodput_mbps", where),
+        coverage_grid=grid,
+        novelty_flags=int(_number(entry, "novelty_flags", where, 0, 255)),
+        task_phase=phase,
+        region=None if region is None else Disc(*_numbers(entry, "region", where, 3)),
+        priority_target_ids=tuple(int(t) for t in _numbers(entry, "priority_target_ids", where)),
+    )
+
+
+def _number(entry: Mapping[str, Any], name: str, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+    value = entry.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ViewError(f"{where}.{name} is {value!r}, must be a number")
+    if not low <= value <= high:
+        raise ViewError(f"{where}.{name} is {value!r}, must be in [{low:g}, {high:g}]")
+    return value
+
+
+def _numbers(entry: Mapping[str, Any], name: str, where: str, length: int | None = None) -> tuple[float, ...]:
+    values = entry.get(name)
+    if not isinstance(values, list) or (length is not None and len(values) != length):
+        raise ViewError(f"{where}.{name} is {values!r}, must be a list" + (f" of {length} numbers" if length else ""))
+    return tuple(_number({name: v}, name, where) for v in values)

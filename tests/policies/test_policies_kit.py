@@ -1,0 +1,237 @@
+"""The conformance kit catches what it is for: one planted fault a rule, each with a view that shows it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import pytest
+from policies_examples import fleet_of
+
+from policies import conformance
+from policies.conformance import RULES, Check, conform, failing
+from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
+from policies.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
+from policies.worked import worked
+
+FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
+calls = itertools.count()
+
+
+def share(view: FleetView, **fields: object) -> list[Directive]:
+    return [Directive(view.ego, p, FEATURES, 0.5, None, 5.0, reason="shares")._replace(**fields) for p in view.peers]
+
+
+def mutates(view: FleetView) -> list[Directive]:
+    directives = share(view)
+    view.age_s.pop(view.ego, None)  # type: ignore[attr-defined]
+    return directives
+
+
+def depends_on_order(view: FleetView) -> list[Directive]:
+    last = list(view.descriptors)[-1:]
+    return [d if d.destination in last else d._replace(rate_hz=1.0) for d in share(view)]
+
+
+def rises_with_age(view: FleetView) -> list[Directive]:
+    return [d._replace(rate_hz=min(30.0, 1.0 + view.age_s[d.destination])) for d in share(view)]
+
+
+def rises_for_another(view: FleetView) -> list[Directive]:
+    """Gives the features to the peer heard last: who ages hands them to somebody else."""
+    youngest = min(view.peers, key=lambda p: (view.age_s[p], p), default=None)
+    return [d if d.destination == youngest else d._replace(representation=DETECTIONS, rho=0.0) for d in share(view)]
+
+
+def overspends(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    return share(view, rho=min(1.0, 1.5 * rho))
+
+
+def remembers(view: FleetView) -> list[Directive]:
+    return share(view, rate_hz=float(next(calls) % 30))
+
+
+def lottery(view: FleetView) -> list[Directive]:
+    return share(view, rate_hz=random.uniform(0, 30))
+
+
+def too_fast(view: FleetView) -> list[Directive]:
+    return share(view, rate_hz=31.0)
+
+
+def not_a_number(view: FleetView) -> list[Directive]:
+    return share(view, rho=math.nan)
+
+
+def forgets_a_link(view: FleetView) -> list[Directive]:
+    return share(view)[:1]
+
+
+def silent(view: FleetView) -> list[Directive]:
+    return share(view, reason="")
+
+
+def needs_a_peer(view: FleetView) -> list[Directive]:
+    max(view.peers)
+    return share(view)
+
+
+def needs_youth(view: FleetView) -> list[Directive]:
+    if view.peers and min(view.age_s.values()) > 19 * view.period_s:
+        raise RuntimeError("nobody there")
+    return share(view)
+
+
+def gives_a_generator(view: FleetView) -> Sequence[Directive]:
+    return (d for d in share(view))  # type: ignore[return-value]
+
+
+def dawdles(view: FleetView) -> list[Directive]:
+    end_ns = time.thread_time_ns() + 300_000
+    while len(view.descriptors) == 20 and time.thread_time_ns() < end_ns:
+        pass
+    return share(view)
+
+
+PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
+    (mutates, "input unchanged", "the policy changed its input: age_s"),
+    (depends_on_order, "order of drones irrelevant", "get other directives"),
+    (rises_with_age, "age-monotone", "rate_hz rises"),
+    (rises_for_another, "age-monotone", "representation rises from 2 to 3"),
+    (overspends, "budget kept", "rho=0.02: its links sum to 0.03 maps, 0.02 of full sharing is 0.02"),
+    (remembers, "same in, same out", "two calls with the same view differ"),
+    (lottery, "same in, same out", "two calls with the same view differ"),
+    (too_fast, "bounds kept", "rate_hz is 31.0, must be in [0, 30]"),
+    (not_a_number, "bounds kept", "rho is nan, must be in [0, 1]"),
+    (forgets_a_link, "one directive a link", "must be for each of"),
+    (silent, "says why", "no reason given for"),
+    (needs_a_peer, "one drone and empty views", "raises ValueError"),
+    (needs_youth, "stale views", "every descriptor 20 periods old: RuntimeError: nobody there"),
+    (gives_a_generator, "answers", "returns generator, must be a sequence of directives"),
+]
+
+
+def verdicts(policy: Callable[..., Sequence[Directive]]) -> dict[str, Check]:
+    return {c.name: c for c in conform(policy, count=25)}
+
+
+@pytest.mark.parametrize(("policy", "rule", "complaint"), PLANTED, ids=lambda x: getattr(x, "__name__", ""))
+def test_a_planted_fault_is_caught_and_its_view_shows_it(
+    policy: Callable[[FleetView], Sequence[Directive]], rule: str, complaint: str
+) -> None:
+    check = verdicts(policy)[rule]
+    assert not check.holds
+    assert complaint in check.what
+    assert check.counterexample is not None
+    again = from_json(to_json(check.counterexample))
+    assert RULES[rule](policy, again) is not None
+    assert len(again.descriptors) <= 3  # as small as its fault allows
+
+
+def test_a_slow_policy_is_told_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conformance, "DECISION_LIMIT_S", 0.0002)
+    check = verdicts(dawdles)["time per decision"]
+    assert not check.holds
+    assert "at 20 drones, must be at most 0.2 ms" in check.what
+
+
+def test_a_sound_policy_passes_with_every_rule_named_once() -> None:
+    checks = conform(share, count=25)
+    assert failing(checks) == []
+    assert [c.name for c in checks] == [*RULES, "time per decision"]
+
+
+def test_a_policy_that_always_raises_holds_no_rule() -> None:
+    def broken(view: FleetView) -> list[Directive]:
+        raise KeyError("battery")
+
+    checks = conform(broken, count=5)
+    assert [c.name for c in checks if c.holds] == ["input unchanged"]
+    assert checks[0].what == "raises KeyError: 'battery'"
+
+
+def test_views_of_the_users_choice() -> None:
+    only = fleet_of(5)._replace(ego=4)
+    check = {c.name: c for c in conform(too_fast, [only])}["bounds kept"]
+    assert check.counterexample is not None
+    assert check.counterexample.ego == 4
+
+
+def test_drawn_views_repeat_and_cover_what_a_plane_may_hand_over() -> None:
+    views = list(draw_views(0, 600))
+    assert views == list(draw_views(0, 600))
+    assert views[7] == draw_view(0, 7) != draw_view(1, 7)
+    drones: list[tuple[FleetView, Descriptor]] = [(v, d) for v in views for d in v.descriptors.values()]
+    assert {len(v.descriptors) for v in views} == set(range(1, 21))
+    assert {d.task_phase for _, d in drones} == set(TaskPhase)
+    assert any(len(d.peer_goodput_mbps) + 1 > len(v.descriptors) for v, d in drones), "peers never heard"
+    assert any(v.age_s[d.agent_id] > 100 * v.period_s for v, d in drones), "stale"
+    assert any(v.age_s[d.agent_id] == 0 for v, d in drones), "fresh"
+    assert {0.0, 0.3, 0.6, 1.0} <= {d.battery_soc for _, d in drones}
+    assert {0.0, 5.0, 1e5} <= {g for _, d in drones for g in d.peer_goodput_mbps}
+    assert any(d.region is None for _, d in drones)
+    assert any(d.region and math.dist(d.region[:2], d.position_m[:2]) > 2000 for _, d in drones), "region far off"
+    assert any(d.region and math.dist(d.region[:2], d.position_m[:2]) < d.region.radius_m for _, d in drones)
+    assert any(d.priority_target_ids for _, d in drones)
+    assert any(list(v.descriptors) != sorted(v.descriptors) for v in views), "any order"
+
+
+@pytest.mark.parametrize("number", range(30))
+def test_a_view_survives_json_exactly(number: int) -> None:
+    view = draw_view(3, number)
+    again = from_json(to_json(view))
+    assert again == view
+    assert list(again.descriptors) == list(view.descriptors)
+
+
+def test_an_empty_view_survives_json() -> None:
+    assert from_json(to_json(FleetView(2, 0.1, {}, {}))) == FleetView(2, 0.1, {}, {})
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("period_s",), 0, "view.period_s is 0, must be above 0"),
+        (("ego",), "x", "view.ego is 'x', must be a number"),
+        (("drones", 0, "battery_soc"), 1.5, "drones[0].battery_soc is 1.5, must be in [0, 1]"),
+        (("drones", 0, "task_phase"), "idle", "drones[0].task_phase is 'idle', must be one of transit, search"),
+        (("drones", 0, "coverage_grid"), "00", "drones[0].coverage_grid has 1 bytes, must have 64"),
+        (("drones", 0, "coverage_grid"), "zz", "drones[0].coverage_grid must be hexadecimal"),
+        (("drones", 0, "position_m"), [1, 2], "drones[0].position_m is [1, 2], must be a list of 3 numbers"),
+        (("drones", 1, "agent_id"), 0, "drones[1].agent_id is 0 for the second time"),
+        (("drones", 0, "age_s"), -1, "drones[0].age_s is -1, must be in [0, inf]"),
+        (("drones", 0), 3, "drones[0] must be an object"),
+        (("drones",), 3, "a view is an object with ego, period_s and a list of drones"),
+    ],
+)
+def test_a_broken_view_names_its_field(path: tuple[str | int, ...], value: object, message: str) -> None:
+    data = json.loads(to_json(fleet_of(2)))
+    inner = data
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(ViewError) as caught:
+        from_json(json.dumps(data))
+    assert message in str(caught.value)
+
+
+def test_smaller_keeps_failing_and_drops_what_does_not_matter() -> None:
+    def fails(view: FleetView) -> bool:
+        return 3 in view.descriptors and view.descriptors[3].battery_soc < 0.3
+
+    view = next(v for v in draw_views(5, 1000) if fails(v) and v.ego != 3 and len(v.descriptors) > 6)
+    small = smaller(view, fails)
+    assert fails(small)
+    assert set(small.descriptors) == {3, view.ego}
+    assert small.descriptors[view.ego].battery_soc == 1.0
+    assert small.descriptors[3].battery_soc == view.descriptors[3].battery_soc
+
+
+def test_a_check_is_a_value() -> None:
+    check = conform(worked, count=1)[0]
+    assert replace(check, what="x") != check
