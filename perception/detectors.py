@@ -5,10 +5,10 @@ Free of torch: a constructor imports what it needs when it is called, so that so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
@@ -31,6 +31,20 @@ class Detector(Protocol):
 
     def camera_views(self, capture: Capture) -> NDArray[Any]:
         """The camera images [cameras, height, width, 3]; ValueError where there are none."""
+
+
+@runtime_checkable
+class DetectsMany(Protocol):
+    """A detector that need not be asked at once: a sortie gathers its moments and asks for many together."""
+
+    calibration: str
+    """Which fit it is of, for outcomes."""
+
+    def detect_many(self, moments: Sequence[Sequence[tuple[Capture, Sequence[Share]]]]) -> Iterable[Boxes]:
+        """As `detect`, moment after moment, job after job."""
+
+    def truth_many(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Iterable[Boxes]:
+        """As `truth`, ego by ego."""
 
 
 Constructor = Callable[[SceneModel, Perception, int, int], Detector]
@@ -69,10 +83,20 @@ def _recorded(scene: SceneModel, config: Perception, seed: int, replication: int
     return RecordedDetector(config)
 
 
+def _surrogate(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+    from perception.surrogate.detector import SurrogateDetector
+
+    weights = None if config.weights is None else Path(config.weights)
+    return SurrogateDetector(scene, config, seed, weights, replication)
+
+
 DETECTORS: dict[str, Kind] = {
     "torch": Kind("the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch),
     "recorded": Kind(
         "what another model saw, from perception.recording; its features may be fused by its own code", _recorded
+    ),
+    "surrogate": Kind(
+        "a fast model fitted to the torch detector by `sortie calibrate`; nothing is rendered", _surrogate
     ),
     "none": Kind("traffic alone; boxes are counted from the scene", None),
 }

@@ -233,13 +233,16 @@ class Scene(Section):
 
 
 class Perception(Section):
-    detector: Literal["torch", "recorded", "none"] = Field(
-        "torch", description="The detector: the network, a recording of another model, or none: the traffic alone."
+    detector: Literal["torch", "surrogate", "recorded", "none"] = Field(
+        "torch",
+        description="The detector: the network, its fast surrogate, a recording of another model, or none: the traffic alone.",
     )
     fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "where2comm"] = Field(
         "disconet", description="How what peers sent is fused; weights belong to a fusion, none and late take any."
     )
-    weights: str | None = Field(None, description="A safetensors file; left out, the shipped weights of the fusion.")
+    weights: str | None = Field(
+        None, description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one."
+    )
     recording: str | None = Field(
         None, description="What the recorded detector saw: an npz file or a Zarr folder (perception/outside)."
     )

@@ -12,13 +12,14 @@ from typing import Annotated, Any
 import typer
 
 from fleet.motion import MotionError
+from fleet.wire import DescriptorTooLarge
 from perception.detectors import DETECTORS
 from perception.errors import InputError
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
-from sim import cli_bench, cli_paper, cli_recording, cli_train, rundir, tables
+from sim import cli_bench, cli_calibrate, cli_paper, cli_recording, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
 from sim.expect import check as check_expectations
@@ -34,7 +35,7 @@ app = typer.Typer(
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_recording.app, name="recording")
 
-USER_ERRORS = (ScenarioError, PolicyError, MotionError, InputError, rundir.RunError)
+USER_ERRORS = (ScenarioError, PolicyError, MotionError, DescriptorTooLarge, InputError, rundir.RunError)
 """What a user can mend: one line and exit code 2, no traceback."""
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
@@ -183,6 +184,7 @@ def list_(
 
 
 app.command()(cli_train.train)
+app.command()(cli_calibrate.calibrate)
 app.add_typer(cli_train.study, name="study")
 app.command()(cli_paper.paper)
 

@@ -43,6 +43,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "ap50": {
             **accuracy(record),
             "detector": scenario.perception.detector,
+            "calibration": record.calibration,
             "sample_rate_hz": scenario.perception.sample_rate_hz,
             "scored_fusions": tables["fusions"].num_rows,
         },

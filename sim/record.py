@@ -85,6 +85,8 @@ class SortieRecord:
     tables: Mapping[str, pa.Table]
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""
+    calibration: str | None = None
+    """Which fit a surrogate detector is of; None with any other."""
     wall: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
 

@@ -72,6 +72,7 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
             "seed": record.seed,
             "replication": record.replication,
             "version": record.version,
+            "calibration": record.calibration,
             "totals": dict(record.totals),
             "wall": dict(record.wall),
         }

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any, Protocol
 
+import numpy as np
 import simpy
 
 from fleet.agent import Agent, Received
+from perception.detectors import DetectsMany
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Scenario
 from sim.record import Recorder
@@ -34,8 +36,15 @@ def as_share(received: Received) -> Share:
     return Share(received.capture, payload.representation.name.lower(), payload.rho, disc, payload.fusion_weight)
 
 
+Moment = tuple[float, list[tuple[Capture, list[Share]]]]
+"""When, and each ego with what it holds."""
+
+
 class Scorer:
-    """Runs the detector over the fleet at the scored frames' fusion times."""
+    """Runs the detector over the fleet at the scored frames' fusion times.
+
+    A detector that takes many moments together is asked when `flush` is called, any other at the moment itself.
+    """
 
     def __init__(
         self,
@@ -47,6 +56,8 @@ class Scorer:
     ) -> None:
         self._env, self._scenario, self._detector = env, scenario, detector
         self._agents, self._recorder = agents, recorder
+        self._waiting: list[Moment] = []
+        recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
 
     def start(self) -> None:
         """Begin the process; call once."""
@@ -69,16 +80,32 @@ class Scorer:
             for a, received in zip(egos, held, strict=True)
             if a.latest is not None
         ]
-        rows = self._recorder.rows
-        for (ego, _), received, boxes in zip(jobs, held, self._detector.detect(jobs), strict=True):
-            truth = self._detector.truth(now_s, ego)
-            rows["detections"].extend((now_s, ego.drone, *row) for row in _rows(boxes, with_score=True))
-            rows["truths"].extend((now_s, ego.drone, *row) for row in _rows(truth, with_score=False))
+        self._waiting.append((now_s, jobs))
+        if not isinstance(self._detector, DetectsMany):
+            self.flush()
+
+    def flush(self) -> None:
+        """Write down what the moments since the last call come to."""
+        waiting, self._waiting = self._waiting, []
+        asked = [(t_s, ego, shares) for t_s, jobs in waiting for ego, shares in jobs]
+        if not asked:
+            return
+        rows, detector = self._recorder.rows, self._detector
+        found: Iterable[Boxes]
+        truths: Iterable[Boxes]
+        if isinstance(detector, DetectsMany):
+            found = detector.detect_many([jobs for _, jobs in waiting])
+            truths = detector.truth_many([t_s for t_s, _, _ in asked], [ego for _, ego, _ in asked])
+        else:
+            found = (boxes for _, jobs in waiting for boxes in detector.detect(jobs))
+            truths = (detector.truth(t_s, ego) for t_s, ego, _ in asked)
+        for (now_s, ego, shares), boxes, truth in zip(asked, found, truths, strict=True):
+            rows["detections"].append((now_s, ego.drone, boxes))
+            rows["truths"].append((now_s, ego.drone, truth))
             rows["fusions"].append(
                 (
-                    now_s, ego.drone, [r.capture.drone for r in received],
-                    [r.payload.representation.name.lower() for r in received],
-                    [now_s - r.capture.t_s for r in received], len(boxes), len(truth),
+                    now_s, ego.drone, [s.capture.drone for s in shares], [s.representation for s in shares],
+                    [now_s - s.capture.t_s for s in shares], len(boxes), len(truth),
                 )
             )  # fmt: skip
 
@@ -88,8 +115,13 @@ class Scorer:
         return [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
 
 
-def _rows(boxes: Boxes, *, with_score: bool) -> list[tuple[float, ...]]:
-    columns = [boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad]
-    if with_score:
-        columns.append(boxes.score)
-    return list(zip(*(c.tolist() for c in columns), strict=True))
+def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    """A fusion's boxes stand in one row."""
+    t_s, drones, several = zip(*rows, strict=True)
+    boxes, counts = Boxes.join(several), [len(b) for b in several]
+    values = boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad, boxes.score
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), *(v.astype(np.float64) for v in values)]
+
+
+def _unfold_truths(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    return _unfold_detections(rows)[:-1]

@@ -17,7 +17,7 @@ from fleet.agent import Agent, PlaneRules
 from fleet.auth import Sealer
 from fleet.battery import FleetBatteries
 from fleet.motion import fly
-from perception.detectors import make_detector
+from perception.detectors import DetectsMany, make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
@@ -127,10 +127,14 @@ def run_sortie(
     ]
     world.agents = ether.agents = agents
 
+    scorer = None if detector is None else Scorer(env, scenario, detector, agents, recorder)
+
     def each_second(t_s: float) -> None:
         if progress is not None:
             progress(t_s)
         if observer is not None:
+            if scorer is not None:
+                scorer.flush()
             observer.second(t_s, recorder.take_new())
 
     world.on_second = each_second
@@ -140,8 +144,8 @@ def run_sortie(
     world.start()
     for agent in agents:
         agent.start()
-    if detector is not None:
-        Scorer(env, scenario, detector, agents, recorder).start()
+    if scorer is not None:
+        scorer.start()
 
     env.run(until=scenario.duration_s)
     world.drain()
@@ -149,6 +153,8 @@ def run_sortie(
     recorder.rows["energy"].extend(
         (i, cause, joules) for cause, per_drone in batteries.energy_j.items() for i, joules in enumerate(per_drone)
     )
+    if scorer is not None:
+        scorer.flush()
     each_second(env.now)
     return SortieRecord(
         scenario=scenario,
@@ -158,6 +164,7 @@ def run_sortie(
         version=VERSION,
         tables=recorder.tables(),
         totals={**notes.totals(), **_air_totals(air)},
+        calibration=detector.calibration if isinstance(detector, DetectsMany) else None,
         wall={"wall_s": time.perf_counter() - begin_s, **notes.policy_eval_us()},
     )
 

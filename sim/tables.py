@@ -41,7 +41,8 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table.add_column()
     ap, data = result["ap50"], result["bytes"]
     if ap["detector"] != "none":
-        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions"
+        model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else ""
+        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{model}"
         table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
         for phase in result["phases"]:
             seen = phase["ap50"]

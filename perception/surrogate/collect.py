@@ -1,0 +1,108 @@
+"""The torch detector's own runs: what it found for every job of a scene, one npz file a scene, kept where it exists."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from perception.detector import TorchDetector
+from perception.scene import SceneModel
+from perception.surrogate.plan import Job, Split, draw_scene, moment, scene_model, scene_seed
+from perception.types import Boxes, Capture
+from scenarios.schema import Perception
+
+FLOOR = 0.02
+"""Boxes are kept down to this score: what the surrogate knows of weaker ones is that they are."""
+
+
+class Probe(TorchDetector):
+    """The detector, asked job by job under that job's rules, and for the ranks of its cells."""
+
+    def __init__(self, scene: SceneModel, seed: int, weights: Path | None) -> None:
+        super().__init__(scene, Perception(score_threshold=FLOOR), seed, weights)
+
+    def ask(self, job: Job) -> Boxes:
+        """Its boxes, best first."""
+        self._config = Perception(score_threshold=FLOOR, unsent_cells=job.unsent, cells_by=job.cells_by)
+        return self.detect([(job.ego, job.shares)])[0]
+
+    def ranks(self, capture: Capture) -> NDArray[np.float32]:
+        """What ranks its cells, [2, 64, 64]: the logit of their confidence, and their features' norm."""
+        self._encode([capture])
+        with torch.inference_mode():
+            confidence = F.max_pool2d(self._head_alone(capture)[:1], 2)[0]
+            norm = self._kept[capture].features.norm(dim=0)
+        return torch.stack([confidence, norm]).numpy()
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One scene's runs.
+
+    `jobs` and the `boxes` of each; `ranks` of every capture in them, [2, 64, 64].
+    """
+
+    split: Split
+    scene: int
+    """Its index in the split."""
+    jobs: list[Job]
+    boxes: list[Boxes]
+    ranks: dict[Capture, NDArray[np.float32]]
+
+
+def captures_of(jobs: Sequence[Job]) -> list[Capture]:
+    """Every capture in the jobs, once, in order."""
+    return list(dict.fromkeys(c for job in jobs for c in (job.ego, *(s.capture for s in job.shares))))
+
+
+def collect(folder: Path, seed: int, split: Split, scene: int, moments: int, weights: Path | None, key: str) -> Path:
+    """Ask about `moments` moments of a scene and keep the answers, unless they are there already.
+
+    Args:
+        key: names the weights; answers of other weights have other files.
+    """
+    path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{moments}.npz"
+    if path.exists():
+        return path
+    model = scene_model(draw_scene(seed, split, scene))
+    probe = Probe(model, scene_seed(seed, split, scene), weights)
+    boxes: list[Boxes] = []
+    ranks: list[NDArray[np.float32]] = []
+    for m in range(moments):
+        jobs = moment(seed, split, scene, m).jobs
+        boxes += [probe.ask(job) for job in jobs]
+        ranks += [probe.ranks(c) for c in captures_of(jobs)]
+    folder.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+    joined = Boxes.join(boxes)
+    np.savez(
+        part,
+        of=np.array([seed, scene, moments]),
+        count=np.array([len(b) for b in boxes]),
+        boxes=np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
+        ranks=np.stack(ranks),
+    )
+    part.replace(path)
+    return path
+
+
+def read(path: Path, split: Split) -> Asked:
+    """The answers in a file, with the jobs drawn again."""
+    with np.load(path, allow_pickle=False) as file:
+        seed, scene, moments = (int(v) for v in file["of"])
+        count, table, ranks = file["count"], file["boxes"], file["ranks"]
+    asked = [moment(seed, split, scene, m).jobs for m in range(moments)]
+    jobs = [job for each in asked for job in each]
+    captures = [c for each in asked for c in captures_of(each)]
+    if len(jobs) != len(count) or len(captures) != len(ranks):
+        raise ValueError(f"{path}: holds {len(count)} answers, the plan has {len(jobs)} jobs; remove it")
+    parts = np.split(table, np.cumsum(count)[:-1])
+    boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
+    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))

@@ -1,0 +1,225 @@
+"""The surrogate as a sortie uses it: the torch detector's interface, nothing rendered, many moments at once. Free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.ap import suppress
+from perception.geometry import FULL
+from perception.scene import SceneModel
+from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
+from perception.surrogate.features import Eyes, Fleet, Looks, axes, off_axes, turned
+from perception.surrogate.luck import Drawn, Luck
+from perception.surrogate.model import SHIPPED, Parameters, load, rank_covariates
+from perception.town import Floats
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception
+
+Job = tuple[Capture, Sequence[Share]]
+LATE = ("detections", "tracks")
+NMS_IOU, MAX_TRACKS = 0.15, 12
+BATCH = 400
+"""Jobs worked out together; memory grows with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Boxes of many jobs: those of job k are rows `first[k]` to `first[k + 1]`, best first."""
+
+    first: NDArray[np.int64]
+    boxes: Boxes
+
+    def __iter__(self) -> Iterator[Boxes]:
+        for a, b in zip(self.first[:-1].tolist(), self.first[1:].tolist(), strict=True):
+            yield self.boxes.take(slice(a, b))  # type: ignore[arg-type]
+
+
+class SurrogateDetector:
+    """The fitted model over one scene.
+
+    Args:
+        scene: what there is to see.
+        config: the scenario's `perception` section.
+        seed, replication: key its draws. A car's luck at a drone and a moment does not depend on what was sent, so
+            that policies flown on one seed meet the same luck.
+        weights: a calibration's file; None takes the shipped one.
+
+    Raises:
+        ValueError: a calibration that is missing or broken, or of another fusion than `perception.fusion`.
+    """
+
+    def __init__(
+        self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
+    ) -> None:
+        path = SHIPPED if weights is None else weights
+        self._set(scene, config, load(path), seed, replication, str(path))
+
+    @classmethod
+    def of(
+        cls, scene: SceneModel, config: Perception, parameters: Parameters, seed: int, replication: int = 0
+    ) -> SurrogateDetector:
+        """The same from parameters in memory."""
+        made = cls.__new__(cls)
+        made._set(scene, config, parameters, seed, replication, "the calibration")
+        return made
+
+    def _set(
+        self, scene: SceneModel, config: Perception, parameters: Parameters, seed: int, replication: int, name: str
+    ) -> None:
+        fitted = str(parameters.card["fusion"])
+        if config.fusion not in (fitted, "none"):
+            raise ValueError(
+                f"{name}: calibrated for fusion {fitted!r}, perception.fusion is {config.fusion!r}, must be that or 'none'"
+            )
+        self.parameters, self.calibration = parameters, parameters.id
+        self._scene, self._config = scene, config
+        self._eyes = Eyes(scene)
+        self._luck = Luck(seed, replication, self._eyes.traffic.count, parameters.alike)
+
+    def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
+        """Each ego's boxes from its own look and what it was sent, ENU, best first."""
+        return list(self.detect_many([jobs]))
+
+    def detect_many(self, moments: Sequence[Sequence[Job]]) -> Found:
+        """The same for many moments at once, job after job; a moment's jobs are those of one instant."""
+        jobs = [
+            (ego, shares if self._config.fusion != "none" else (), {e.drone: e for e, _ in moment})
+            for moment in moments
+            for ego, shares in moment
+        ]
+        parts = [self._detect(jobs[a : a + BATCH]) for a in range(0, len(jobs), BATCH)]
+        return _joined(parts)
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        """The cars inside the ego's square at `t_s`, about its true position and heading at capture."""
+        return self.truth_many([t_s], [ego]).boxes
+
+    def truth_many(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Found:
+        """The same for many moments at once."""
+        parts = [self._truth(t_s[a : a + BATCH], egos[a : a + BATCH]) for a in range(0, len(egos), BATCH)]
+        return _joined(parts)
+
+    def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Found:
+        looks = self._eyes.look(replace(Fleet.of(egos), t_s=np.asarray(t_s, float)), bare=True)
+        first = np.searchsorted(looks.capture, np.arange(len(egos) + 1))
+        columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
+        return Found(first, Boxes(*(c.astype(np.float32) for c in columns)))
+
+    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+        """How many detections the drone would send, as many as the detector has there on average."""
+        threshold, found, alarms = self.parameters.boxes
+        x, y, radius = (*capture.position_m[:2], 2 * FULL.half_extent_m / np.sqrt(np.pi)) if roi is None else roi
+        at = max(self._config.score_threshold, float(threshold[0]))
+        cars = self._scene.cars_near(capture.t_s, x, y, min(radius, FULL.half_extent_m * 1.13))
+        part = min(1.0, np.pi * radius**2 / (2 * FULL.half_extent_m) ** 2)
+        return round(cars * float(np.interp(at, threshold, found)) + part * float(np.interp(at, threshold, alarms)))
+
+    def camera_views(self, capture: Capture) -> NDArray[np.uint8]:
+        """There are none.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError("the surrogate renders nothing: fly with perception.detector = torch to see camera views")
+
+    # --- one batch ---------------------------------------------------------------------------------
+
+    def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> Found:
+        asked = [(ego, shares) for ego, shares, _ in jobs]
+        late = {s.capture: None for _, shares in asked for s in shares if s.representation in LATE and s.weight > 0.0}
+        captures = list(dict.fromkeys(c for ego, shares in asked for c in (ego, *(s.capture for s in shares))))
+        column = {c: i for i, c in enumerate(captures)}
+        fleet = Fleet.of(captures)
+        looks = self._eyes.look(fleet)
+        luck = self._luck.of(captures, looks)
+        p = self.parameters
+        confidence = p.confidence(looks.covariates, luck.look)
+        asked += [(c, ()) for c in late]
+        lies = None
+        if not self._config.motion_compensation:
+            lies = [[now.get(s.capture.drone, s.capture).est_pose for s in shares] for _, shares, now in jobs]
+            lies += [[] for _ in late]
+        exchange = Exchange.of(asked, column, lies)
+        found = self._fuse(exchange, looks, fleet, confidence, luck)
+        if not late:
+            return found
+        boxes = list(found)
+        alone = dict(zip(late, boxes[len(jobs) :], strict=True))
+        joined = [_join(own, shares, alone) for own, (_, shares, _) in zip(boxes, jobs, strict=False)]
+        return Found(np.cumsum([0, *(len(b) for b in joined)]), Boxes.join(joined))
+
+    def _fuse(
+        self, exchange: Exchange, looks: Looks, fleet: Fleet, confidence: NDArray[np.float32], luck: Drawn
+    ) -> Found:
+        p, config = self.parameters, self._config
+        pairs = pair(exchange, looks, fleet)
+        zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
+        cars = np.bincount(looks.capture, minlength=len(fleet.t_s))[looks.capture]
+        rank = p.rank(rank_covariates(looks.covariates, confidence, cars), luck.rank, config.cells_by)[pairs.peer]
+        everything = exchange.cells >= exchange.allowed
+        sent = pairs.aimed & (
+            (rank < (exchange.cells / np.maximum(exchange.allowed, 1.0))[pairs.row]) | everything[pairs.row]
+        )
+        x = covariates(pairs, exchange, looks, confidence, sent, rank, zeros[pairs.row])
+        score = p.find(x, luck.find[pairs.look])
+        here = np.flatnonzero(score >= max(p.floor, config.score_threshold))
+        look, row, x, score = pairs.look[here], pairs.row[here], x[here], score[here]
+        off, follow = p.place(np.concatenate([x, score[:, None]], axis=1), luck.residual[look])
+        at, own = looks.xy_m[look], exchange.ego[row]
+        heading = looks.yaw_rad[look] - fleet.yaw_rad[own]
+        angle, hand = axes(heading, at)
+        at = (
+            at
+            + off_axes(off[:, :2].astype(np.float64), angle, hand)
+            + mean_shift(pairs, exchange, sent)[here] * follow[:, None]
+        )
+        size = self._eyes.traffic.size_m[looks.car[look]] * np.exp(off[:, 3:5])
+        yaw = heading + hand * off[:, 2]
+        also = self._alarms(exchange, looks, zeros, luck)
+        row, score = np.concatenate([row, also.job]), np.concatenate([score, also.drawn[:, 5]])
+        at, size = np.concatenate([at, also.drawn[:, :2]]), np.concatenate([size, also.drawn[:, 2:4]])
+        yaw = np.concatenate([yaw, also.drawn[:, 4]])
+        order = np.lexsort((-score, row))
+        row, at, size, yaw, score = row[order], at[order], size[order], yaw[order], score[order]
+        x_m, y_m, turn = fleet.est[exchange.ego[row]].T
+        xy = turned(at, turn) + np.stack([x_m, y_m], axis=1)
+        first = np.searchsorted(row, np.arange(len(exchange.ego) + 1))
+        return Found(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
+
+    def _alarms(self, exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_], luck: Drawn) -> _Alarms:
+        """False alarms. One that comes at a rate also comes at a higher one."""
+        p = self.parameters
+        rate = p.alarm_rates(alarm_covariates(exchange, looks, zeros, self._scene.config))
+        job, band, k = np.nonzero(luck.alarm_at[exchange.ego, : rate.shape[1]] < rate[:, :, None])
+        which = (luck.alarm_which[exchange.ego[job], band, k] * p.alarm_pool.shape[1]).astype(np.intp)
+        drawn = p.alarm_pool[band, np.minimum(which, p.alarm_pool.shape[1] - 1)].astype(np.float64)
+        loud = drawn[:, 5] >= self._config.score_threshold
+        return _Alarms(job[loud], drawn[loud])
+
+
+@dataclass(frozen=True, slots=True)
+class _Alarms:
+    """`job` [a] and `drawn` [a, 6] as `ALARM_COLUMNS`."""
+
+    job: NDArray[np.intp]
+    drawn: Floats
+
+
+def _joined(parts: Sequence[Found]) -> Found:
+    counts = np.concatenate([np.zeros(1, np.int64), *(np.diff(p.first) for p in parts)])
+    return Found(np.cumsum(counts), Boxes.join([p.boxes for p in parts]))
+
+
+def _join(own: Boxes, shares: Sequence[Share], alone: dict[Capture, Boxes]) -> Boxes:
+    """The ego's boxes and those that its peers sent, suppressed as the detector does."""
+    late = []
+    for s in shares:
+        if s.representation in LATE and s.weight > 0.0:
+            boxes = alone[s.capture].inside(s.roi)
+            late.append(boxes.take(np.arange(min(len(boxes), MAX_TRACKS))) if s.representation == "tracks" else boxes)
+    return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own

@@ -1,0 +1,234 @@
+"""What an exchange brings to each car of an ego: who sent the cell that holds it, how sure they were, how far off it lies. Free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception import budget
+from perception.geometry import CELLS, FULL
+from perception.surrogate.features import Fleet, Ints, Looks
+from perception.town import Floats
+from perception.types import Capture, Share
+from scenarios.schema import Scene
+
+MAPS = ("features", "raw")
+NO_PEER = -8.0
+"""Stands for the confidence of a peer that sent nothing (a logit)."""
+FUSED_COVARIATES = (
+    "own", "first", "second", "mean", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
+    "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude",
+)  # fmt: skip
+
+ALARM_COVARIATES = (
+    "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
+    "old_town", "suburb", "yard",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """m egos' feature shares, padded to k slots.
+
+    `ego` [m] and `sender` [m, k] are columns of the fleet (−1: no share); `cells` [m, k] how many cells go and `allowed`
+    [m, k] of how many they are the best (4096, or those of the region); `roi` [m, k, 3] (radius inf: everywhere);
+    `weight` [m, k]; `pose` [m, k, 3] what places the sender's map (x, y, yaw).
+    """
+
+    ego: Ints
+    sender: Ints
+    cells: Floats
+    allowed: Floats
+    roi: Floats
+    weight: Floats
+    pose: Floats
+
+    @classmethod
+    def of(
+        cls,
+        jobs: Sequence[tuple[Capture, Sequence[Share]]],
+        column: dict[Capture, int],
+        lies: Sequence[Sequence[tuple[float, float, float]]] | None = None,
+    ) -> Exchange:
+        """Of jobs whose captures stand in `column`; `lies` are other poses than the senders' own for their maps."""
+        rows: list[tuple[int, int, int]] = []
+        values: list[tuple[float, ...]] = []
+        for m, (_, shares) in enumerate(jobs):
+            slot = 0
+            for i, s in enumerate(shares):
+                if s.representation in MAPS and s.weight > 0.0:
+                    x, y, yaw = s.capture.est_pose
+                    rho, disc = (1.0, None) if s.representation == "raw" else (s.rho, s.roi)
+                    pose = (x, y, yaw) if lies is None else lies[m][i]
+                    rows.append((m, slot, column[s.capture]))
+                    values.append((rho, s.weight, *(disc or (0.0, 0.0, np.inf)), *pose, x, y, yaw))
+                    slot += 1
+        m = len(jobs)
+        row, slots, sender_of = np.array(rows, np.intp).reshape(-1, 3).T
+        k = int(slots.max(initial=-1)) + 1
+        table = np.array(values).reshape(-1, 11)
+        filled = np.zeros((m, k, 10))
+        filled[row, slots, :8] = table[:, :8]
+        allowed = _allowed(table[:, 2:5], table[:, 8:])
+        filled[row, slots, 8], filled[row, slots, 9] = (
+            np.minimum(np.floor(table[:, 0] * CELLS**2 + 1e-9), allowed),
+            allowed,
+        )
+        sender = np.full((m, k), -1)
+        sender[row, slots] = sender_of
+        egos = np.array([column[ego] for ego, _ in jobs], np.intp)
+        return cls(egos, sender, filled[..., 8], filled[..., 9], filled[..., 2:5], filled[..., 1], filled[..., 5:8])
+
+
+def _allowed(roi: Floats, pose: Floats) -> Floats:
+    """How many cells [n] of a sender at an estimated pose lie in a disc (radius inf: all): by area, counted where it leaves the map."""
+    radius = roi[:, 2]
+    out = np.where(np.isinf(radius), float(CELLS**2), np.pi * (np.minimum(radius, 1e3) / FULL.cell_m) ** 2)
+    off = np.hypot(roi[:, 0] - pose[:, 0], roi[:, 1] - pose[:, 1]) + radius
+    for i in np.flatnonzero(np.isfinite(radius) & (off > FULL.half_extent_m)).tolist():
+        x, y, yaw = pose[i].tolist()
+        out[i] = budget.cells_sent(1.0, tuple(roi[i].tolist()), x, y, yaw)
+    return np.asarray(out)
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """The cars of each ego: `look` [n] the ego's own, `row` [n] of the exchange, `peer` [n, k] the senders' looks (−1: outside
+    their map, or no share), `shift_m` [n, k, 2] from where the ego puts the car to where the sender's map puts it, ego's frame;
+    `aimed` [n, k] whether the sender's region holds it."""
+
+    look: Ints
+    row: Ints
+    peer: NDArray[np.int32]
+    shift_m: NDArray[np.float32]
+    aimed: NDArray[np.bool_]
+
+
+def pair(exchange: Exchange, looks: Looks, fleet: Fleet) -> Pairs:
+    """Every car that an ego's square holds, with what its peers' maps hold of it."""
+    row, car = np.nonzero(looks.index[exchange.ego] >= 0)
+    look = looks.index[exchange.ego[row], car].astype(np.intp)
+    sender, k = exchange.sender, exchange.sender.shape[1]
+    peer = np.full((len(row), k), -1, np.int32)
+    shift = np.zeros((len(row), k, 2), np.float32)
+    aimed = np.zeros((len(row), k), bool)
+    # from each sender's frame to its ego's, and each disc in its sender's frame
+    ego = fleet.est[exchange.ego]
+    ex, ey, eyaw = (ego[:, i, None] for i in range(3))
+    px, py, pyaw = (exchange.pose[..., i] for i in range(3))
+    tx, ty = _into(px - ex, py - ey, eyaw)
+    c, s = np.cos(pyaw - eyaw), np.sin(pyaw - eyaw)
+    theirs = fleet.est[sender]
+    dx, dy = _into(exchange.roi[..., 0] - theirs[..., 0], exchange.roi[..., 1] - theirs[..., 1], theirs[..., 2])
+    radius = exchange.roi[..., 2]
+    xy, mine = looks.xy_m.astype(np.float32), looks.xy_m[look].astype(np.float32)
+    cos, sin, at_x, at_y, disc_x, disc_y = (v.astype(np.float32) for v in (c, s, tx, ty, dx, dy))
+    for j in range(k):
+        here = np.flatnonzero(sender[row, j] >= 0)
+        of = looks.index[sender[row[here], j], car[here]]
+        here, of = here[of >= 0], of[of >= 0]
+        m = row[here]
+        x, y = xy[of, 0], xy[of, 1]
+        peer[here, j] = of
+        shift[here, j, 0] = cos[m, j] * x - sin[m, j] * y + at_x[m, j] - mine[here, 0]
+        shift[here, j, 1] = sin[m, j] * x + cos[m, j] * y + at_y[m, j] - mine[here, 1]
+        aimed[here, j] = (x - disc_x[m, j]) ** 2 + (y - disc_y[m, j]) ** 2 <= radius[m, j] ** 2
+    return Pairs(look, row, peer, shift, aimed)
+
+
+def _into(x: Floats, y: Floats, yaw: Floats) -> tuple[Floats, Floats]:
+    """A vector in the frame that is turned by `yaw`."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return c * x + s * y, c * y - s * x
+
+
+def covariates(
+    pairs: Pairs,
+    exchange: Exchange,
+    looks: Looks,
+    confidence: NDArray[np.float32],
+    sent: NDArray[np.bool_],
+    rank: NDArray[np.float32],
+    zeros: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """What fusion makes of each pair depends on: [n, 22] float32, as `FUSED_COVARIATES`.
+
+    Args:
+        confidence: [looks] the logit that each drone gives each car on its own.
+        sent: [n, k] whether the cell that holds the car was sent.
+        rank: [n, k] the fraction of the sender's cells that rank above the car's: how much of what is about it was sent too.
+        zeros: [n] whether cells that were not sent take part as zeros.
+    """
+    n, k = pairs.peer.shape
+    first, second = np.full((2, n), NO_PEER, np.float32)
+    total, silent, sure, off, shift_first, middle_x, middle_y, deep = np.zeros((8, n), np.float32)
+    allow = exchange.cells / np.maximum(exchange.allowed, 1.0)
+    for j in range(k):
+        weight = exchange.weight[pairs.row, j].astype(np.float32)
+        came = sent[:, j] * weight
+        theirs = np.where(sent[:, j], confidence[pairs.peer[:, j]], np.float32(NO_PEER))
+        x, y = pairs.shift_m[:, j, 0], pairs.shift_m[:, j, 1]
+        away = np.sqrt(x * x + y * y)
+        best = theirs > first
+        shift_first = np.where(best, away, shift_first)
+        second = np.maximum(second, np.minimum(theirs, first))
+        first = np.maximum(first, theirs)
+        total += came
+        sure += came * theirs
+        off += came * away
+        room = np.log(np.maximum(allow[pairs.row, j], 1e-4)) - np.log(np.maximum(rank[:, j], 1e-4))
+        deep += came * np.clip(room, 0.0, 6.0).astype(np.float32)
+        middle_x += came * x
+        middle_y += came * y
+        silent += np.where(zeros & (pairs.peer[:, j] >= 0), weight - came, np.float32(0.0))
+    count = np.maximum(total, np.float32(1e-6))
+    mean = np.where(total > 0, sure / count, np.float32(NO_PEER))
+    spread = np.sqrt(middle_x * middle_x + middle_y * middle_y) / (1.0 + total)
+    most = np.log(np.maximum(np.where(exchange.sender >= 0, exchange.cells, 1.0).max(axis=1, initial=1.0), 1.0)) / 8.0
+    part = np.where(exchange.sender >= 0, allow, 0.0).max(axis=1, initial=0.0)
+    own = looks.covariates[pairs.look]
+    columns = (
+        confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
+        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in (0, 3, 2, 1, 7, 8, 4, 12, 13)),
+    )  # fmt: skip
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def mean_shift(pairs: Pairs, exchange: Exchange, sent: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How far off what was sent of each car lies, [n, 2] m of the ego's frame, by the shares' weights."""
+    weight = (exchange.weight[pairs.row] * sent).astype(np.float32)
+    total = np.maximum(weight.sum(axis=1), 1e-6)
+    return np.asarray((pairs.shift_m * weight[..., None]).sum(axis=1) / total[:, None], np.float32)
+
+
+def alarm_covariates(exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_], scene: Scene) -> NDArray[np.float32]:
+    """What the number of false alarms depends on, [m, 13] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
+    light, and how much of how many maps was sent."""
+    m = len(exchange.ego)
+    cars = (looks.index[exchange.ego] >= 0).sum(axis=1)
+    shares = (exchange.sender >= 0).sum(axis=1)
+    received = exchange.cells.sum(axis=1) / CELLS**2
+    silent = np.where(zeros, shares - received, 0.0)
+    seams = np.where(zeros, 0.0, np.sqrt(np.clip(received, 0, 1) * np.clip(shares - received, 0, 4)))
+    plenty = np.where(shares > 0, np.log10(np.maximum(received, 1e-3)), 0.0)
+    shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
+    given = (scene.brightness - 1.0, shade, scene.building_density - 0.6, scene.tree_density - 0.5)
+    styles = (scene.style == name for name in ALARM_COVARIATES[-3:])
+    b, d, h, t = (np.full(m, v) for v in given)
+    columns = (
+        np.log1p(cars) - 3.6, b, d, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty, h, t,
+        *(np.full(m, float(is_)) for is_ in styles),
+    )  # fmt: skip
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def cell_of(xy_m: Floats) -> tuple[Ints, Ints]:
+    """Row and column of the cells about a place of the sender's frame: the two by two that are nearest, [n, 4] each."""
+    at = (xy_m + FULL.half_extent_m) / FULL.cell_m - 0.5
+    low = np.floor(at).astype(np.intp)
+    row = np.clip(low[:, 0, None] + np.array([0, 0, 1, 1]), 0, CELLS - 1)
+    column = np.clip(low[:, 1, None] + np.array([0, 1, 0, 1]), 0, CELLS - 1)
+    return row, column

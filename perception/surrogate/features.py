@@ -1,0 +1,224 @@
+"""What bears on whether a car is found: who looks at it from where, over what, and what of that was sent. Free of torch.
+
+A *look* is one capture and one car in its ±102.4 m square. Everything here follows from geometry and the scene's
+description; nothing is rendered. Looks of many captures are worked out at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.geometry import FULL
+from perception.scene import SceneModel
+from perception.surrogate.sight import HeightField, Kerbs
+from perception.town import Floats
+from perception.traffic import TARGET_COLOUR, TARGET_SIZE_M
+from perception.types import Capture
+
+Ints = NDArray[np.intp]
+HALF_H = float(np.tan(np.radians(35.0)))
+HALF_V = HALF_H * 90 / 160
+"""The cameras' half angles, as in `render.py`, which needs torch."""
+LOOK_COVARIATES = (
+    "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
+    "crowd", "altitude",
+)  # fmt: skip
+_ROAD_TONE, _TONE = 0.34, np.array([0.299, 0.587, 0.114]) / 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """Captures as columns: `t_s` [c], `position_m` [c, 3], `est` [c, 3] (x, y, yaw), `yaw_rad` [c], `tilt` [c, 3, 3] (body to level), `stretch` [c]
+    the height that the lift believes over the height there is: by that much its map is too large."""
+
+    t_s: Floats
+    position_m: Floats
+    est: Floats
+    yaw_rad: Floats
+    tilt: Floats
+    stretch: Floats
+
+    @classmethod
+    def of(cls, captures: Sequence[Capture]) -> Fleet:
+        t_s = np.array([c.t_s for c in captures])
+        position = np.array([c.position_m for c in captures]).reshape(-1, 3)
+        est = np.array([(c.est_position_m[0], c.est_position_m[1], c.est_yaw_rad) for c in captures]).reshape(-1, 3)
+        x, y, z, w = np.array([c.orientation_xyzw for c in captures]).reshape(-1, 4).T
+        yaw = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
+        body = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        ).transpose(2, 0, 1)
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        tilt = np.stack([c * body[:, 0] + s * body[:, 1], c * body[:, 1] - s * body[:, 0], body[:, 2]], axis=1)
+        stretch = np.array([c.est_position_m[2] for c in captures]) / np.maximum(position[:, 2], 1.0)
+        return cls(t_s, position, est, yaw, tilt, stretch)
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """n looks, capture by capture, cars ascending: `capture` [n], `car` [n] (column of `Traffic`), `xy_m` [n, 2] where the
+    drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 14] float32 as
+    `LOOK_COVARIATES`, `index` [c, cars] (−1: no look)."""
+
+    capture: Ints
+    car: Ints
+    xy_m: Floats
+    world_m: Floats
+    yaw_rad: Floats
+    covariates: NDArray[np.float32]
+    index: NDArray[np.int32]
+
+
+class Traffic:
+    """Every car of a scene as columns, parked ones first, then moving ones, then the target if there is one."""
+
+    def __init__(self, scene: SceneModel) -> None:
+        parked, lanes, target = scene.parked_cars, scene._lanes, scene._target
+        self._lanes, self._target = lanes, target
+        self.parked, self.count = len(parked), len(parked) + len(lanes.s0_m) + (target is not None)
+        extra = 1 if target is not None else 0
+        size = [
+            np.stack([parked.length_m, parked.width_m], 1),
+            lanes.size_m[:, :2],
+            np.array([TARGET_SIZE_M[:2]])[:extra],
+        ]
+        self.size_m: Floats = np.concatenate(size)
+        colour = np.concatenate([parked.colour, lanes.colour, np.array([TARGET_COLOUR], np.uint8)[:extra]])
+        self.tone: Floats = colour @ _TONE
+        self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
+        self.parked_xy: Floats = np.stack([parked.x_m, parked.y_m], 1)
+        self._yaw = np.concatenate([parked.yaw_rad, lanes.yaw_rad, np.zeros(extra)])
+
+    def at(self, t_s: Floats, parked: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Where some parked cars (their indices) and, after them, all others are at times [t]: xy [t, k, 2], yaw [t, k], and
+        whether they are in the scene [t, k]."""
+        n, first, lanes = len(t_s), len(parked), self._lanes
+        moving = slice(first, first + len(lanes.s0_m))
+        count = first + self.count - self.parked
+        xy, there = np.empty((n, count, 2)), np.ones((n, count), bool)
+        yaw = np.broadcast_to(np.concatenate([self._yaw[parked], self._yaw[self.parked :]]), (n, count))
+        xy[:, :first] = self.parked_xy[parked]
+        s = lanes.low_m + np.mod(lanes.s0_m + lanes.speed_mps * t_s[:, None] - lanes.low_m, lanes.period_m)
+        xy[:, moving, 0] = np.where(lanes.east, s, lanes.lateral_m)
+        xy[:, moving, 1] = np.where(lanes.east, lanes.lateral_m, s)
+        there[:, moving] = s <= lanes.limit_m
+        if self._target is not None:
+            pose = np.array([self._target.pose(t) for t in t_s.tolist()])
+            xy[:, -1] = pose[:, :2]
+            yaw = yaw.copy()
+            yaw[:, -1] = pose[:, 2]
+        return xy, yaw, there
+
+
+class Eyes:
+    """Works out looks over one scene."""
+
+    def __init__(self, scene: SceneModel) -> None:
+        self.traffic = Traffic(scene)
+        self._field, self._kerbs = HeightField(scene), Kerbs(scene)
+        config = scene.config
+        self._light = np.array([config.overcast, config.brightness, 1.0 / np.tan(np.radians(config.sun_elevation_deg))])
+        parked = self.traffic.parked_xy
+        self._lit = self._field.lit(parked[:, 0], parked[:, 1])
+
+    def look(self, fleet: Fleet, *, bare: bool = False) -> Looks:
+        """All looks of the captures; `bare` leaves the covariates out."""
+        traffic, half = self.traffic, FULL.half_extent_m
+        where = fleet.position_m[:, :2]
+        low, high = where.min(axis=0, initial=np.inf) - 1.5 * half, where.max(axis=0, initial=-np.inf) + 1.5 * half
+        parked = np.flatnonzero(((traffic.parked_xy > low) & (traffic.parked_xy < high)).all(axis=1))
+        times, which = np.unique(fleet.t_s, return_inverse=True)
+        xy, yaw, there = traffic.at(times, parked)
+        # single precision a few hundred metres from the middle keeps a tenth of a millimetre
+        middle = where.mean(axis=0) if len(where) else np.zeros(2)
+        x, y = ((xy[..., k] - middle[k]).astype(np.float32)[which] for k in (0, 1))
+        x -= (where[:, :1] - middle[0]).astype(np.float32)
+        y -= (where[:, 1:] - middle[1]).astype(np.float32)
+        c, s = np.cos(fleet.yaw_rad).astype(np.float32)[:, None], np.sin(fleet.yaw_rad).astype(np.float32)[:, None]
+        near = np.abs(c * x + s * y) < half
+        near &= np.abs(c * y - s * x) < half
+        near &= there[which]
+        capture, among = np.nonzero(near)
+        x, y, c, s = x[capture, among], y[capture, among], c[capture, 0], s[capture, 0]
+        local = np.stack([c * x + s * y, c * y - s * x], axis=1).astype(np.float64)
+        car = np.concatenate([parked, np.arange(traffic.parked, traffic.count)])[among]
+        index = np.full((len(where), traffic.count), -1, np.int32)
+        index[capture, car] = np.arange(len(capture))
+        at = which[capture]
+        world, turn = xy[at, among], yaw[at, among]
+        covariates = np.zeros((0, 0), np.float32) if bare else self._covariates(fleet, capture, car, local, world, turn)
+        return Looks(capture, car, local * fleet.stretch[capture, None], world, turn, covariates, index)
+
+    def _covariates(
+        self, fleet: Fleet, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats
+    ) -> NDArray[np.float32]:
+        traffic = self.traffic
+        eye = fleet.position_m[capture]
+        reach = np.hypot(local[:, 0], local[:, 1])
+        nadir, margin = _in_view(fleet.tilt[capture], local, eye[:, 2])
+        along = 0.35 * traffic.size_m[car, 0, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        visible = sum(self._field.seen(p[:, 0], p[:, 1], eye).astype(np.float32) for p in (xy - along, xy, xy + along))
+        moving = car >= traffic.parked
+        crowd = np.empty(len(car), np.float32)
+        crowd[~moving], crowd[moving] = self._kerbs.parked[car[~moving]], self._kerbs.near(xy[moving, 0], xy[moving, 1])
+        bearing = np.arctan2(local[:, 1], local[:, 0]) + fleet.yaw_rad[capture]
+        lit = np.empty(len(car), bool)
+        lit[~moving] = self._lit[car[~moving]]
+        lit[moving] = self._field.lit(xy[moving, 0], xy[moving, 1])
+        overcast, brightness, length = self._light
+        shade = (1.0 - overcast) * min(length, 2.5)
+        light = np.where(lit, 1.0, 0.6 + 0.4 * overcast)
+        columns = (
+            reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
+            (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
+            traffic.size_m[car, 0] - 4.6, lit, shade * np.ones(len(car)), (brightness - 1.0) * np.ones(len(car)),
+            crowd, eye[:, 2] / 60.0 - 1.0,
+        )  # fmt: skip
+        return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _in_view(tilt: Floats, local: Floats, height_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Whether the camera that looks down sees the point, and how far inside the camera that the lift asks it lies (1 in its middle)."""
+    x, y, z = (
+        tilt[:, 0, k] * local[:, 0] + tilt[:, 1, k] * local[:, 1] - tilt[:, 2, k] * (height_m - 0.8) for k in range(3)
+    )
+    depth = np.maximum(-z, 0.1)
+    down = 1.0 - np.maximum(np.abs(y) / HALF_H, np.abs(x) / HALF_V) / depth
+    lengthwise = np.abs(x) >= np.abs(y)
+    ahead, right = np.where(lengthwise, np.abs(x), np.abs(y)), np.where(lengthwise, np.abs(y), np.abs(x))
+    forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
+    u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
+    side = 1.0 - np.maximum(u, v)
+    return down > 0.0, np.maximum(down, side)
+
+
+def turned(xy: Floats, by_rad: Floats) -> Floats:
+    """Vectors [n, 2], each turned by its angle [n]."""
+    c, s = np.cos(by_rad), np.sin(by_rad)
+    return np.stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]], axis=1)
+
+
+def axes(yaw_rad: Floats, xy_m: Floats) -> tuple[Floats, Floats]:
+    """A car's own axes, pointing away from the drone that looks: the angle [n] of the one along it, and on which side of that
+    (1 left, −1 right) the other one lies. Boxes are off along a car far more than across it, and lean away."""
+    bearing = np.arctan2(xy_m[:, 1], xy_m[:, 0])
+    angle = np.where(np.cos(yaw_rad - bearing) >= 0, yaw_rad, yaw_rad + np.pi)
+    return angle, np.where(np.sin(bearing - angle) >= 0, 1.0, -1.0)
+
+
+def on_axes(xy: Floats, angle: Floats, hand: Floats) -> Floats:
+    """Vectors [n, 2] on such axes."""
+    return turned(xy, -angle) * np.stack([np.ones(len(hand)), hand], axis=1)
+
+
+def off_axes(uv: Floats, angle: Floats, hand: Floats) -> Floats:
+    """And back."""
+    return turned(uv * np.stack([np.ones(len(hand)), hand], axis=1), angle)

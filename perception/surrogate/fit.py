@@ -1,0 +1,204 @@
+"""Fitting: the detector's answers to the surrogate's parameters. Small networks, a minute or two."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import expit, logit, ndtr, ndtri
+from torch import Tensor
+
+from perception.surrogate.exchange import FUSED_COVARIATES
+from perception.surrogate.features import axes, on_axes
+from perception.surrogate.model import NETS, SPREAD, Net, Parameters, rank_covariates
+from perception.surrogate.rows import Rows
+from scenarios.streams import stream
+
+Array = NDArray[Any]
+HIDDEN = {"look": (32, 32), "rank": (16,), "rank_norm": (16,), "find": (32, 24), "place": (24, 16)}
+START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0]}
+"""First outputs, so that a mixture's components part."""
+RESIDUALS, POOL, REACH = 2048, 512, 10.0
+BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.94, 0.975, 0.99])
+"""Quantiles of the alarms' scores between which they are counted."""
+
+
+def fit(
+    rows: Rows,
+    boxes: Array,
+    floor: float,
+    seed: int = 0,
+    steps: int = 1200,
+    progress: Callable[[str], None] | None = None,
+) -> Parameters:
+    """All parameters, without a card.
+
+    Args:
+        rows: of the fitted scenes, made with the same `floor`.
+        boxes: as `Parameters.boxes`.
+    """
+    tell = progress or (lambda _: None)
+    nets: dict[str, Net] = {}
+    tell("look")
+    nets["look"], out = _train("look", rows.look, {"c": rows.confidence}, _look_loss, seed, steps)
+    alike = _alike(rows, out)
+    tell("rank")
+    covariates = rank_covariates(rows.look, rows.confidence, rows.look_cars)
+    for name, above in (("rank", rows.above), ("rank_norm", rows.above_norm)):
+        nets[name], _ = _train(name, covariates, {"y": np.log(above + 0.5 / 4096)}, _normal_loss, seed, steps)
+    tell("find")
+    found = rows.score > 0
+    q = np.where(found, logit(np.clip(rows.score, 1e-6, 1 - 1e-6)), 0.0)
+    at = torch.tensor(float(logit(floor)))
+    nets["find"], _ = _train("find", rows.fused, {"hit": found, "q": q}, lambda o, y: _find_loss(o, y, at), seed, steps)
+    tell("place")
+    covariates = np.concatenate([rows.fused, rows.score[:, None]], axis=1)[found]
+    angle, hand = axes(rows.heading[found], rows.xy_m[found])
+    off = np.concatenate([on_axes(rows.offset[found, :2], angle, hand), rows.offset[found, 2:]], axis=1)
+    off[:, 2] *= hand
+    shift = on_axes(rows.shift[found], angle, hand)
+    nets["place"], out = _train("place", covariates, {"off": off, "shift": shift}, _place_loss, seed, steps)
+    followed = np.concatenate([shift * expit(out[:, 10:]), np.zeros((len(off), 3))], axis=1)
+    residuals = (off - followed - out[:, :5]) / np.exp(np.clip(out[:, 5:10], *SPREAD))
+    rng = stream(seed, 0, (), "calibrate.pool")
+    shared, best = rows.fused[found, FUSED_COVARIATES.index("senders")] > 0, rows.score[found]
+    pools = [_by_score(residuals[of], best[of]) for of in (~shared, shared)]
+    tell("alarms")
+    edges, rate, pool = _alarms(rows, floor, rng)
+    singles = (alike, np.stack(pools), edges, rate, pool, boxes)
+    a, r, e, q, p, n = (np.asarray(v, np.float32) for v in singles)
+    return Parameters(nets, a, r, e, q, p, n, card={})
+
+
+def _by_score(residuals: Array, score: Array) -> Array:
+    """Evenly many of the residuals, [2048, 6], by ascending score, which is the last column."""
+    order = np.argsort(score, kind="stable")
+    pick = order[np.linspace(0, len(order) - 1, RESIDUALS).astype(int)]
+    return np.concatenate([np.clip(residuals[pick], -REACH, REACH), score[pick, None]], axis=1)
+
+
+def _train(
+    name: str,
+    x: Array,
+    y: dict[str, Array],
+    loss: Callable[[Tensor, dict[str, Tensor]], Tensor],
+    seed: int,
+    steps: int,
+    batch: int = 1024,
+) -> tuple[Net, Array]:
+    """A network fitted by Adam with a falling rate, and its outputs for all rows."""
+    inputs, outputs = NETS[name]
+    torch.manual_seed(seed)
+    sizes = (inputs, *HIDDEN[name], outputs)
+    mean, deviation = x.mean(axis=0), x.std(axis=0) + 1e-3
+    data = torch.from_numpy(((x - mean) / deviation).astype(np.float32))
+    want = {k: torch.from_numpy(v.astype(np.float32)) for k, v in y.items()}
+    layers: list[torch.nn.Module] = []
+    for a, b in itertools.pairwise(sizes):
+        layers += [torch.nn.Linear(a, b), torch.nn.ReLU()]
+    net = torch.nn.Sequential(*layers[:-1])
+    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
+    with torch.no_grad():
+        linear[-1].weight.mul_(0.1)
+        linear[-1].bias.copy_(torch.tensor(START.get(name, [0.0] * outputs)))
+    optimiser = torch.optim.AdamW(net.parameters(), 4e-3, weight_decay=0.03)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=steps)
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(steps):
+        pick = torch.randint(len(data), (min(batch, len(data)),), generator=generator)
+        value = loss(net(data[pick]), {k: v[pick] for k, v in want.items()})
+        optimiser.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+    weights, biases = [], []
+    for layer in linear:
+        weights.append(layer.weight.detach().numpy().T.astype(np.float64))
+        biases.append(layer.bias.detach().numpy().astype(np.float64))
+    biases[0] = biases[0] - (mean / deviation) @ weights[0]
+    weights[0] = weights[0] / deviation[:, None]
+    made = Net(tuple(w.astype(np.float32) for w in weights), tuple(b.astype(np.float32) for b in biases))
+    with torch.no_grad():
+        return made, net(data).numpy().astype(np.float64)
+
+
+def _normal(x: Tensor, mean: Tensor, log_spread: Tensor) -> Tensor:
+    log_spread = log_spread.clamp(*SPREAD)
+    return -0.5 * ((x - mean) * torch.exp(-log_spread)) ** 2 - log_spread
+
+
+def _look_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
+    low = torch.nn.functional.logsigmoid(-out[:, 0]) + _normal(y["c"], out[:, 2], out[:, 4])
+    high = torch.nn.functional.logsigmoid(out[:, 0]) + _normal(y["c"], out[:, 1], out[:, 3])
+    return -torch.logaddexp(low, high).mean()
+
+
+def _normal_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
+    return -_normal(y["y"], out[:, 0], out[:, 1]).mean()
+
+
+def _find_loss(out: Tensor, y: dict[str, Tensor], floor: Tensor) -> Tensor:
+    spread = out[:, 2].clamp(*SPREAD)
+    above = torch.special.log_ndtr((out[:, 1] - floor) * torch.exp(-spread))
+    p = torch.nn.functional.logsigmoid(out[:, 0])
+    missed = torch.log1p(-torch.exp((p + above).clamp(max=-1e-6)))
+    seen = p + _normal(y["q"], out[:, 1], spread)
+    return -torch.where(y["hit"] > 0, seen, missed).mean()
+
+
+def _place_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
+    follow = torch.sigmoid(out[:, 10:])
+    shift = torch.nn.functional.pad(y["shift"] * follow, (0, 3))
+    log_spread = out[:, 5:10].clamp(*SPREAD)
+    return (
+        (((y["off"] - shift - out[:, :5]).abs() * torch.exp(-log_spread)) + log_spread).sum(dim=1).mean()
+    )  # Laplace: outliers count once
+
+
+def _alike(rows: Rows, out: Array) -> Array:
+    """What part of a look's luck is the car's own: correlation, over pairs of looks at one car, of where in its predicted
+    distribution each fell."""
+    p = expit(out[:, 0])
+    low = ndtr((rows.confidence - out[:, 2]) / np.exp(np.clip(out[:, 4], *SPREAD)))
+    high = ndtr((rows.confidence - out[:, 1]) / np.exp(np.clip(out[:, 3], *SPREAD)))
+    z = ndtri(np.clip(p * high + (1 - p) * low, 1e-4, 1 - 1e-4))
+    count = np.bincount(rows.look_object)
+    total, square = np.bincount(rows.look_object, z), np.bincount(rows.look_object, z * z)
+    pairs = (count * (count - 1.0)).sum()
+    shared = float(((total**2 - square).sum() / max(pairs, 1.0)) / max(z.var(), 1e-6))
+    return np.full(2, np.clip(shared, 0.0, 0.95))
+
+
+def _alarms(rows: Rows, floor: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Bands of scores, a Poisson regression of the count in each, and alarms to draw from."""
+    score = rows.alarm[:, 5]
+    if len(score) < 50:
+        raise ValueError(f"{len(score)} false alarms above {floor:g}, at least 50 are needed; calibrate on more scenes")
+    edges = np.append(np.quantile(score, BANDS), 1.0)
+    edges[0] = floor
+    edges = np.maximum.accumulate(edges + 1e-6 * np.arange(len(edges)))
+    band = np.clip(np.searchsorted(edges, score, side="right") - 1, 0, len(BANDS) - 1)
+    counts = np.zeros((len(rows.job), len(BANDS)))
+    np.add.at(counts, (rows.alarm_job, band), 1.0)
+    x = np.concatenate([np.ones((len(rows.job), 1)), rows.job], axis=1)
+    rate = np.stack([_poisson(x, counts[:, b]) for b in range(len(BANDS))], axis=1)
+    pool = np.stack([rows.alarm[rng.choice(np.flatnonzero(band == b), POOL)] for b in range(len(BANDS))])
+    return edges, rate, pool
+
+
+def _poisson(x: Array, y: Array, ridge: float = 3.0, rounds: int = 40) -> Array:
+    """Log-linear Poisson regression [c] by Newton's method; all but the first coefficient are held to 0 by a ridge."""
+    beta = np.zeros(x.shape[1])
+    beta[0] = np.log(y.mean() + 1e-3)
+    hold = np.full(len(beta), ridge)
+    hold[0] = 1e-3
+    for _ in range(rounds):
+        mean = np.exp(np.clip(x @ beta, -12, 8))
+        step = np.linalg.solve((x * mean[:, None]).T @ x + np.diag(hold), x.T @ (y - mean) - hold * beta)
+        beta += np.clip(step, -1.0, 1.0)
+    return beta

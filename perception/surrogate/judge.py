@@ -1,0 +1,105 @@
+"""How far the surrogate is from the torch detector on scenes that it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from perception.ap import Matched, average_precision, match
+from perception.harness.statistics import compare
+from perception.surrogate.collect import Asked
+from perception.surrogate.detector import SurrogateDetector
+from perception.surrogate.model import Parameters
+from perception.surrogate.plan import draw_scene, scene_model
+from scenarios.schema import Perception
+
+THRESHOLD = 0.1
+WITHIN = 0.02
+"""The error of AP that a calibration is to keep."""
+REPEATS = 4
+CONTRASTS = (
+    ("alone", "all-4, ρ = 0.01"), ("alone", "all-4, ρ = 0.25"), ("alone", "all-4, ρ = 0.25, 32 m"), ("alone", "detections"),
+    ("all-4, ρ = 0.05", "all-4, ρ = 0.25"), ("all-4, ρ = 0.25", "all-4, ρ = 1"), ("detections", "all-4, ρ = 0.25"),
+    ("nearest 2, ρ = 0.5", "all-4, ρ = 0.25"), ("farthest 2, ρ = 0.5", "all-4, ρ = 0.25"),
+    ("nearest 2, ρ = 0.5", "farthest 2, ρ = 0.5"), ("all-4, ρ = 0.25, 0.4 s older", "all-4, ρ = 0.25"),
+    ("all-4, ρ = 0.25, zeros", "all-4, ρ = 0.25"),
+)  # fmt: skip
+"""Policies whose order is judged, in pairs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One condition's AP@0.5 by both, on `egos` moments."""
+
+    condition: str
+    torch: float
+    surrogate: float
+    error: float
+    egos: int
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """AP of b minus AP of a by both; the torch detector's with its 95 % interval by whole scenes."""
+
+    a: str
+    b: str
+    torch: float
+    low: float
+    high: float
+    surrogate: float
+
+    @property
+    def significant(self) -> bool:
+        return not self.low <= 0.0 <= self.high
+
+    @property
+    def kept(self) -> bool:
+        """Whether the surrogate says the same, where the detector says something."""
+        return not self.significant or self.torch * self.surrogate > 0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """All levels and orders."""
+
+    levels: list[Level]
+    orders: list[Order]
+
+    def facts(self) -> dict[str, Any]:
+        """As JSON."""
+        orders = [{**asdict(o), "significant": o.significant, "kept": o.kept} for o in self.orders]
+        return {"levels": [asdict(v) for v in self.levels], "orders": orders}
+
+
+def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> Verdict:
+    """Both detectors' AP under every condition of the held-out scenes; the surrogate's with several draws of its luck."""
+    theirs: dict[str, list[Matched]] = {}
+    ours: dict[str, list[Matched]] = {}
+    scenes: dict[str, list[int]] = {}
+    for asked in held_out:
+        scene = scene_model(draw_scene(seed, asked.split, asked.scene))
+        truths = None
+        for rules in dict.fromkeys((j.unsent, j.cells_by) for j in asked.jobs):
+            config = Perception(unsent_cells=rules[0], cells_by=rules[1], score_threshold=THRESHOLD)
+            mine = [i for i, j in enumerate(asked.jobs) if (j.unsent, j.cells_by) == rules]
+            for repeat in range(REPEATS):
+                detector = SurrogateDetector.of(scene, config, parameters, seed, repeat)
+                if truths is None:
+                    truths = list(detector.truth_many([j.ego.t_s for j in asked.jobs], [j.ego for j in asked.jobs]))
+                jobs = [[(asked.jobs[i].ego, asked.jobs[i].shares)] for i in mine]
+                for i, boxes in zip(mine, detector.detect_many(jobs), strict=True):
+                    name = asked.jobs[i].condition
+                    ours.setdefault(name, []).append(match(boxes, truths[i]))
+                    if repeat == 0:
+                        found = asked.boxes[i].take(asked.boxes[i].score >= THRESHOLD)
+                        theirs.setdefault(name, []).append(match(found, truths[i]))
+                        scenes.setdefault(name, []).append(asked.scene)
+    ap = {name: (average_precision(theirs[name]), average_precision(ours[name])) for name in theirs}
+    levels = [Level(name, a, b, b - a, len(theirs[name])) for name, (a, b) in ap.items()]
+    orders = []
+    for a, b in CONTRASTS:
+        d = compare(theirs[a], theirs[b], scenes[a])
+        orders.append(Order(a, b, d.delta, d.low, d.high, ap[b][1] - ap[a][1]))
+    return Verdict(levels, orders)

@@ -1,0 +1,247 @@
+"""The surrogate's parameters: small networks and tables, read from safetensors, asked in numpy. Free of torch.
+
+Five parts, each fitted to what the torch detector did:
+
+- **look**: how sure a drone is of a car on its own, the logit of its heat map there. A mixture of two normals.
+- **rank**: what part of the drone's cells rank above the car's cell, given how sure it is: whether a budget sends it.
+- **find**: what fusion makes of it: a box or none, and its score.
+- **place**: how far that box is off, along the car, across it, in heading, length and width.
+- **alarms**: how many boxes there are of nothing, by score.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from scipy.special import expit, ndtr
+
+from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
+from perception.surrogate.features import LOOK_COVARIATES
+
+Singles = NDArray[np.float32]
+FORMAT = 1
+RANK_COVARIATES = ("confidence", "range", "visible", "nadir", "cars", "brightness", "shade")
+PLACE_COVARIATES = (*FUSED_COVARIATES, "score")
+ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")
+NETS: dict[str, tuple[int, int]] = {
+    "look": (len(LOOK_COVARIATES), 5),
+    "rank": (len(RANK_COVARIATES), 2),
+    "rank_norm": (len(RANK_COVARIATES), 2),
+    "find": (len(FUSED_COVARIATES), 3),
+    "place": (len(PLACE_COVARIATES), 11),
+}
+"""Inputs and outputs of each network."""
+SHIPPED = Path(__file__).parent / "weights" / "surrogate.safetensors"
+
+
+SPREAD = (-3.5, 2.0)
+"""Bounds of log deviations."""
+WINDOW = 0.08
+"""Part of the residuals, those nearest in score, from which a box's is drawn."""
+_ROWS = 192
+
+
+@dataclass(frozen=True, slots=True)
+class Net:
+    """A network of one or more hidden layers with rectifiers; inputs are first put to mean 0 and deviation 1.
+
+    `weight` and `bias` by layer, float32.
+    """
+
+    weight: tuple[Singles, ...]
+    bias: tuple[Singles, ...]
+
+    def __call__(self, x: Singles) -> Singles:
+        """[n, in] → [n, out]; equally many rows at a time, so that a row comes out the same to the bit whatever else is asked,
+        and few enough for the cache and for the matrix library to start no threads."""
+        n = len(x)
+        out = np.empty((n, self.bias[-1].shape[0]), np.float32)
+        for at in range(0, n, _ROWS):
+            h = x[at : at + _ROWS]
+            if len(h) < _ROWS:
+                h = np.concatenate([h, np.zeros((_ROWS - len(h), x.shape[1]), np.float32)])
+            for w, b in zip(self.weight[:-1], self.bias[:-1], strict=True):
+                h = h @ w
+                h += b
+                np.maximum(h, 0.0, out=h)
+            out[at : at + _ROWS] = (h @ self.weight[-1] + self.bias[-1])[: n - at]
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Everything that a calibration leaves behind.
+
+    `alike` [2]: what part of a look's luck belongs to the car (whoever looks), by component and within it. `residuals`
+    [2, r, 6]: how boxes were off in units of the predicted deviations, together, and their scores, ascending; alone and shared. `alarm_edges` [b + 1]: scores
+    between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [b, p, 5] where and how large they
+    were (`ALARM_COLUMNS`, ego's frame); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
+    above each, and how many boxes of nothing there are.
+    """
+
+    nets: Mapping[str, Net]
+    alike: Singles
+    residuals: Singles
+    alarm_edges: Singles
+    alarm_rate: Singles
+    alarm_pool: Singles
+    boxes: Singles
+    card: Mapping[str, Any]
+
+    @property
+    def floor(self) -> float:
+        """The lowest score that the surrogate gives; AP hardly knows weaker boxes."""
+        return float(self.alarm_edges[0])
+
+    @property
+    def id(self) -> str:
+        """Names the calibration in outcomes."""
+        return str(self.card["id"])
+
+    # --- the five parts ---------------------------------------------------------------------------
+
+    def confidence(self, covariates: Singles, luck: Singles) -> Singles:
+        """How sure each drone is of each car on its own, a logit [n]; `luck` [n, 2] standard normal."""
+        out = self.nets["look"](covariates)
+        high = ndtr(luck[:, 0]) < expit(out[:, 0])
+        mean = np.where(high, out[:, 1], out[:, 2])
+        spread = _spread(np.where(high, out[:, 3], out[:, 4]))
+        return np.asarray(mean + spread * luck[:, 1], np.float32)
+
+    def rank(self, covariates: Singles, luck: Singles, by: str = "confidence") -> Singles:
+        """The fraction [n] of the drone's cells that rank above; `luck` [n] standard normal."""
+        out = self.nets["rank" if by == "confidence" else "rank_norm"](covariates)
+        return np.asarray(np.minimum(np.exp(out[:, 0] + _spread(out[:, 1]) * luck), 1.0), np.float32)
+
+    def find(self, covariates: Singles, luck: Singles) -> Singles:
+        """Scores [n], 0 where there is no box; `luck` [n, 2]: uniform, and standard normal."""
+        out = self.nets["find"](covariates)
+        score = expit(out[:, 1] + _spread(out[:, 2]) * luck[:, 1])
+        return np.where((luck[:, 0] < expit(out[:, 0])) & (score >= self.floor), score, 0.0).astype(np.float32)
+
+    def place(self, covariates: Singles, luck: Singles) -> tuple[Singles, Singles]:
+        """How boxes are off, [n, 5]: along the car and across it (m), heading (rad), log length, log width (see
+        `features.axes`); and what part [n] of
+        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals near the box's score."""
+        out = self.nets["place"](covariates)
+        score, shared = (
+            covariates[:, PLACE_COVARIATES.index("score")],
+            covariates[:, PLACE_COVARIATES.index("senders")] > 0,
+        )
+        count = self.residuals.shape[1]
+        window = max(1, int(WINDOW * count))
+        drawn = np.empty((len(score), 5), np.float32)
+        for kind, pool in ((~shared, self.residuals[0]), (shared, self.residuals[1])):
+            first = np.clip(np.searchsorted(pool[:, 5], score[kind]) - window // 2, 0, count - window)
+            drawn[kind] = pool[np.minimum(first + (luck[kind] * window).astype(np.intp), count - 1), :5]
+        return np.asarray(out[:, :5] + _spread(out[:, 5:10]) * drawn, np.float32), expit(out[:, 10])
+
+    def alarm_rates(self, covariates: Singles) -> Singles:
+        """Expected alarms of each job in each band of scores, [m, b]."""
+        return np.asarray(np.exp(Net((self.alarm_rate[1:],), (self.alarm_rate[0],))(covariates)))
+
+
+def _spread(log: Singles) -> Singles:
+    return np.asarray(np.exp(np.clip(log, *SPREAD)))
+
+
+def rank_covariates(look: Singles, confidence: Singles, cars: NDArray[Any]) -> Singles:
+    """[l, 7] as `RANK_COVARIATES`; `cars` [l] how many the capture's square holds."""
+    named = {
+        name: look[:, LOOK_COVARIATES.index(name)] for name in ("range", "visible", "nadir", "brightness", "shade")
+    }
+    named |= {"confidence": confidence, "cars": np.log1p(cars) - 3.6}
+    return np.stack([named[name] for name in RANK_COVARIATES], axis=1).astype(np.float32)
+
+
+def save(path: Path, parameters: Parameters) -> None:
+    """Write them as safetensors with the card in the metadata, under a temporary name first."""
+    tensors: dict[str, Singles] = {
+        name: getattr(parameters, name)
+        for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "boxes")
+    }
+    for name, net in parameters.nets.items():
+        for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
+            tensors[f"{name}.{k}.weight"], tensors[f"{name}.{k}.bias"] = w, b
+    tensors = {k: np.ascontiguousarray(v, np.float32) for k, v in tensors.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    save_file(tensors, part, metadata={"surrogate": json.dumps({"format": FORMAT, **parameters.card})})
+    part.chmod(0o644)
+    part.replace(path)
+
+
+def load(path: Path) -> Parameters:
+    """Parameters from a file.
+
+    Raises:
+        ValueError: naming the file, and what is missing, of another shape, or not finite.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such calibration; `sortie calibrate` makes one")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: no safetensors file: {error}") from error
+    if "surrogate" not in metadata:
+        raise ValueError(f"{path}: holds no calibration; `sortie calibrate` makes one")
+    try:
+        card = json.loads(metadata["surrogate"])
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: its card is no JSON: {error}") from error
+    if card.get("format") != FORMAT:
+        raise ValueError(f"{path}: format is {card.get('format')}, must be {FORMAT}; calibrate again")
+    for name in ("id", "fusion"):
+        if not isinstance(card.get(name), str):
+            raise ValueError(f"{path}: card.{name} is {card.get(name)!r}, must be text")
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"{path}: tensor {name} holds values that are not finite")
+
+    def take(name: str, *shape: int | None) -> Singles:
+        if name not in tensors:
+            raise ValueError(f"{path}: tensor {name} is missing")
+        found = tensors[name]
+        if found.ndim != len(shape) or any(
+            want not in (None, have) for want, have in zip(shape, found.shape, strict=True)
+        ):
+            wanted = ", ".join("any" if v is None else str(v) for v in shape)
+            raise ValueError(f"{path}: tensor {name} has shape {list(found.shape)}, must be [{wanted}]")
+        return np.asarray(found, np.float32)
+
+    edges = take("alarm_edges", None)
+    bands = len(edges) - 1
+    return Parameters(
+        {
+            name: _net(take, name, *sizes, layers=sum(t.startswith(f"{name}.") for t in tensors) // 2)
+            for name, sizes in NETS.items()
+        },
+        take("alike", 2),
+        take("residuals", 2, None, 6),
+        edges,
+        take("alarm_rate", 1 + len(ALARM_COVARIATES), bands),
+        take("alarm_pool", bands, None, len(ALARM_COLUMNS)),
+        take("boxes", 3, None),
+        card,
+    )
+
+
+def _net(take: Any, name: str, inputs: int, outputs: int, layers: int) -> Net:
+    weight, bias = [], []
+    width = inputs
+    for k in range(max(layers, 1)):
+        w = take(f"{name}.{k}.weight", width, outputs if k == layers - 1 else None)
+        weight.append(w)
+        width = w.shape[1]
+        bias.append(take(f"{name}.{k}.bias", width))
+    return Net(tuple(weight), tuple(bias))

@@ -1,0 +1,165 @@
+"""The detector's answers as rows to fit: what each look showed, what each fusion made of each car, and what was there besides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception import budget
+from perception.surrogate.collect import Asked, captures_of
+from perception.surrogate.exchange import Exchange, Pairs, alarm_covariates, cell_of, covariates, mean_shift, pair
+from perception.surrogate.features import Eyes, Fleet, Looks
+from perception.surrogate.plan import draw_scene, scene_model
+from perception.town import Floats
+from perception.types import Boxes
+
+REACH_M = 2.5
+"""A box within this of a car is of that car."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Rows of one or more scenes.
+
+    Looks (l): `look` [l, 14] covariates, `confidence` [l] and `norm` [l] what ranks the car's best cell, `above` [l] and
+    `above_norm` [l] the fraction of all cells that rank higher, `look_object` [l] which car of which scene, `look_cars` [l] how many its capture shows.
+    Fusions (f): `fused` [f, 22] covariates, `score` [f] (0: no box), `offset` [f, 5] box against car (ahead, left, yaw, log
+    length, log width), `xy_m` [f, 2] the car in the ego's frame, `heading` [f] and how it is turned there,
+    `shift` [f, 2] the mean that its peers' maps are off.
+    Jobs (j): `job` [j, …] covariates of false alarms, `alarms` [j] how many; alarms (a): `alarm_job` [a], `alarm` [a, 6] (x, y of
+    the ego's frame, length, width, yaw, score).
+    """
+
+    look: Array
+    confidence: Array
+    norm: Array
+    above: Array
+    above_norm: Array
+    look_object: Array
+    look_cars: Array
+    fused: Array
+    score: Array
+    offset: Array
+    xy_m: Array
+    shift: Array
+    heading: Array
+    fused_job: Array
+    fused_look: Array
+    job: Array
+    alarm_job: Array
+    alarm: Array
+
+    @classmethod
+    def join(cls, several: list[Rows]) -> Rows:
+        """All rows; jobs, looks and objects numbered on."""
+        out: dict[str, list[Array]] = {f.name: [] for f in fields(cls)}
+        jobs = looks = objects = 0
+        for r in several:
+            for f in fields(cls):
+                shift = {"fused_job": jobs, "alarm_job": jobs, "fused_look": looks, "look_object": objects}.get(
+                    f.name, 0
+                )
+                out[f.name].append(getattr(r, f.name) + shift)
+            jobs, looks = jobs + len(r.job), looks + len(r.look)
+            objects += int(r.look_object.max(initial=-1)) + 1
+        return cls(**{name: np.concatenate(parts) for name, parts in out.items()})
+
+
+def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
+    """One scene's answers as rows; boxes below `floor` count as none."""
+    config = draw_scene(seed, asked.split, asked.scene)
+    eyes = Eyes(scene_model(config))
+    captures = captures_of(asked.jobs)
+    column = {c: i for i, c in enumerate(captures)}
+    fleet = Fleet.of(captures)
+    looks = eyes.look(fleet)
+    ranks = np.stack([asked.ranks[c] for c in captures])
+    r, c = cell_of(looks.xy_m)
+    there = ranks[looks.capture[:, None], 0, r, c]
+    best = there.argmax(axis=1)
+    n = np.arange(len(best))
+    cell_r, cell_c = r[n, best], c[n, best]
+    confidence, norm = there[n, best], ranks[looks.capture, 1, cell_r, cell_c]
+    order = np.sort(ranks.reshape(len(captures), 2, -1), axis=-1)
+    above = np.array(
+        [4096 - np.searchsorted(order[k, 0], v, side="right") for k, v in zip(looks.capture, confidence, strict=True)]
+    )
+    above_norm = np.array(
+        [4096 - np.searchsorted(order[k, 1], v, side="right") for k, v in zip(looks.capture, norm, strict=True)]
+    )
+
+    jobs = [(j.ego, j.shares) for j in asked.jobs]
+    zeros = np.array([j.unsent == "zero" for j in asked.jobs])
+    exchange = Exchange.of(jobs, column)
+    pairs = pair(exchange, looks, fleet)
+    sent = _sent(asked, pairs, cell_r, cell_c, column)
+    by_norm = np.array([j.cells_by == "norm" for j in asked.jobs])[pairs.row, None]
+    rank = np.where(by_norm, above_norm[pairs.peer], above[pairs.peer]) / 4096.0
+    fused = covariates(pairs, exchange, looks, confidence, sent, rank.astype(np.float32), zeros[pairs.row])
+    late = np.array([any(s.representation not in ("features", "raw") for s in j.shares) for j in asked.jobs])
+    shift = mean_shift(pairs, exchange, sent)
+    score, offset, alarms = [], [], []
+    for m, (job, boxes) in enumerate(zip(asked.jobs, asked.boxes, strict=True)):
+        mine = pairs.look[pairs.row == m]
+        found, off, rest = _claim(job.ego, boxes.take(boxes.score >= floor), looks, mine, eyes)
+        score.append(found)
+        offset.append(off)
+        alarms.append(np.concatenate([np.full((len(rest), 1), m), rest], axis=1))
+    keep = ~late[pairs.row]
+    alarm = np.concatenate(alarms)
+    alarm = alarm[~late[alarm[:, 0].astype(int)]]
+    of_jobs = alarm_covariates(exchange, looks, zeros, config)
+    of_jobs[late] = np.nan  # boxes that were sent are worked out, not fitted
+    return Rows(
+        looks.covariates, confidence, norm, above / 4096.0, above_norm / 4096.0, looks.car,
+        np.bincount(looks.capture, minlength=len(captures))[looks.capture],
+        fused[keep], np.concatenate(score)[keep], np.concatenate(offset)[keep], looks.xy_m[pairs.look][keep], shift[keep],
+        (looks.yaw_rad[pairs.look] - fleet.yaw_rad[exchange.ego[pairs.row]])[keep],
+        pairs.row[keep], pairs.look[keep], of_jobs, alarm[:, 0].astype(int), alarm[:, 1:],
+    )  # fmt: skip
+
+
+def _sent(asked: Asked, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict[Any, int]) -> NDArray[np.bool_]:
+    """Whether the cell of each pair's car was sent, by the detector's own choice."""
+    sent = np.zeros(pairs.peer.shape, bool)
+    for m, job in enumerate(asked.jobs):
+        mine = np.flatnonzero(pairs.row == m)
+        slot = 0
+        for s in job.shares:
+            if s.representation not in ("features", "raw") or s.weight <= 0:
+                continue
+            rank = asked.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
+            mask = budget.select(rank, s.rho, s.roi, *s.capture.est_pose)
+            peer = pairs.peer[mine, slot]
+            sent[mine, slot] = (peer >= 0) & mask[cell_r[peer], cell_c[peer]]
+            slot += 1
+    return sent
+
+
+def _claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
+    """Which box is of which car, best first: scores [cars] (0: none), offsets [cars, 5], and the boxes that are of none [a, 6]."""
+    x, y, yaw = ego.est_pose
+    c, s = np.cos(yaw), np.sin(yaw)
+    dx, dy = boxes.xy_m[:, 0] - x, boxes.xy_m[:, 1] - y
+    at: Floats = np.stack([c * dx + s * dy, c * dy - s * dx], axis=1)
+    cars = looks.xy_m[mine]
+    score, offset = np.zeros(len(mine)), np.zeros((len(mine), 5))
+    rest = []
+    car_yaw = looks.yaw_rad[mine] - ego.true_yaw_rad
+    size = eyes.traffic.size_m[looks.car[mine]]
+    for b in range(len(boxes)):  # they are best first
+        away = np.hypot(*(cars - at[b]).T) + 1e3 * (score > 0)
+        best = int(away.argmin()) if len(away) else -1
+        turn = float(boxes.yaw_rad[b] - yaw)
+        if best < 0 or away[best] > REACH_M:
+            rest.append((*at[b], *boxes.size_m[b], turn, boxes.score[b]))
+            continue
+        score[best] = boxes.score[b]
+        off = (turn - car_yaw[best] + np.pi / 2) % np.pi - np.pi / 2
+        offset[best] = (*(at[b] - cars[best]), off, *np.log(boxes.size_m[b] / size[best]))
+    return score, offset, np.array(rest).reshape(-1, 6)

@@ -1,0 +1,113 @@
+"""Lines of sight over the town: a coarse height field, and who sees over it. Free of torch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.scene import SceneModel
+from perception.town import Floats, shadow_m
+
+RES_M = 0.8
+STEP_M = 1.0
+"""Heights between which a ray is not looked at."""
+CAR_TOP_M = 1.2
+"""What of a car has to be seen over a roof or a hedge."""
+NEAR_M = 8.0
+_RAYS = 16384
+
+
+class HeightField:
+    """Roofs and crowns of the town inside a scene's rectangle, on a 0.8 m raster; beyond it the land is flat."""
+
+    def __init__(self, scene: SceneModel) -> None:
+        x0, y0, x1, y1 = scene.rect
+        self.x0_m, self.y0_m = x0, y0
+        self.columns, self.rows = int(np.ceil((x1 - x0) / RES_M)) + 2, int(np.ceil((y1 - y0) / RES_M)) + 2
+        height = np.zeros((self.rows, self.columns), np.float32)
+        blocks = scene.town.blocks(x0, y0, x1, y1)
+        buildings = np.concatenate([b.buildings for b in blocks])
+        at = np.rint((buildings[:, :4] - (x0, y0, x0, y0)) / RES_M).astype(int).clip(0)
+        for (left, low, right, high), top in zip(at.tolist(), buildings[:, 4].tolist(), strict=True):
+            height[low:high, left:right] = top
+        _plant(height, np.concatenate([b.trees for b in blocks]), x0, y0)
+        self.top_m = float(height.max(initial=0.0))
+        self._flat = height.ravel()
+        self._sun = shadow_m(scene.config)
+
+    def seen(self, x_m: Floats, y_m: Floats, eye_m: Floats) -> NDArray[np.bool_]:
+        """Whether points [n] at a car's height are seen from `eye_m` [n, 3]."""
+        fall = np.maximum(eye_m[:, 2] - CAR_TOP_M, 1.0)
+        return self._march(x_m, y_m, (eye_m[:, 0] - x_m) / fall, (eye_m[:, 1] - y_m) / fall)
+
+    def lit(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
+        """Whether the sun reaches points [n] at a car's height."""
+        return self._march(x_m, y_m, *(np.full(len(x_m), -along) for along in self._sun))
+
+    def _march(self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats) -> NDArray[np.bool_]:
+        """Follow rays upwards; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
+        steps = int(np.ceil(max(self.top_m - CAR_TOP_M, 0.0) / STEP_M))
+        clear = np.ones(len(x_m), bool)
+        for at in range(0, len(x_m), _RAYS):
+            some = slice(at, at + _RAYS)
+            sx, sy = (
+                (slope_x[some] * (STEP_M / RES_M)).astype(np.float32),
+                (slope_y[some] * (STEP_M / RES_M)).astype(np.float32),
+            )
+            px = ((x_m[some] - self.x0_m) / RES_M).astype(np.float32) - 0.5 * sx
+            py = ((y_m[some] - self.y0_m) / RES_M).astype(np.float32) - 0.5 * sy
+            for k in range(steps):
+                px += sx
+                py += sy
+                pixel = py.astype(np.intp)
+                pixel *= self.columns
+                pixel += px.astype(np.intp)
+                clear[some] &= self._flat.take(pixel, mode="clip") < CAR_TOP_M + (k + 0.5) * STEP_M
+        return clear
+
+
+class Kerbs:
+    """How near parked cars are, on a raster of its own: 1 at one's middle, 0 from 8 m on."""
+
+    def __init__(self, scene: SceneModel) -> None:
+        x0, y0, x1, y1 = scene.rect
+        self.x0_m, self.y0_m = x0, y0
+        self.columns, self.rows = int((x1 - x0) / RES_M) + 2, int((y1 - y0) / RES_M) + 2
+        cars = scene.parked_cars
+        near = np.zeros((self.rows, self.columns), np.float32)
+        reach = int(NEAR_M / RES_M)
+        span = np.arange(-reach, reach + 1)
+        dy, dx = (d.ravel() for d in np.meshgrid(span, span, indexing="ij"))
+        column, row = (
+            ((cars.x_m - x0) / RES_M).astype(int)[:, None] + dx,
+            ((cars.y_m - y0) / RES_M).astype(int)[:, None] + dy,
+        )
+        value = np.broadcast_to(np.maximum(0.0, 1.0 - RES_M * np.hypot(dx, dy) / NEAR_M).astype(np.float32), row.shape)
+        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        np.maximum.at(near, (row[inside], column[inside]), value[inside])
+        self._flat = near.ravel()
+        gap = np.hypot(cars.x_m[:, None] - cars.x_m, cars.y_m[:, None] - cars.y_m)
+        np.fill_diagonal(gap, NEAR_M)
+        self.parked = np.maximum(0.0, 1.0 - gap.min(axis=1, initial=NEAR_M) / NEAR_M).astype(np.float32)
+        """Each parked car's nearness to the next one."""
+
+    def near(self, x_m: Floats, y_m: Floats) -> NDArray[np.float32]:
+        """How near points [n] are to a parked car."""
+        row, column = ((y_m - self.y0_m) / RES_M).astype(np.intp), ((x_m - self.x0_m) / RES_M).astype(np.intp)
+        return self._flat.take(row * self.columns + column, mode="clip")
+
+
+def _plant(height: NDArray[np.float32], trees: Floats, x0_m: float, y0_m: float) -> None:
+    """Raise the field to the trees' domes (x, y, radius, height, tone), in place."""
+    reach = int(np.ceil(trees[:, 2].max(initial=0.0) / RES_M)) + 1
+    span = np.arange(-reach, reach + 1)
+    dy, dx = (d.ravel() for d in np.meshgrid(span, span, indexing="ij"))
+    column = np.floor((trees[:, 0, None] - x0_m) / RES_M).astype(int) + dx
+    row = np.floor((trees[:, 1, None] - y0_m) / RES_M).astype(int) + dy
+    away = (x0_m + (column + 0.5) * RES_M - trees[:, 0, None]) ** 2 + (
+        y0_m + (row + 0.5) * RES_M - trees[:, 1, None]
+    ) ** 2
+    part = away / trees[:, 2, None] ** 2
+    inside = (part < 1.0) & (row >= 0) & (row < height.shape[0]) & (column >= 0) & (column < height.shape[1])
+    dome = (trees[:, 3, None] * (1.0 - 0.35 * part)).astype(np.float32)
+    np.maximum.at(height, (row[inside], column[inside]), dome[inside])

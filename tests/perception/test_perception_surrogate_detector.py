@@ -1,0 +1,219 @@
+"""The surrogate as a detector: limits, draws that do not depend on what was sent, one batch as many."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from perception_examples import EMPTY, capture, cross
+
+from perception.ap import match
+from perception.detector import ground_truth
+from perception.detectors import DetectsMany
+from perception.scene import SceneModel
+from perception.surrogate.detector import SurrogateDetector
+from perception.surrogate.exchange import Exchange, pair
+from perception.surrogate.features import Eyes, Fleet
+from perception.surrogate.luck import Luck, uniform
+from perception.types import Boxes, Capture, Share
+from scenarios.schema import Perception, Scene, Target
+
+BOUNDS = (-50.0, -50.0, 50.0, 50.0)
+TIMES = np.arange(2.0, 26.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneModel:
+    return SceneModel(Scene(), None, BOUNDS)
+
+
+@pytest.fixture(scope="module")
+def detector(scene: SceneModel) -> SurrogateDetector:
+    return SurrogateDetector(scene, Perception(), seed=3)
+
+
+def shared(
+    fleet: list[Capture], rho: float, weight: float = 1.0, kind: str = "features"
+) -> list[tuple[Capture, list[Share]]]:
+    return [(e, [Share(c, kind, rho, None, weight) for c in fleet if c is not e]) for e in fleet]
+
+
+def moments(rho: float, weight: float = 1.0) -> list[list[tuple[Capture, list[Share]]]]:
+    return [shared(cross(10.0, 20.0, 0.3, t_s=float(t)), rho, weight) for t in TIMES]
+
+
+def same(a: list[Boxes], b: list[Boxes]) -> None:
+    assert len(a) == len(b)
+    for one, other in zip(a, b, strict=True):
+        for name in Boxes.__slots__:
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_it_has_the_detectors_interface_and_says_which_fit_it_is_of(detector: SurrogateDetector) -> None:
+    assert isinstance(detector, DetectsMany)
+    assert detector.calibration.startswith("disconet-")
+
+
+def test_many_moments_at_once_are_one_after_the_other(detector: SurrogateDetector, scene: SceneModel) -> None:
+    asked = moments(0.1)
+    one_by_one = [boxes for moment in asked for boxes in detector.detect(moment)]
+    same(list(detector.detect_many(asked)), one_by_one)
+    same(one_by_one, [b for m in asked for b in SurrogateDetector(scene, Perception(), seed=3).detect(m)])
+
+
+def test_boxes_come_best_first_and_above_the_threshold(scene: SceneModel) -> None:
+    found = list(SurrogateDetector(scene, Perception(score_threshold=0.6), seed=3).detect_many(moments(0.25)))
+    assert sum(map(len, found)) > 100
+    for boxes in found:
+        assert (np.diff(boxes.score) <= 0).all()
+        assert (boxes.score >= np.float32(0.6)).all()
+
+
+def test_another_seed_or_replication_is_other_luck(scene: SceneModel, detector: SurrogateDetector) -> None:
+    job = moments(0.1)[0]
+    mine = detector.detect(job)[0].score
+    for other in (
+        SurrogateDetector(scene, Perception(), seed=4),
+        SurrogateDetector(scene, Perception(), seed=3, replication=1),
+    ):
+        theirs = other.detect(job)[0].score
+        assert len(mine) != len(theirs) or not np.array_equal(mine, theirs)
+
+
+def test_nothing_sent_is_alone(detector: SurrogateDetector, scene: SceneModel) -> None:
+    alone = [boxes for m in moments(1.0) for boxes in detector.detect([(e, ()) for e, _ in m])]
+    same([b for m in moments(1.0, weight=0.0) for b in detector.detect(m)], alone)
+    mute = SurrogateDetector(scene, Perception(fusion="none"), seed=3)
+    same([b for m in moments(1.0) for b in mute.detect(m)], alone)
+
+
+def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
+    detector: SurrogateDetector, scene: SceneModel
+) -> None:
+    eyes, luck = Eyes(scene), Luck(3, 0, Eyes(scene).traffic.count, detector.parameters.alike)
+    fleet = cross(10.0, 20.0, 0.3)
+    every, two = eyes.look(Fleet.of(fleet)), eyes.look(Fleet.of(fleet[1:3]))
+    a, b = luck.of(fleet, every), luck.of(fleet[1:3], two)
+    mine = np.isin(every.capture, (1, 2))
+    for name in ("look", "rank", "find", "residual"):
+        np.testing.assert_array_equal(getattr(a, name)[mine], getattr(b, name))
+    np.testing.assert_array_equal(a.alarm_at[1:3], b.alarm_at)
+
+
+def test_uniform_draws_are_uniform_and_unlike_across_purposes() -> None:
+    words = np.arange(100_000, dtype=np.uint64)
+    u, v = uniform(words, 0), uniform(words, 1)
+    for one in (u, v):
+        assert abs(one.mean() - 0.5) < 4 / np.sqrt(12 * len(u))
+        assert abs(one.var() - 1 / 12) < 1e-3
+    assert abs(np.corrcoef(u, v)[0, 1]) < 0.015
+    assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 0.015
+
+
+def test_sharing_finds_more_cars_and_more_cells_find_no_fewer(detector: SurrogateDetector) -> None:
+    """On the average of 60 egos; a tenth of a car is luck's."""
+
+    def hits(rho: float) -> float:
+        asked = moments(rho)
+        egos = [e for m in asked for e, _ in m]
+        truths = detector.truth_many([e.t_s for e in egos], egos)
+        return float(np.mean([match(b, t).hit.sum() for b, t in zip(detector.detect_many(asked), truths, strict=True)]))
+
+    found = [hits(rho) for rho in (0.0, 0.02, 0.1, 1.0)]
+    assert found[-1] > found[0] + 0.5
+    assert (np.diff(found) > -0.3).all(), found
+
+
+def test_a_larger_budget_sends_every_cell_that_a_smaller_one_sent(
+    detector: SurrogateDetector, scene: SceneModel
+) -> None:
+    fleet = cross(10.0, 20.0, 0.3)
+    few = [cells_of(fleet, rho) for rho in (0.01, 0.1, 1.0)]
+    assert (np.diff(np.stack(few), axis=0) > 0).all()
+
+
+def cells_of(fleet: list[Capture], rho: float) -> np.ndarray:
+    jobs = shared(fleet, rho)
+    return Exchange.of(jobs, {c: i for i, c in enumerate(fleet)}).cells
+
+
+def test_cells_of_a_disc_are_its_area_and_counted_where_it_leaves_the_map() -> None:
+    fleet = cross(0.0, 0.0, 0.0)
+    column = {c: i for i, c in enumerate(fleet)}
+    inside = [(fleet[0], [Share(fleet[1], "features", 1.0, (20.0, 0.0, 32.0), 1.0)])]
+    rim = [(fleet[0], [Share(fleet[1], "features", 1.0, (20.0 + 102.4, 0.0, 32.0), 1.0)])]
+    assert Exchange.of(inside, column).allowed[0, 0] == pytest.approx(np.pi * 10**2)
+    assert Exchange.of(rim, column).allowed[0, 0] == pytest.approx(np.pi * 10**2 / 2, rel=0.05)
+
+
+def test_an_old_share_of_a_moving_car_lies_behind_it() -> None:
+    scene = SceneModel(EMPTY, Target(waypoints_m=((-40.0, 0.0), (40.0, 0.0)), speed_mps=8.0), BOUNDS)
+    ego, late = capture(0.0, 0.0, t_s=5.0), capture(5.0, 5.0, drone=1, t_s=4.6)
+    jobs = [(ego, [Share(late, "features", 1.0, None, 1.0)])]
+    fleet = Fleet.of([ego, late])
+    pairs = pair(Exchange.of(jobs, {ego: 0, late: 1}), Eyes(scene).look(fleet), fleet)
+    np.testing.assert_allclose(pairs.shift_m[0, 0], (-8.0 * 0.4, 0.0), atol=1e-4)
+
+
+def test_heading_errors_shift_what_a_peer_sends_by_its_range() -> None:
+    scene = SceneModel(EMPTY, Target(waypoints_m=((60.0, 0.0),)), BOUNDS)
+    ego, peer = capture(0.0, 0.0), capture(0.0, 0.0, drone=1, est=(0.0, 0.0, 60.0, 0.01))
+    fleet = Fleet.of([ego, peer])
+    jobs = [(ego, [Share(peer, "features", 1.0, None, 1.0)])]
+    pairs = pair(Exchange.of(jobs, {ego: 0, peer: 1}), Eyes(scene).look(fleet), fleet)
+    np.testing.assert_allclose(pairs.shift_m[0, 0], (60 * (np.cos(0.01) - 1), 60 * np.sin(0.01)), atol=1e-4)
+
+
+def test_boxes_stand_by_the_estimated_pose(scene: SceneModel) -> None:
+    """An ego that believes itself 3 m east puts every box 3 m east."""
+    plain, moved = capture(10.0, 20.0), capture(10.0, 20.0, est=(13.0, 20.0, 60.0, 0.0))
+    detector = SurrogateDetector(scene, Perception(), seed=3)
+    a, b = detector.detect([(plain, ())])[0], detector.detect([(moved, ())])[0]
+    np.testing.assert_allclose(b.xy_m - a.xy_m, np.tile((3.0, 0.0), (len(a), 1)), atol=1e-3)
+
+
+def test_truth_is_the_detectors(scene: SceneModel, detector: SurrogateDetector) -> None:
+    ego = capture(10.0, 20.0, yaw=0.4, pitch=0.05, t_s=7.3)
+    mine, theirs = detector.truth(7.4, ego), ground_truth(scene, 7.4, (10.0, 20.0), 102.4, ego.true_yaw_rad)
+    assert len(mine) == len(theirs) > 10
+    order = [np.lexsort(b.xy_m.T) for b in (mine, theirs)]
+    np.testing.assert_allclose(mine.xy_m[order[0]], theirs.xy_m[order[1]], atol=1e-3)
+    np.testing.assert_allclose(mine.size_m[order[0]], theirs.size_m[order[1]], atol=1e-5)
+
+
+def test_boxes_that_are_sent_are_the_peers_own(detector: SurrogateDetector) -> None:
+    fleet = cross(10.0, 20.0, 0.3)
+    for kind, most in (("detections", 10_000), ("tracks", 12)):
+        own, joined = detector.detect([(fleet[0], ())])[0], detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
+        assert (
+            len(own) - (kind == "tracks")
+            < len(joined)
+            <= len(own) + min(most, len(detector.detect([(fleet[1], ())])[0]))
+        )
+
+
+def test_counts_grow_with_the_disc_and_shrink_with_the_threshold(
+    scene: SceneModel, detector: SurrogateDetector
+) -> None:
+    ego = capture(10.0, 20.0)
+    counts = [detector.count_boxes(ego, disc) for disc in ((10.0, 20.0, 16.0), (10.0, 20.0, 64.0), None)]
+    assert counts == sorted(counts)
+    assert counts[0] < counts[2]
+    assert SurrogateDetector(scene, Perception(score_threshold=0.7), seed=3).count_boxes(ego, None) < counts[2]
+
+
+def test_it_renders_nothing(detector: SurrogateDetector) -> None:
+    with pytest.raises(
+        ValueError, match=r"^the surrogate renders nothing: fly with perception.detector = torch to see camera views$"
+    ):
+        detector.camera_views(capture())
+
+
+def test_another_fusion_is_refused(scene: SceneModel, detector: SurrogateDetector) -> None:
+    with pytest.raises(
+        ValueError, match=r"calibrated for fusion 'disconet', perception.fusion is 'fcooper', must be that or 'none'$"
+    ):
+        SurrogateDetector(scene, Perception(fusion="fcooper"), seed=3)
+    card = {**detector.parameters.card, "fusion": "fcooper"}
+    SurrogateDetector.of(scene, Perception(fusion="fcooper"), dataclasses.replace(detector.parameters, card=card), 3)

@@ -1,0 +1,174 @@
+"""The calibration's file and its parts: what is broken is named; sight and regressions against plain definitions."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perception_examples import EMPTY
+from safetensors.numpy import load_file, save_file
+
+from perception.scene import SceneModel
+from perception.surrogate.fit import _poisson, _train
+from perception.surrogate.luck import BANDS
+from perception.surrogate.model import NETS, PLACE_COVARIATES, RANK_COVARIATES, SHIPPED, Net, Parameters, load, save
+from perception.surrogate.sight import CAR_TOP_M, HeightField
+from scenarios.schema import Scene
+
+RNG = np.random.Generator(np.random.PCG64(5))
+CARD = {"format": 1, "id": "x", "fusion": "disconet"}
+
+
+@pytest.fixture(scope="module")
+def parameters() -> Parameters:
+    return load(SHIPPED)
+
+
+def broken(path: Path, card: object = CARD, **changes: np.ndarray | None) -> Path:
+    """The shipped calibration with tensors changed, or without those that are None."""
+    tensors = {**load_file(SHIPPED), **changes}
+    metadata = {} if card is None else {"surrogate": card if isinstance(card, str) else json.dumps(card)}
+    save_file({k: np.ascontiguousarray(v) for k, v in tensors.items() if v is not None}, path, metadata=metadata)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("card", "changes", "says"),
+    [
+        (None, {}, "holds no calibration; `sortie calibrate` makes one"),
+        ("{", {}, "its card is no JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
+        ({**CARD, "format": 7}, {}, "format is 7, must be 1; calibrate again"),
+        ({**CARD, "fusion": 3}, {}, "card.fusion is 3, must be text"),
+        (CARD, {"alike": None}, "tensor alike is missing"),
+        (CARD, {"alike": np.zeros(3, np.float32)}, "tensor alike has shape [3], must be [2]"),
+        (
+            CARD,
+            {"look.0.weight": np.zeros((2, 2), np.float32)},
+            "tensor look.0.weight has shape [2, 2], must be [14, any]",
+        ),
+        (CARD, {"alike": np.array([np.nan, 0], np.float32)}, "tensor alike holds values that are not finite"),
+    ],
+)
+def test_a_broken_calibration_is_named(
+    tmp_path: Path, card: object, changes: dict[str, np.ndarray | None], says: str
+) -> None:
+    path = broken(tmp_path / "c.safetensors", card, **changes)
+    with pytest.raises(ValueError) as error:
+        load(path)
+    assert str(error.value) == f"{path}: {says}"
+
+
+def test_a_missing_one_and_no_safetensors_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"none.safetensors: no such calibration; `sortie calibrate` makes one$"):
+        load(tmp_path / "none.safetensors")
+    (tmp_path / "text.safetensors").write_text("no")
+    with pytest.raises(ValueError, match=r"text.safetensors: no safetensors file: "):
+        load(tmp_path / "text.safetensors")
+
+
+def test_what_is_saved_is_loaded(tmp_path: Path, parameters: Parameters) -> None:
+    save(tmp_path / "again.safetensors", parameters)
+    again = load(tmp_path / "again.safetensors")
+    assert again.card == parameters.card
+    for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "boxes"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(parameters, name))
+    x = RNG.normal(size=(7, 14)).astype(np.float32)
+    np.testing.assert_array_equal(again.nets["look"](x), parameters.nets["look"](x))
+
+
+def test_the_shipped_one_says_how_far_it_is_off(parameters: Parameters) -> None:
+    levels = {v["condition"]: v for v in parameters.card["levels"]}
+    assert {"alone", "all-4, ρ = 0.25", "all-4, ρ = 1"} <= set(levels)
+    for v in levels.values():
+        assert v["error"] == pytest.approx(v["surrogate"] - v["torch"])
+    assert parameters.alarm_rate.shape[1] <= BANDS
+
+
+def test_a_net_is_its_layers_however_many_rows_it_takes() -> None:
+    weight = tuple(RNG.normal(size=s).astype(np.float32) for s in ((3, 5), (5, 2)))
+    bias = tuple(RNG.normal(size=s).astype(np.float32) for s in (5, 2))
+    x = RNG.normal(size=(1001, 3)).astype(np.float32)
+    plain = np.maximum(x @ weight[0] + bias[0], 0) @ weight[1] + bias[1]
+    np.testing.assert_allclose(Net(weight, bias)(x), plain, rtol=1e-5, atol=1e-5)
+
+
+def test_better_luck_and_surer_drones_rank_higher(parameters: Parameters) -> None:
+    x = np.zeros((50, len(RANK_COVARIATES)), np.float32)
+    x[:, 0] = np.linspace(-4, 3, 50)
+    fraction = parameters.rank(x, np.zeros(50, np.float32))
+    assert fraction[0] > 10 * fraction[-1]
+    assert (fraction <= 1).all()
+    assert (fraction > 0).all()
+    luck = parameters.rank(x[:1].repeat(3, 0), np.array([-1, 0, 1], np.float32))
+    assert (np.diff(luck) > 0).all()
+
+
+def test_surer_drones_find_more(parameters: Parameters) -> None:
+    x = np.zeros((2000, NETS["find"][0]), np.float32)
+    x[:, 1:4], x[:, 11], x[:, 12] = -8.0, 0.5, 1.0
+    luck = np.stack([RNG.random(2000), RNG.normal(size=2000)], axis=1).astype(np.float32)
+    found = []
+    for own in (-2.0, 0.0, 1.5):
+        x[:, 0] = own
+        found.append(float((parameters.find(x, luck) > 0.5).mean()))
+    assert found[0] < found[1] < found[2]
+
+
+def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
+    x = np.zeros((2000, len(PLACE_COVARIATES)), np.float32)
+    x[:, 1:4], x[:, 11], x[:, 12] = -8.0, 0.7, 1.0
+    spread = []
+    for own, score in ((-1.5, 0.25), (1.5, 0.8)):
+        x[:, 0], x[:, -1] = own, score
+        spread.append(float(np.abs(parameters.place(x, RNG.random(2000).astype(np.float32))[0][:, :2]).mean()))
+    assert spread[0] > 1.3 * spread[1]
+
+
+def test_sight_is_a_ray_against_boxes() -> None:
+    """Houses alone, against rays that are stepped finely through the rectangles themselves."""
+    scene = SceneModel(Scene(tree_density=0.0), None, (-50, -50, 50, 50))
+    houses = np.concatenate([b.buildings for b in scene.town.blocks(-120, -120, 120, 120)])
+    field, n = HeightField(scene), 600
+    x, y = RNG.uniform(-80, 80, n), np.round(RNG.uniform(-80, 80, n) / 80) * 80 + RNG.uniform(-5, 5, n)
+    eye = np.stack([RNG.uniform(-50, 50, n), RNG.uniform(-50, 50, n), np.full(n, 60.0)], axis=1)
+    z = np.arange(CAR_TOP_M, 30.0, 0.1)[:, None]
+    part = (z - CAR_TOP_M) / (60.0 - CAR_TOP_M)
+    px, py = x + part * (eye[:, 0] - x), y + part * (eye[:, 1] - y)
+    hidden = np.zeros(n, bool)
+    for x0, y0, x1, y1, top, _ in houses:
+        hidden |= ((px > x0) & (px < x1) & (py > y0) & (py < y1) & (z < top)).any(axis=0)
+    assert 0.03 < hidden.mean() < 0.9
+    assert (field.seen(x, y, eye) == ~hidden).mean() > 0.95
+
+
+def test_nothing_hides_on_an_empty_plain() -> None:
+    field = HeightField(SceneModel(EMPTY, None, (-50, -50, 50, 50)))
+    eye = np.tile((0.0, 0.0, 60.0), (9, 1))
+    assert field.seen(np.linspace(-90, 90, 9), np.zeros(9), eye).all()
+    assert field.lit(np.zeros(3), np.zeros(3)).all()
+
+
+def test_poisson_regression_finds_the_rates() -> None:
+    x = np.stack([np.ones(6000), RNG.normal(size=6000)], axis=1)
+    y = RNG.poisson(np.exp(0.7 + 0.4 * x[:, 1])).astype(float)
+    np.testing.assert_allclose(_poisson(x, y), (0.7, 0.4), atol=0.05)
+    np.testing.assert_allclose(_poisson(x[:, :1], y), np.log(y.mean()), atol=1e-4)
+
+
+def test_a_fit_returns_the_network_that_it_fitted() -> None:
+    """Inputs of another scale are folded into the first layer, and the mean and spread are learned."""
+    from perception.surrogate.fit import _normal_loss
+
+    x = RNG.normal(size=(4000, NETS["rank"][0])) * 3 + 1
+    net, out = _train("rank", x, {"y": 0.5 * x[:, 0] + 0.2 * RNG.normal(size=4000)}, _normal_loss, 0, 400)
+    np.testing.assert_allclose(net(x.astype(np.float32)), out, atol=2e-3)
+    assert np.abs(out[:, 0] - 0.5 * x[:, 0]).mean() < 0.1
+    assert abs(np.exp(out[:, 1]).mean() - 0.2) < 0.05
+
+
+def test_parameters_cannot_be_changed(parameters: Parameters) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        parameters.alike = np.zeros(2)  # type: ignore[misc]
