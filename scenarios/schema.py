@@ -241,7 +241,8 @@ class Perception(Section):
         "disconet", description="How what peers sent is fused; weights belong to a fusion, none and late take any."
     )
     weights: str | None = Field(
-        None, description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one."
+        None,
+        description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one.",
     )
     recording: str | None = Field(
         None, description="What the recorded detector saw: an npz file or a Zarr folder (perception/outside)."
