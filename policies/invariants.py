@@ -1,0 +1,419 @@
+"""Invariants: what must hold of a policy's directives whatever the view, as short lines of text.
+
+    when battery < 0.3: representation <= detections and rate_hz <= 2
+    when target_in_region and peers >= 1: any_link(representation >= detections)
+    rate_hz <= fresh.rate_hz
+
+A line is `REQUIREMENT`, or `when CONDITION: REQUIREMENT`; `#` begins a comment. An expression has comparisons,
+`and`, `or`, `not`, `+ - * /`, numbers, and the words of `WORDS`. One that speaks of a link must hold for each
+outgoing link; `any_link(…)`, `every_link(…)`, `count_links(…)` and `sum_links(…)` speak of all of them at once.
+`fresh.rate_hz` is what the same policy decides for the same link were every descriptor just heard (age 0).
+
+Python's parser reads the text and an allow-list of its nodes becomes a frozen tree; nothing is ever executed.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
+
+Kind = Literal["number", "truth"]
+
+
+class InvariantError(ValueError):
+    """An invariant's text is not one; the message names the line and what it stumbled over."""
+
+
+# --- the words -----------------------------------------------------------------------------------
+
+
+class Scope(NamedTuple):
+    """What an expression is about: a view, all its directives, and one link of them where it speaks of a link."""
+
+    view: FleetView
+    me: Descriptor
+    directives: Sequence[Directive]
+    fresh: Mapping[int, Directive]
+    link: Directive | None = None
+
+
+class Word(NamedTuple):
+    """A name of the language; `of_link` where it needs a link."""
+
+    about: str
+    kind: Kind
+    of_link: bool
+    value: Callable[[Scope], Any]
+
+
+def _view_word(about: str, value: Callable[[Scope], Any], kind: Kind = "number") -> Word:
+    return Word(about, kind, False, value)
+
+
+def _decided(about: str, value: Callable[[Directive], Any], kind: Kind = "number") -> Word:
+    return Word(about, kind, True, lambda s: value(_link(s)))
+
+
+def _of_peer(about: str, value: Callable[[Scope, int], Any]) -> Word:
+    return Word(about, "number", True, lambda s: value(s, _link(s).destination))
+
+
+def _link(scope: Scope) -> Directive:
+    assert scope.link is not None, "the parser binds link words to a link"  # noqa: S101
+    return scope.link
+
+
+DECISIONS: dict[str, Word] = {
+    "representation": _decided("the rung: none, tracks, detections, features or raw", lambda d: d.representation),
+    "rho": _decided("budget, 0 … 1", lambda d: d.rho),
+    "rate_hz": _decided("rate, Hz", lambda d: d.rate_hz),
+    "deadline_s": _decided("deadline, s", lambda d: d.deadline_s),
+    "fusion_weight": _decided("weight at the receiver, 0 … 1", lambda d: d.fusion_weight),
+    "duty": _decided("share of frames in which perception runs, 0 … 1", lambda d: d.duty_percent / 100),
+    "roi": _decided("whether it is confined to a region", lambda d: d.roi is not None, "truth"),
+}
+"""What a directive says of its link."""
+
+WORDS: dict[str, Word] = {
+    "battery": _view_word("the ego's state of charge, 0 … 1", lambda s: s.me.battery_soc),
+    "cpu": _view_word("the ego's CPU headroom, 0 … 1", lambda s: s.me.cpu_headroom),
+    "gpu": _view_word("the ego's GPU headroom, 0 … 1", lambda s: s.me.gpu_headroom),
+    "phase": _view_word("the ego's: transit, search, track, returning or landing", lambda s: s.me.task_phase),
+    "peers": _view_word("how many peers were heard", lambda s: len(s.view.peers)),
+    "region": _view_word("the ego has a region of responsibility", lambda s: s.me.region is not None, "truth"),
+    "targets": _view_word("the ego reports priority targets", lambda s: bool(s.me.priority_target_ids), "truth"),
+    "target_in_region": _view_word(
+        "the ego has a region and reports targets; a descriptor does not say what they are, people or cars",
+        lambda s: s.me.region is not None and bool(s.me.priority_target_ids),
+        "truth",
+    ),
+    "goodput_mbps": _of_peer("to the link's peer, as the ego measured it", lambda s, p: s.me.goodput_to(p)),
+    "age_s": _of_peer("age of the peer's descriptor", lambda s, p: s.view.age_s[p]),
+    "age_periods": _of_peer("the same in periods", lambda s, p: s.view.age_s[p] / s.view.period_s),
+    "peer_battery": _of_peer("the peer's state of charge, 0 … 1", lambda s, p: s.view.descriptors[p].battery_soc),
+    **DECISIONS,
+}
+"""Every name an invariant may use."""
+
+CONSTANTS: dict[str, int] = {r.name.lower(): int(r) for r in Representation} | {
+    "transit": TaskPhase.TRANSIT,
+    "search": TaskPhase.SEARCH,
+    "track": TaskPhase.TRACK,
+    "returning": TaskPhase.RETURN,  # `return` is a word of Python's
+    "landing": TaskPhase.LANDING,
+}
+LINK_FUNCTIONS: dict[str, tuple[Kind, Kind]] = {
+    "any_link": ("truth", "truth"),
+    "every_link": ("truth", "truth"),
+    "count_links": ("truth", "number"),
+    "sum_links": ("number", "number"),
+}
+"""Functions over all links: the kind of what stands in the brackets, and of what comes out."""
+
+
+# --- the tree ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    word: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fresh:
+    """The same decision, were every descriptor just heard."""
+
+    word: str
+
+
+@dataclass(frozen=True, slots=True)
+class Binary:
+    """A comparison or arithmetic."""
+
+    sign: str
+    left: Node
+    right: Node
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """`and`, `or`, or `not` (of one part)."""
+
+    word: str
+    parts: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """A function over all links."""
+
+    function: str
+    body: Node
+
+
+Node = Number | Name | Fresh | Binary | Logic | Links
+
+_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+    "==": lambda a, b: a == b,
+    "!=": lambda a, b: a != b,
+}
+_ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
+    "+": lambda a, b: a + b,
+    "-": lambda a, b: a - b,
+    "*": lambda a, b: a * b,
+    "/": lambda a, b: a / b,
+}
+_SIGNS: dict[type[ast.AST], str] = {
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Invariant:
+    """One line: where `when` is true (None: always), `then` must be."""
+
+    text: str
+    when: Node | None
+    then: Node
+
+    @property
+    def of_link(self) -> bool:
+        """Whether it must hold for each link by itself."""
+        return any(_speaks_of_link(n) for n in (self.when, self.then) if n is not None)
+
+    @property
+    def needs_fresh(self) -> bool:
+        """Whether it compares with what the policy decides at age 0."""
+        return any(isinstance(n, Fresh) for top in (self.when, self.then) if top is not None for n in walk(top))
+
+
+def walk(node: Node) -> Iterator[Node]:
+    """The node and all below it."""
+    yield node
+    for below in _below(node):
+        yield from walk(below)
+
+
+def _below(node: Node) -> tuple[Node, ...]:
+    match node:
+        case Binary():
+            return (node.left, node.right)
+        case Logic():
+            return node.parts
+        case Links():
+            return (node.body,)
+        case _:
+            return ()
+
+
+def _speaks_of_link(node: Node) -> bool:
+    if isinstance(node, Links):
+        return False  # it binds the link itself
+    if isinstance(node, Fresh):
+        return True
+    if isinstance(node, Name):
+        return node.word in WORDS and WORDS[node.word].of_link
+    return any(_speaks_of_link(below) for below in _below(node))
+
+
+# --- from text -----------------------------------------------------------------------------------
+
+
+def parse(text: str) -> tuple[Invariant, ...]:
+    """Invariants of a text, one a line.
+
+    Raises:
+        InvariantError: naming the line and what is wrong with it.
+    """
+    found = []
+    for number, raw in enumerate(text.splitlines(), 1):
+        line = raw.partition("#")[0].strip()
+        if not line:
+            continue
+        try:
+            found.append(_parse_line(line))
+        except InvariantError as error:
+            raise InvariantError(f"line {number}, {line!r}: {error}") from None
+    return tuple(found)
+
+
+def _parse_line(line: str) -> Invariant:
+    when = None
+    requirement = line
+    if line.startswith("when "):
+        condition, colon, requirement = line.removeprefix("when ").partition(":")
+        if not colon:
+            raise InvariantError("a condition ends with a colon, as in `when battery < 0.3: rate_hz <= 2`")
+        when = _truth(condition)
+    return Invariant(line, when, _truth(requirement))
+
+
+def _truth(text: str) -> Node:
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+        node = _node(tree)
+    except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
+        if isinstance(error, InvariantError):
+            raise
+        raise InvariantError(f"{text.strip()!r} is no expression") from None
+    if _kind(node) != "truth":
+        raise InvariantError(f"{text.strip()!r} is a number, must be true or false")
+    return node
+
+
+def _node(tree: ast.expr) -> Node:
+    """The allow-list: what is not named here is refused."""
+    match tree:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+            return Number(value)
+        case ast.Name(id=word):
+            if word in CONSTANTS:
+                return Number(CONSTANTS[word])
+            if word in WORDS:
+                return Name(word)
+            raise InvariantError(f"unknown word {word!r}, known: {', '.join([*WORDS, *CONSTANTS])}")
+        case ast.Attribute(value=ast.Name(id="fresh"), attr=word) if word in DECISIONS:
+            return Fresh(word)
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            return Logic("not", (_of_kind("truth", operand),))
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return Binary("-", Number(0), _of_kind("number", operand))
+        case ast.BoolOp(op=op, values=values):
+            return Logic("and" if isinstance(op, ast.And) else "or", tuple(_of_kind("truth", v) for v in values))
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
+            return Binary(_SIGNS[type(op)], _of_kind("number", left), _of_kind("number", right))
+        case ast.Compare(left=first, ops=ops, comparators=rest) if all(type(op) in _SIGNS for op in ops):
+            sides = [_of_kind("number", side) for side in (first, *rest)]
+            pairs = [
+                Binary(_SIGNS[type(op)], left, right) for op, left, right in zip(ops, sides, sides[1:], strict=False)
+            ]
+            return pairs[0] if len(pairs) == 1 else Logic("and", tuple(pairs))
+        case ast.Call(func=ast.Name(id=function), args=[body], keywords=[]) if function in LINK_FUNCTIONS:
+            inner = _of_kind(LINK_FUNCTIONS[function][0], body)
+            if any(isinstance(n, Links) for n in walk(inner)):
+                raise InvariantError(f"{function}(…) holds another function over links")
+            return Links(function, inner)
+    raise InvariantError(f"{ast.unparse(tree)!r} has no place in an invariant")
+
+
+def _of_kind(kind: Kind, tree: ast.expr) -> Node:
+    node = _node(tree)
+    if _kind(node) != kind:
+        wanted = "a number" if kind == "number" else "true or false"
+        raise InvariantError(f"{ast.unparse(tree)!r} must be {wanted}")
+    return node
+
+
+def _kind(node: Node) -> Kind:
+    match node:
+        case Number():
+            return "number"
+        case Name() | Fresh():
+            return WORDS[node.word].kind
+        case Binary():
+            return "truth" if node.sign in _COMPARE else "number"
+        case Logic():
+            return "truth"
+        case Links():
+            return LINK_FUNCTIONS[node.function][1]
+
+
+# --- judging -------------------------------------------------------------------------------------
+
+
+def violations(
+    invariant: Invariant, view: FleetView, directives: Sequence[Directive], fresh: Sequence[Directive] = ()
+) -> list[Directive | None]:
+    """The directives that break an invariant; [None] where it is broken as a whole.
+
+    Args:
+        invariant: the line.
+        view: what the policy saw.
+        directives: what it decided.
+        fresh: what it decides on the same view at age 0, for invariants that ask.
+    """
+    me = view.me
+    if me is None:
+        return []
+    scope = Scope(view, me, directives, {d.destination: d for d in fresh})
+    broken: list[Directive | None] = []
+    for link in directives if invariant.of_link else (None,):
+        here = scope._replace(link=link)
+        if (invariant.when is None or evaluate(invariant.when, here)) and not evaluate(invariant.then, here):
+            broken.append(link)
+    return broken
+
+
+def evaluate(node: Node, scope: Scope) -> Any:
+    """An expression's value; a division by zero is infinite."""
+    match node:
+        case Number():
+            return node.value
+        case Name():
+            return WORDS[node.word].value(scope)
+        case Fresh():
+            link = _link(scope)
+            known = scope.fresh.get(link.destination, Directive(link.source, link.destination))
+            return WORDS[node.word].value(scope._replace(link=known))
+        case Logic(word="not"):
+            return not evaluate(node.parts[0], scope)
+        case Logic():
+            values = (evaluate(part, scope) for part in node.parts)
+            return all(values) if node.word == "and" else any(values)
+        case Binary():
+            left, right = evaluate(node.left, scope), evaluate(node.right, scope)
+            if node.sign in _COMPARE:
+                return _COMPARE[node.sign](left, right)
+            if node.sign == "/" and right == 0:
+                return float("inf")
+            return _ARITHMETIC[node.sign](left, right)
+        case Links():
+            links = (evaluate(node.body, scope._replace(link=d)) for d in scope.directives)
+            if node.function == "any_link":
+                return any(links)
+            if node.function == "every_link":
+                return all(links)
+            return sum(1 if v else 0 for v in links) if node.function == "count_links" else sum(links)
+
+
+def complaint(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
+    """What a policy breaks on a view, in words; None where it keeps every invariant."""
+    directives = list(policy(view))
+    fresh: list[Directive] | None = None
+    for invariant in invariants:
+        if invariant.needs_fresh and fresh is None:
+            fresh = list(policy(just_heard(view)))
+        for broken in violations(invariant, view, directives, fresh or ()):
+            where = (
+                "the directives break" if broken is None else f"directive {broken.source}→{broken.destination} breaks"
+            )
+            return f"{where} {invariant.text!r}: {spelt(directives if broken is None else [broken])}"
+    return None
+
+
+def just_heard(view: FleetView) -> FleetView:
+    """The same view with every age 0."""
+    return view._replace(age_s=dict.fromkeys(view.age_s, 0.0))
+
+
+def spelt(directives: Iterable[Directive]) -> str:
+    """Directives in a few words each."""
+    return "; ".join(
+        f"→{d.destination} {Representation(d.representation).name.lower()} ρ {d.rho:g} {d.rate_hz:g} Hz "
+        f"duty {d.duty_percent} % ({d.reason})"
+        for d in directives
+    )

@@ -1,0 +1,18 @@
+"""What the registered rule policies promise, as invariants; `sortie verify NAME` proves them."""
+
+from __future__ import annotations
+
+PROMISES: dict[str, str] = {
+    "worked": """
+        when battery < 0.6: rate_hz <= 5
+        when battery < 0.3: representation <= detections and rate_hz <= 2
+        when goodput_mbps < 5: representation <= detections and rate_hz <= 2
+        when phase == track and region and representation > none: roi
+        when target_in_region and peers >= 1: any_link(representation >= detections and rate_hz >= 2)
+        count_links(representation > none) <= 2
+        representation <= features
+        rate_hz <= fresh.rate_hz
+    """,
+    "silence": "representation == none",
+}
+"""By the policy's name; one that promises nothing of its own is held to the plane's properties alone."""

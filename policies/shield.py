@@ -1,0 +1,237 @@
+"""A shield: a policy that keeps its invariants at run time, and says where it had to step in.
+
+    decide = shield(worked, parse("when battery < 0.3: rate_hz <= 1"))
+
+A directive that breaks an invariant is replaced by the nearest one that keeps them all, and its reason begins with
+"shield:", so that the record shows each intervention at the gate and `interventions` counts them. Nearest means:
+fewest fields changed, then the least change, a rung counting as a quarter of the ladder and every number as its
+share of its bounds. The shield stands where the policy stands: staleness and damping come after it and may lower
+what it raised, and damping holds a raise back for the dwell time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, FleetView, Policy, Representation
+from policies.invariants import (
+    Binary,
+    Invariant,
+    InvariantError,
+    Links,
+    Name,
+    Node,
+    Scope,
+    evaluate,
+    just_heard,
+    violations,
+    walk,
+)
+
+MARK = "shield: "
+_HIGHEST: dict[str, float] = {
+    "representation": 4, "rho": 1.0, "rate_hz": MAX_RATE_HZ, "deadline_s": MAX_DEADLINE_S, "fusion_weight": 1.0,
+    "duty": 1.0, "roi": 1.0,
+}  # fmt: skip
+_SUMS = ("sum_links", "count_links", "every_link")
+
+
+def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
+    """The policy, kept to its invariants; a pure function as the policy is, and shielding it again changes nothing.
+
+    Where no change of one link keeps an invariant (it contradicts another, or asks something of the view alone)
+    the directives stay as decided and each one's reason says so.
+
+    Raises:
+        InvariantError: an invariant sums or counts links: which of them should yield is not the shield's to say; nor
+            `every_link(…)`, which says the same as its requirement alone.
+    """
+    rules = tuple(invariants)
+    for rule in rules:
+        for top in (rule.when, rule.then):
+            for node in () if top is None else walk(top):
+                if isinstance(node, Links) and node.function in _SUMS:
+                    raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
+    asks_fresh = any(rule.needs_fresh for rule in rules)
+
+    def shielded(view: FleetView, /) -> list[Directive]:
+        decided = list(policy(view))
+        fresh = list(policy(just_heard(view))) if asks_fresh else []
+        return enforce(rules, view, decided, fresh)
+
+    shielded.__doc__ = f"{getattr(policy, '__name__', 'a policy')}, shielded."
+    return shielded
+
+
+def interventions(directives: Iterable[Directive]) -> int:
+    """How many of a policy's directives a shield replaced."""
+    return sum(d.reason.startswith(MARK) for d in directives)
+
+
+def enforce(
+    rules: Sequence[Invariant], view: FleetView, decided: Sequence[Directive], fresh: Sequence[Directive] = ()
+) -> list[Directive]:
+    """The directives, with those that break a rule replaced by the nearest that keep all.
+
+    Args:
+        rules: what must hold.
+        view: what the policy saw.
+        decided: what it decided.
+        fresh: what it decides at age 0, for rules that ask.
+    """
+    directives = list(decided)
+    of_link = [rule for rule in rules if rule.of_link]
+    for k, directive in enumerate(directives):
+        broken = [r for r in of_link if _breaks(r, view, directives, fresh, directive)]
+        if broken:
+            directives[k] = _mended(directives, k, of_link, broken, view, fresh)
+    for rule in rules:
+        if not rule.of_link and violations(rule, view, directives, fresh):
+            directives = _mended_together(directives, rule, of_link, view, fresh)
+    return directives
+
+
+def _breaks(
+    rule: Invariant, view: FleetView, directives: Sequence[Directive], fresh: Sequence[Directive], one: Directive
+) -> bool:
+    return any(d is one for d in violations(rule, view, directives, fresh))
+
+
+def _mended(
+    directives: list[Directive],
+    k: int,
+    rules: Sequence[Invariant],
+    broken: Sequence[Invariant],
+    view: FleetView,
+    fresh: Sequence[Directive],
+) -> Directive:
+    """The nearest directive on this link that keeps every rule of links."""
+    before = directives[k]
+    for after in _nearest(before, rules, directives, view, fresh):
+        trial = [*directives[:k], after, *directives[k + 1 :]]
+        if not any(_breaks(r, view, trial, fresh, after) for r in rules):
+            return _told(before, after, broken)
+    return _unkept(before, broken)
+
+
+def _mended_together(
+    directives: list[Directive],
+    rule: Invariant,
+    of_link: Sequence[Invariant],
+    view: FleetView,
+    fresh: Sequence[Directive],
+) -> list[Directive]:
+    """The directives with one link changed, the least change of all links', so that a rule over all of them holds."""
+    best: tuple[tuple[int, float], int, Directive] | None = None
+    for k, before in enumerate(directives):
+        for after in _nearest(before, [*of_link, rule], directives, view, fresh):
+            far = _distance(before, after)
+            if best is not None and far >= best[0]:
+                break
+            trial = [*directives[:k], after, *directives[k + 1 :]]
+            if not violations(rule, view, trial, fresh) and not any(
+                _breaks(r, view, trial, fresh, after) for r in of_link
+            ):
+                best = (far, k, after)
+                break
+    if best is not None:
+        _, k, after = best
+        return [*directives[:k], _told(directives[k], after, [rule]), *directives[k + 1 :]]
+    return [_unkept(d, [rule]) for d in directives]
+
+
+def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
+    because = "; ".join(rule.text for rule in broken)
+    was = f"{Representation(before.representation).name.lower()} at {before.rate_hz:g} Hz"
+    return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
+
+
+def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
+    note = f"{MARK}cannot keep {'; '.join(rule.text for rule in broken)} "
+    return before if before.reason.startswith(note) else before._replace(reason=f"{note}({before.reason})")
+
+
+# --- candidates ----------------------------------------------------------------------------------
+
+
+def _nearest(
+    before: Directive,
+    rules: Sequence[Invariant],
+    directives: Sequence[Directive],
+    view: FleetView,
+    fresh: Sequence[Directive],
+) -> Iterator[Directive]:
+    """Directives that differ in the decisions that the rules speak of, nearest first."""
+    me = view.me
+    if me is None:
+        return
+    scope = Scope(view, me, directives, {d.destination: d for d in fresh}, before)
+    values: dict[str, set[float]] = {}
+    for rule in rules:
+        for top in (rule.when, rule.then):
+            if top is not None:
+                _collect(top, scope, values)
+    if not values:
+        return
+    words = sorted(values)
+    choices = [sorted({_value(before, w), 0.0, _HIGHEST[w], *values[w]}) for w in words]
+    found = (_with(before, dict(zip(words, pick, strict=True)), view) for pick in itertools.product(*choices))
+    yield from sorted({d for d in found if d is not None}, key=lambda d: (*_distance(before, d), tuple(map(repr, d))))
+
+
+def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
+    """Into `values`: for each decision spoken of, where the comparisons about it change their answer."""
+    for node in walk(top):
+        if isinstance(node, Name) and node.word in _HIGHEST:
+            values.setdefault(node.word, set())
+        if not isinstance(node, Binary) or node.sign not in ("<", "<=", ">", ">=", "==", "!="):
+            continue
+        for side, other in ((node.left, node.right), (node.right, node.left)):
+            if isinstance(side, Name) and side.word in _HIGHEST and not isinstance(other, Links):
+                edge = evaluate(other, scope)
+                near = (edge - 1, edge, edge + 1) if side.word == "representation" else _around(edge)
+                values.setdefault(side.word, set()).update(v for v in near if 0 <= v <= _HIGHEST[side.word])
+
+
+def _around(edge: float) -> tuple[float, ...]:
+    """The edge, and a clear step to each side: what a strict comparison needs must survive the wire's rounding."""
+    step = max(abs(edge), 0.01) * 0.01
+    return (edge - step, edge, edge + step) if math.isfinite(edge) else ()
+
+
+def _value(d: Directive, word: str) -> float:
+    if word == "duty":
+        return d.duty_percent / 100
+    return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
+
+
+def _with(before: Directive, wanted: dict[str, float], view: FleetView) -> Directive | None:
+    """The directive with decisions changed; None where there is no such directive."""
+    changed: dict[str, Any] = {}
+    for word, value in wanted.items():
+        if value == _value(before, word):
+            continue
+        if word == "representation":
+            if value != int(value):
+                return None
+            changed[word] = Representation(int(value))
+        elif word == "duty":
+            changed["duty_percent"] = round(value * 100)
+        elif word == "roi":
+            region = view.me.region if view.me is not None else None
+            if value and region is None:
+                return None
+            changed["roi"] = region if value else None
+        else:
+            changed[word] = value
+    if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
+        changed["rho"] = 0.0  # the budget is one of feature cells
+    return before._replace(**changed)
+
+
+def _distance(a: Directive, b: Directive) -> tuple[int, float]:
+    parts = [abs(_value(a, word) - _value(b, word)) / high for word, high in _HIGHEST.items()]
+    return sum(p > 0 for p in parts), sum(parts)

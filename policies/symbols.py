@@ -1,0 +1,258 @@
+"""Numbers that stand for a whole range of inputs, and the search over every way a policy can take through them.
+
+A `Ranged` number compares with constants. Where the answer is the same for its whole range it gives that answer;
+where it is not, the run takes one side, narrows the range to it, and the search comes back later for the other.
+So the policy itself tells where its decision boundaries are, on whatever axis it looks at, and every run stands
+for a cell of views on which it decides the same. The search is complete when no side is left.
+
+What a range cannot answer exactly (a comparison of two axes, a square root, a conversion to int) raises `Refused`.
+Arithmetic with constants is kept as steps and boundaries are found among the floats themselves: rounding is
+monotone, so that a bisection over the floats finds the very last one below.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NoReturn, TypeVar
+
+T = TypeVar("T")
+
+
+class Refused(BaseException):
+    """The search cannot answer what the policy asks; the message says what. No ordinary `except` swallows it."""
+
+
+class Path:
+    """One run: which side it took at every fork, and what is left of each axis."""
+
+    def __init__(self, script: Sequence[int]) -> None:
+        self.ranges: dict[str, tuple[float, float]] = {}
+        self.picks: dict[str, Any] = {}
+        self.refusal: str | None = None
+        self.taken: list[tuple[int, int]] = []
+        self._script = script
+
+    def choose(self, options: int) -> int:
+        """Which of so many sides this run takes: as the script says, then always the first."""
+        k = len(self.taken)
+        choice = self._script[k] if k < len(self._script) else 0
+        if choice >= options:
+            self.refuse("decides differently on the same view")
+        self.taken.append((choice, options))
+        return choice
+
+    def pick(self, label: str, options: Sequence[T]) -> T:
+        """One of a few values of an axis that has no order; the same again within the run."""
+        if label not in self.picks:
+            self.picks[label] = options[self.choose(len(options))]
+        found: T = self.picks[label]
+        return found
+
+    def number(self, axis: str, low: float, high: float) -> Ranged:
+        """The number of an axis whose values are the floats (or, given two ints, the ints) of [low, high]."""
+        self.ranges.setdefault(axis, (low, high))
+        return Ranged(self, axis)
+
+    def refuse(self, why: str) -> NoReturn:
+        """End the run: it cannot be searched."""
+        self.refusal = why
+        raise Refused(why)
+
+
+def explore(run: Callable[[Path], T]) -> Iterator[tuple[Path, T]]:
+    """Every run of a deterministic function of one path, depth first, each with what it returns."""
+    script: list[int] = []
+    while True:
+        path = Path(script)
+        result = run(path)
+        if path.refusal is not None:  # a bare `except` may have swallowed it
+            raise Refused(path.refusal)
+        if len(path.taken) < len(script):
+            raise Refused("decides differently on the same view")
+        yield path, result
+        left = path.taken
+        while left and left[-1][0] + 1 == left[-1][1]:
+            left.pop()
+        if not left:
+            return
+        script = [choice for choice, _ in left]
+        script[-1] += 1
+
+
+class Ranged:
+    """A number of which only the range is known: an axis, and what was done to it since, step by step."""
+
+    __slots__ = ("_axis", "_path", "_steps")
+
+    def __init__(self, path: Path, axis: str, steps: tuple[tuple[str, float], ...] = ()) -> None:
+        self._path, self._axis, self._steps = path, axis, steps
+
+    # --- comparing ---------------------------------------------------------------------------
+
+    def _at(self, x: float) -> float:
+        for step, c in self._steps:
+            x = _STEPS[step](x, c)
+        return x
+
+    def _below(self, c: float, or_at: bool) -> bool:
+        """Whether it is < c (≤ c where `or_at`), taking a side where both are possible."""
+        path = self._path
+
+        def holds(x: float) -> bool:
+            return self._at(x) <= c if or_at else self._at(x) < c
+
+        low, high = path.ranges[self._axis]
+        at_low, at_high = holds(low), holds(high)
+        if at_low == at_high:
+            return at_low
+        whole = isinstance(low, int) and isinstance(high, int)
+        a, b = _ordinal(low), _ordinal(high)
+        if not self._steps and not whole:  # the boundary is the constant itself
+            a = _ordinal(c if or_at else math.nextafter(c, -math.inf))
+            b = a + 1
+        while b - a > 1:
+            middle = (a + b) // 2
+            if holds(middle if whole else _float(middle)) == at_low:
+                a = middle
+            else:
+                b = middle
+        last_low, first_high = (a, b) if whole else (_float(a), _float(b))
+        if path.choose(2) == 0:
+            path.ranges[self._axis] = (low, last_low)
+            return at_low
+        path.ranges[self._axis] = (first_high, high)
+        return at_high
+
+    def _constant(self, other: object) -> float | None:
+        """The other side of a comparison as a plain number; None where it is no number."""
+        if isinstance(other, Ranged):
+            low, high = other._path.ranges[other._axis]
+            if low == high:
+                return other._at(low)
+            self._path.refuse(f"compares or combines two inputs, {self._axis} and {other._axis}")
+        return other if isinstance(other, int | float) else None
+
+    def _same(self, other: object) -> bool:
+        return isinstance(other, Ranged) and other._axis == self._axis and other._steps == self._steps
+
+    def __lt__(self, other: object) -> bool:
+        if self._same(other):
+            return False
+        c = self._constant(other)
+        return NotImplemented if c is None else not math.isnan(c) and self._below(c, False)
+
+    def __le__(self, other: object) -> bool:
+        if self._same(other):
+            return True
+        c = self._constant(other)
+        return NotImplemented if c is None else not math.isnan(c) and self._below(c, True)
+
+    def __gt__(self, other: object) -> bool:
+        if self._same(other):
+            return False
+        c = self._constant(other)
+        return NotImplemented if c is None else not math.isnan(c) and not self._below(c, True)
+
+    def __ge__(self, other: object) -> bool:
+        if self._same(other):
+            return True
+        c = self._constant(other)
+        return NotImplemented if c is None else not math.isnan(c) and not self._below(c, False)
+
+    def __eq__(self, other: object) -> bool:
+        if self._same(other):
+            return True
+        c = self._constant(other)
+        return NotImplemented if c is None else not self._below(c, False) and self._below(c, True)
+
+    def __ne__(self, other: object) -> bool:
+        equal = self.__eq__(other)
+        return equal if equal is NotImplemented else not equal
+
+    def __bool__(self) -> bool:
+        return self != 0
+
+    # --- arithmetic with constants -----------------------------------------------------------
+
+    def _step(self, step: str, other: object) -> Any:
+        c = self._constant(other)
+        if c is None:
+            return NotImplemented
+        if not math.isfinite(c):
+            self._path.refuse(f"computes with {c} and {self._axis}")
+        if step == "times" and c == 0:
+            return 0.0
+        return Ranged(self._path, self._axis, (*self._steps, (step, c)))
+
+    def __add__(self, other: object) -> Any:
+        return self._step("plus", other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: object) -> Any:
+        return self._step("minus", other)
+
+    def __rsub__(self, other: object) -> Any:
+        return self._step("from", other)
+
+    def __mul__(self, other: object) -> Any:
+        return self._step("times", other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: object) -> Any:
+        if other == 0:
+            raise ZeroDivisionError("division by zero")
+        return self._step("over", other)
+
+    def __neg__(self) -> Any:
+        return self._step("times", -1.0)
+
+    def __pos__(self) -> Ranged:
+        return self
+
+    def __abs__(self) -> Any:
+        return self if self >= 0 else -self
+
+    # --- what it cannot do -------------------------------------------------------------------
+
+    def _cannot(self, *_: object) -> NoReturn:
+        self._path.refuse(f"computes with {self._axis} otherwise than by constants and comparisons")
+
+    __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = _cannot
+    __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = _cannot
+    __hash__ = _cannot
+
+    def __getattr__(self, name: str) -> NoReturn:
+        self._cannot()
+
+    def __format__(self, spec: str) -> str:
+        """Some value of the range: text is for reasons, on which no property depends."""
+        return format(self._at(self._path.ranges[self._axis][0]), spec)
+
+    def __repr__(self) -> str:
+        return f"⟨{self._axis}⟩"
+
+
+_STEPS: dict[str, Callable[[float, float], float]] = {
+    "plus": lambda x, c: x + c,
+    "minus": lambda x, c: x - c,
+    "from": lambda x, c: c - x,
+    "times": lambda x, c: x * c,
+    "over": lambda x, c: x / c,
+}
+
+
+def _ordinal(x: float) -> int:
+    """The number of a float in the order of all floats; an int is its own."""
+    if isinstance(x, int):
+        return x
+    bits: int = struct.unpack("<q", struct.pack("<d", x))[0]
+    return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF)
+
+
+def _float(ordinal: int) -> float:
+    found: float = struct.unpack("<d", struct.pack("<q", abs(ordinal)))[0]
+    return found if ordinal >= 0 else -found

@@ -1,0 +1,226 @@
+"""Proofs: complete where they say so, and a counterexample in every policy with a planted fault."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from policies.baselines import everyone, random_k
+from policies.contract import Directive, FleetView, Representation, TaskPhase
+from policies.geometry import footprint_overlap, peers_by_overlap
+from policies.invariants import parse
+from policies.proof import Verdict, complaint_on, property_of, prove
+from policies.properties import PROMISES
+from policies.ranges import _places
+from policies.symbols import Path, Ranged, Refused, explore
+from policies.views import from_json, to_json
+from policies.worked import worked
+
+Decide = Callable[[FleetView], Sequence[Directive]]
+HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
+
+
+def last(policy: Decide, line: str, drones: int = 3) -> Verdict:
+    return prove(policy, parse(line), max_drones=drones)[-1]
+
+
+# --- the search itself ---------------------------------------------------------------------------
+
+
+def cells(run: Callable[[Ranged], object], low: float = 0.0, high: float = 1.0) -> list[tuple[float, float, object]]:
+    found = []
+    for path, result in explore(lambda p: run(p.number("x", low, high))):
+        found.append((*path.ranges["x"], result))
+    return sorted(found, key=lambda c: c[0])
+
+
+@given(
+    st.lists(st.floats(-2, 2), max_size=5),
+    st.sampled_from([1.0, -1.0, 3.0, -0.1, 1e-3]),
+    st.floats(-2, 2),
+    st.lists(st.floats(0, 1), max_size=20),
+)
+def test_cells_cover_every_float_and_decide_alike(
+    thresholds: list[float], factor: float, offset: float, points: list[float]
+) -> None:
+    def decide(x: object) -> list[bool]:
+        value = x * factor + offset  # type: ignore[operator]
+        return [value < t for t in thresholds] + [value == t for t in thresholds]
+
+    found = cells(decide)
+    assert found[0][0] == 0.0
+    assert found[-1][1] == 1.0
+    for (_, end, _), (begin, _, _) in pairwise(found):
+        assert math.nextafter(end, math.inf) == begin, "no float lies between two cells"
+    for low, high, answer in found:
+        assert decide(low) == answer == decide(high)
+    for x in points:
+        assert [answer for low, high, answer in found if low <= x <= high] == [decide(x)]
+
+
+def test_a_threshold_cuts_at_the_very_float() -> None:
+    below = math.nextafter(0.3, 0)
+    assert cells(lambda x: x >= 0.3) == [(0.0, below, False), (0.3, 1.0, True)]
+    assert cells(lambda x: x == 0.3) == [(0.0, below, False), (0.3, 0.3, True), (math.nextafter(0.3, 1), 1.0, False)]
+    assert cells(lambda n: 2 <= n < 4, 0, 5) == [(0, 1, False), (2, 3, True), (4, 5, False)]
+
+
+@pytest.mark.parametrize(
+    "act", [math.sqrt, int, round, hash, lambda x: x % 2, lambda x: x**2, lambda x: 1 / x, lambda x: x.is_integer()]
+)
+def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Callable[[object], object]) -> None:
+    def run(path: Path) -> None:
+        with contextlib.suppress(BaseException):
+            act(path.number("charge", 0.0, 1.0))
+
+    with pytest.raises(Refused, match="charge"):
+        list(explore(run))
+
+
+def test_two_axes_are_not_compared() -> None:
+    with pytest.raises(Refused, match="compares or combines two inputs, a and b"):
+        list(explore(lambda p: p.number("a", 0.0, 1.0) < p.number("b", 0.0, 1.0)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_places_realise_every_order(n: int) -> None:
+    import itertools
+
+    from policies_examples import fleet_of
+
+    view = fleet_of(n + 1)
+    for order in itertools.permutations(range(1, n + 1)):
+        at = _places(0, order)
+        placed = {i: d._replace(position_m=at[i]) for i, d in view.descriptors.items()}
+        assert peers_by_overlap(view._replace(descriptors=placed)) == list(order)
+
+
+# --- verdicts ------------------------------------------------------------------------------------
+
+
+def test_the_worked_policy_keeps_all_its_promises() -> None:
+    verdicts = prove(worked, parse(PROMISES["worked"]), max_drones=3)
+    assert len(verdicts) == 10
+    assert [v for v in verdicts if v.outcome != "proved"] == []
+
+
+def test_a_promise_that_the_worked_policy_does_not_keep_is_refuted_at_its_edge() -> None:
+    verdict = last(worked, "when battery <= 0.3: representation <= detections")
+    assert verdict.outcome == "refuted"
+    assert verdict.counterexample is not None
+    assert verdict.counterexample.descriptors[verdict.counterexample.ego].battery_soc == 0.3, "the one float of all"
+
+
+def drops_below_detections(view: FleetView) -> list[Directive]:
+    """Falls silent in a sliver of charge in which no drawn view lies."""
+    me = view.me
+    tired = me is not None and 0.4 < me.battery_soc < 0.4000001 and me.task_phase == TaskPhase.RETURN
+    return [d._replace(representation=Representation.NONE) if tired else d for d in worked(view)]
+
+
+def rises_with_age(view: FleetView) -> list[Directive]:
+    """Sends faster to a peer whose descriptor is between 0.2 and 0.2001 s old."""
+    return [d._replace(rate_hz=9.0 if 0.2 < view.age_s[d.destination] < 0.2001 else 1.0) for d in everyone(view)]
+
+
+def out_of_bounds(view: FleetView) -> list[Directive]:
+    return [d._replace(rate_hz=40 * view.descriptors[d.destination].battery_soc) for d in everyone(view)]
+
+
+def crashes(view: FleetView) -> list[Directive]:
+    me = view.me
+    if me is not None and me.peer_goodput_mbps[:1] and me.peer_goodput_mbps[0] == 77.25:
+        raise RuntimeError("the one goodput")
+    return everyone(view)
+
+
+def test_a_policy_that_drops_below_detections_is_found_out() -> None:
+    verdict = last(drops_below_detections, HUMANE)
+    assert verdict.outcome == "refuted"
+    assert verdict.counterexample is not None
+    assert 0.4 < verdict.counterexample.descriptors[verdict.counterexample.ego].battery_soc < 0.4000001
+    again = from_json(to_json(verdict.counterexample))
+    assert complaint_on(property_of(parse(HUMANE)[0]), drops_below_detections, again) == verdict.what
+    assert last(worked, HUMANE).outcome == "proved"
+
+
+def test_a_policy_that_rises_with_age_is_found_out() -> None:
+    verdict = prove(rises_with_age, max_drones=2)[1]
+    assert verdict.outcome == "refuted"
+    assert "rate_hz rises from 1.0 to 9.0" in verdict.what
+    assert last(rises_with_age, "rate_hz <= fresh.rate_hz").outcome == "refuted"
+
+
+def test_a_policy_that_only_falls_with_age_is_proved() -> None:
+    def falls(view: FleetView) -> list[Directive]:
+        return [
+            d._replace(rate_hz=10.0 if view.age_s[d.destination] / view.period_s <= 3 else 2.0) for d in everyone(view)
+        ]
+
+    assert [v.outcome for v in prove(falls, parse("when age_periods > 3: rate_hz <= 2"), max_drones=3)] == [
+        "proved"
+    ] * 3
+
+
+def test_a_rate_out_of_bounds_in_proportion_to_charge_is_found() -> None:
+    verdict = prove(out_of_bounds, max_drones=2)[0]
+    assert verdict.outcome == "refuted"
+    assert "must be in [0, 30]" in verdict.what
+    assert verdict.counterexample is not None
+
+
+def test_a_crash_at_one_single_float_is_found() -> None:
+    verdict = prove(crashes, max_drones=2)[0]
+    assert (verdict.outcome, verdict.what) == ("refuted", "raises RuntimeError: the one goodput")
+
+
+def test_what_cannot_be_searched_says_so() -> None:
+    verdict = prove(random_k, max_drones=3)[0]
+    assert verdict.outcome == "not proved"
+    assert verdict.what == "reads stamp_ns, which has no boundaries to search; 1000 drawn views keep it"
+    assert last(random_k, "representation == none").outcome == "refuted", "by a drawn view"
+
+
+def reads_overlap(view: FleetView) -> list[Directive]:
+    me = view.me
+    assert me is not None
+    return [d for d in everyone(view) if footprint_overlap(me, view.descriptors[d.destination]) >= 0]
+
+
+def reads_grid(view: FleetView) -> list[Directive]:
+    me = view.me
+    return everyone(view) if me is None or me.coverage_grid[0] >= 0 else []
+
+
+def best_goodput(view: FleetView) -> list[Directive]:
+    me = view.me
+    assert me is not None
+    best = max(view.peers, key=me.goodput_to, default=None)
+    return [d if d.destination == best else d._replace(rate_hz=1.0) for d in everyone(view)]
+
+
+@pytest.mark.parametrize(
+    ("policy", "why"),
+    [
+        (reads_overlap, "reads position_m otherwise than through peers_by_overlap"),
+        (reads_grid, "reads coverage_grid, which has no boundaries to search"),
+        (best_goodput, "compares or combines two inputs, goodput of drone 0 to slot"),
+    ],
+)
+def test_a_policy_beyond_the_search_is_not_called_proved(policy: Decide, why: str) -> None:
+    verdict = last(policy, "rate_hz <= 10")
+    assert verdict.outcome == "not proved" or "AssertionError" in verdict.what
+    if verdict.outcome == "not proved":
+        assert why in verdict.what
+
+
+def test_too_many_cells_are_given_up() -> None:
+    verdict = prove(worked, max_drones=3, max_cells=10)[0]
+    assert verdict.outcome == "not proved"
+    assert "more than 10 cells" in verdict.what
