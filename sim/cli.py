@@ -19,10 +19,11 @@ from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
-from sim import cli_bench, cli_calibrate, cli_paper, cli_recording, cli_train, rundir, tables
+from sim import cli_bench, cli_calibrate, cli_paper, cli_recording, cli_study, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
 from sim.expect import check as check_expectations
+from sim.folders import RunError
 from sim.outcome import outcome
 from sim.sortie import VERSION, Observer, run_sortie
 
@@ -35,7 +36,7 @@ app = typer.Typer(
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_recording.app, name="recording")
 
-USER_ERRORS = (ScenarioError, PolicyError, MotionError, DescriptorTooLarge, InputError, rundir.RunError)
+USER_ERRORS = (ScenarioError, PolicyError, MotionError, DescriptorTooLarge, InputError, RunError)
 """What a user can mend: one line and exit code 2, no traceback."""
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
@@ -185,7 +186,7 @@ def list_(
 
 app.command()(cli_train.train)
 app.command()(cli_calibrate.calibrate)
-app.add_typer(cli_train.study, name="study")
+app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
 
 
@@ -240,7 +241,7 @@ def _write_json(path: Path, data: Any) -> None:
         partial.write_text(json.dumps(data, indent=2) + "\n")
         partial.rename(path)
     except OSError as error:
-        raise rundir.RunError(f"{path}: cannot be written: {error.strerror}") from error
+        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 @contextmanager

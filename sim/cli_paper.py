@@ -15,7 +15,7 @@ from perception.harness import report
 from perception.harness.rows import INSTRUMENTS, Row
 from perception.harness.verdict import Verdict
 from sim.console import out, stages
-from sim.rundir import RunError
+from sim.folders import RunError
 
 if TYPE_CHECKING:
     from perception.harness.picture import Picture

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from perception.outside.recorded import open_recording
 from sim.console import bars, out
-from sim.rundir import RunError
+from sim.folders import RunError
 
 app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,8 @@ from perception.harness.paper import bench_frames, camera_views, measure
 from perception.harness.picture import PAPER_BUDGETS, Picture, picture
 from perception.harness.rows import Point, Row
 from perception.harness.sensitivity import Varied, sensitivity
+from sim.folders import RunError, ensure_folder, replacing, write_text
 from sim.plane import machine, measure_plane
-from sim.rundir import RunError
 from sim.sortie import VERSION
 
 REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
@@ -125,10 +124,7 @@ def ensure_writable(path: Path) -> None:
     Raises:
         RunError: naming the path.
     """
-    if path.exists() and not path.is_dir():
-        raise RunError(f"{path}: is a file, a report needs a folder")
-    if path.is_dir() and any(path.iterdir()) and not (path / TABLE).is_file():
-        raise RunError(f"{path}: holds files but no {TABLE}; a report would replace them, name another folder")
+    ensure_folder(path, TABLE, "report")
 
 
 def write(result: Result, path: Path) -> list[Path]:
@@ -138,21 +134,13 @@ def write(result: Result, path: Path) -> list[Path]:
         RunError: as `ensure_writable`, or the disk refuses.
     """
     ensure_writable(path)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with replacing(path) as partial:
         pq.write_table(rows.to_table(result.rows, result.facts), partial / TABLE)
         for name, several in ((POINTS, result.points), (VARIED, result.varied)):
             pq.write_table(pa.Table.from_pylist([_plain(p) for p in several]), partial / name)
         drawn = _draw(result, partial) if figures.available() else []
         text = report.report(result.rows, result.facts, [(name, FIGURES[name]) for name in drawn], result.varied)
         (partial / REPORT).write_text(text, encoding="utf-8")
-        _replace(partial, path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return sorted(path.iterdir())
 
 
@@ -164,11 +152,9 @@ def put_into_readme(readme: Path, result_rows: Sequence[Row], facts: dict[str, A
     """
     try:
         text = report.put_into(readme.read_text(encoding="utf-8"), report.short(result_rows, facts, link))
-        part = readme.with_name(f".{readme.name}.partial")
-        part.write_text(text, encoding="utf-8")
-        part.replace(readme)
     except (OSError, ValueError) as error:
         raise RunError(f"{readme}: {error}") from error
+    write_text(readme, text)
 
 
 def _draw(result: Result, folder: Path) -> list[str]:
@@ -186,16 +172,6 @@ def _draw(result: Result, folder: Path) -> list[str]:
 
 def _plain(point: Point | Varied) -> dict[str, Any]:
     return {name: getattr(point, name) for name in point.__slots__}
-
-
-def _replace(new: Path, path: Path) -> None:
-    """Rename `new` to `path`; an older report steps aside first."""
-    aside = path.with_name(f".{path.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)
-    if path.exists():
-        path.rename(aside)
-    new.rename(path)
-    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _cpu_s() -> float:

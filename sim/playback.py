@@ -23,12 +23,12 @@ import rerun as rr
 
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
+from sim.folders import RunError
 from sim.playback_canvas import Canvas, Floats
 from sim.playback_charts import Charts
 from sim.playback_layout import blueprint, legend
 from sim.playback_scene import Drawing
 from sim.record import SortieRecord
-from sim.rundir import RunError
 from sim.sightings import sightings
 
 APPLICATION = "sortie"

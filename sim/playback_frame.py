@@ -19,8 +19,8 @@ from perception.geometry import CELLS
 from perception.harness.picture import Picture, to_world
 from perception.render import CAMERAS
 from perception.types import Boxes
+from sim.folders import RunError
 from sim.playback_canvas import MISSION, drone_colour
-from sim.rundir import RunError
 
 APPLICATION = "sortie-frame"
 TRUTH, FOUND = (150, 152, 158, 255), (80, 150, 255, 255)

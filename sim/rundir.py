@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,14 +11,11 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from scenarios.load import ScenarioError, dump, loads
+from sim.folders import RunError, ensure_folder, replacing
 from sim.outcome import outcome
 from sim.record import TABLES, SortieRecord
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
-
-
-class RunError(ValueError):
-    """A run directory that cannot be written or read; the message names the path."""
 
 
 def default_path(record: SortieRecord) -> Path:
@@ -36,16 +31,7 @@ def ensure_writable(path: Path) -> None:
     Raises:
         RunError: it holds something that is no run, or cannot be made.
     """
-    if path.exists() and not path.is_dir():
-        raise RunError(f"{path}: is a file, a run needs a folder")
-    if path.is_dir() and any(path.iterdir()) and not (path / OUTCOME).is_file():
-        raise RunError(f"{path}: holds files but no {OUTCOME}; a run would replace them, name another folder")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{path}: cannot make its folder: {error.strerror}") from error
-    if not os.access(path.parent, os.W_OK):
-        raise RunError(f"{path}: its folder {path.parent} is not writable")
+    ensure_folder(path, OUTCOME, "run")
 
 
 def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None = None) -> dict[str, Any]:
@@ -60,11 +46,8 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
         RunError: as `ensure_writable`, or the disk refuses.
     """
     ensure_writable(path)
-    partial = path.with_name(f".{path.name}.partial")
     result = outcome(record)
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
+    with replacing(path) as partial:
         (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
         (partial / SCENARIO).write_text(dump(record.scenario))
         about = {
@@ -81,11 +64,6 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
             pq.write_table(table, partial / f"{name}.parquet", compression="zstd")
         if also is not None:
             also(partial)
-        _replace(partial, path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return result
 
 
@@ -104,15 +82,3 @@ def load(path: Path) -> SortieRecord:
         return SortieRecord(scenario=scenario, tables=tables, **about)
     except (OSError, ValueError, TypeError, ScenarioError) as error:
         raise RunError(f"{path}: the run is damaged: {error}") from error
-
-
-def _replace(new: Path, path: Path) -> None:
-    """Rename `new` to `path`; an older run steps aside first, since a folder cannot be renamed over a full one."""
-    if not path.exists():
-        new.rename(path)
-        return
-    aside = path.with_name(f".{path.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)
-    path.rename(aside)
-    new.rename(path)
-    shutil.rmtree(aside)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +14,8 @@ from perception.harness.condition import FULL_SHARING, SINGLE, Condition
 from perception.harness.evaluation import Evaluation
 from perception.harness.measures import POINTS, Contrast, Level, Oracle
 from perception.harness.scores import Bootstrap
+from perception.harness.statistics import interval
+from perception.harness.verdict import Measured as Measurement
 from perception.study.plan import Measured, Tau, Variant
 
 MODEL_TAU = 0.1
@@ -39,7 +41,7 @@ class Row:
     tau_name: str
     tau: float
     quantity: str
-    """gain, starved, level, contrast or oracle."""
+    """gain, level, starved, contrast, fill or oracle: see `rows_of`."""
     rho: float
     """The budget; NaN where there is none."""
     value: float
@@ -62,39 +64,55 @@ def optimal_f1(units: Sequence[Matched], taus: NDArray[np.float64]) -> F1:
 def rows_of(measured: Measured, variant: Variant, seed: int, density: str, found: Evaluation, tau_f1: F1) -> list[Row]:
     """Every quantity of one network on one density's test split.
 
-    gain: full sharing over a drone alone; starved: everyone at the least budget over a drone alone; level: AP itself;
-    contrast: two peers over four at each budget; oracle: the best of each budget over the best single policy.
+    gain: full sharing over a drone alone; level: AP itself; starved: everyone at the least budget over a drone alone;
+    contrast: two peers over four at each budget; fill: zero fill over masked fusion, everyone sharing, at each budget;
+    oracle: the best of each budget over the best single policy.
     """
     out: list[Row] = []
     many, few = measured.policies
+    starved = Condition(measured.starved, many)
     wide = tuple(tuple(Condition(rho, peers) for rho in measured.budgets) for peers in measured.policies)
-    for unsent in measured.unsent:
-        for cells_by in measured.cells_by:
-            asked = Condition(measured.starved, many, cells_by=cells_by, unsent=unsent)
-            if asked not in found.conditions:
-                continue
-            for name in measured.taus:
-                tau = threshold(name, tau_f1)
-                scores = Bootstrap(found.at(max(tau, found.settings.floor)), unsent, cells_by)
+    for cells_by in measured.cells_by:
+        if replace(starved, cells_by=cells_by, unsent=measured.unsent[0]) not in found.conditions:
+            continue
+        for name in measured.taus:
+            tau = threshold(name, tau_f1)
+            cut = found.at(max(tau, found.settings.floor))
+            ways = {unsent: Bootstrap(cut, unsent, cells_by) for unsent in measured.unsent}
+            for unsent, scores in ways.items():
+                head = (variant.name, seed, density, unsent, cells_by, str(name), tau)
 
-                def row(quantity: str, rho: float, what: Contrast | Level | Oracle) -> Row:
-                    m = what.measure(scores)  # noqa: B023 (called at once)
-                    low, high = (np.nan if v is None else v for v in (m.low, m.high))
-                    head = (variant.name, seed, density, unsent, cells_by, str(name), tau)  # noqa: B023
-                    unit = POINTS if isinstance(what, Level) else 1.0  # levels come as 0 … 1
-                    return Row(*head, quantity, rho, unit * m.value, unit * low, unit * high)
+                def add(quantity: str, rho: float, of: Figures, unit: float = 1.0) -> None:
+                    out.append(Row(*head, quantity, rho, *(unit * v for v in of)))  # noqa: B023 (called at once)
 
-                out.append(row("gain", np.nan, Contrast((FULL_SHARING,), (SINGLE,))))
-                out.append(row("level", 0.0, Level(SINGLE)))
-                out.append(row("level", 1.0, Level(FULL_SHARING)))
-                starved = Condition(measured.starved, many)
-                out.append(row("starved", measured.starved, Contrast((starved,), (SINGLE,))))
+                add("gain", np.nan, _figures(Contrast((FULL_SHARING,), (SINGLE,)).measure(scores)))
+                add("level", 0.0, _figures(Level(SINGLE).measure(scores)), POINTS)  # levels come as 0 … 1
+                add("level", 1.0, _figures(Level(FULL_SHARING).measure(scores)), POINTS)
+                add("starved", measured.starved, _figures(Contrast((starved,), (SINGLE,)).measure(scores)))
                 for rho in measured.budgets:
                     two, four = Condition(rho, few), Condition(rho, many)
-                    out.append(row("contrast", rho, Contrast((two,), (four,))))
-                    out += [row(f"level {c.peers}", rho, Level(c)) for c in (two, four)]
-                out.append(row("oracle", np.nan, Oracle(wide)))
+                    add("contrast", rho, _figures(Contrast((two,), (four,)).measure(scores)))
+                    for c in (two, four):
+                        add(f"level {c.peers}", rho, _figures(Level(c).measure(scores)), POINTS)
+                if unsent == "zero" and "masked" in ways:
+                    for rho in (measured.starved, *measured.budgets):
+                        add("fill", rho, _between(scores, ways["masked"], Condition(rho, many)), POINTS)
+                add("oracle", np.nan, _figures(Oracle(wide).measure(scores)))
     return out
+
+
+Figures = tuple[float, float, float]
+"""A value with its interval; NaN where there is none."""
+
+
+def _figures(m: Measurement) -> Figures:
+    return m.value, np.nan if m.low is None else m.low, np.nan if m.high is None else m.high
+
+
+def _between(a: Bootstrap, b: Bootstrap, condition: Condition) -> Figures:
+    """AP of one condition under a minus under b, 0 … 1, on the same resamples."""
+    low, high = interval(a.draws(condition, "full") - b.draws(condition, "full"))
+    return a.ap(condition, "full") - b.ap(condition, "full"), low, high
 
 
 def threshold(name: Tau, tau_f1: F1) -> float:

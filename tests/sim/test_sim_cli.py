@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from sim import rundir
 from sim.cli import app, main
 from sim.expect import check
+from sim.folders import RunError
 from sim.outcome import outcome
 from sim.record import TABLES
 from sim.sortie import run_sortie
@@ -82,11 +83,11 @@ def test_a_run_that_dies_while_saving_leaves_no_half_run(tmp_path: Path) -> None
     def dies(folder: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(rundir.RunError, match="run: cannot be written: No space left on device"):
+    with pytest.raises(RunError, match="run: cannot be written: No space left on device"):
         rundir.save(record, path, dies)
     assert list(tmp_path.iterdir()) == []
     first = rundir.save(record, path)
-    with pytest.raises(rundir.RunError):
+    with pytest.raises(RunError):
         rundir.save(record, path, dies)
     assert json.loads((path / "outcome.json").read_text()) == first, "the older run is still whole"
 
@@ -94,19 +95,19 @@ def test_a_run_that_dies_while_saving_leaves_no_half_run(tmp_path: Path) -> None
 def test_a_folder_that_is_no_run_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(rundir.RunError, match=r"holds files but no outcome\.json"):
+    with pytest.raises(RunError, match=r"holds files but no outcome\.json"):
         rundir.ensure_writable(tmp_path / "thesis")
     (tmp_path / "file").write_text("")
-    with pytest.raises(rundir.RunError, match="is a file, a run needs a folder"):
+    with pytest.raises(RunError, match="is a file, a run needs a folder"):
         rundir.ensure_writable(tmp_path / "file")
 
 
 def test_a_damaged_run_says_so(tmp_path: Path) -> None:
-    with pytest.raises(rundir.RunError, match=r"no run there \(outcome\.json is missing\)"):
+    with pytest.raises(RunError, match=r"no run there \(outcome\.json is missing\)"):
         rundir.load(tmp_path)
     rundir.save(run_sortie(example()), tmp_path / "run")
     (tmp_path / "run" / "states.parquet").write_bytes(b"PAR1 not really")
-    with pytest.raises(rundir.RunError, match="the run is damaged"):
+    with pytest.raises(RunError, match="the run is damaged"):
         rundir.load(tmp_path / "run")
 
 

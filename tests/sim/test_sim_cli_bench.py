@@ -12,7 +12,7 @@ from perception.bench.difficulty import DENSITIES, Split
 from perception.geometry import FULL, SMALL
 from sim.cli import app
 from sim.cli_bench import DensityName, RangeName, SplitName
-from sim.rundir import RunError
+from sim.folders import RunError
 
 run = CliRunner()
 

@@ -20,8 +20,8 @@ from perception.harness.sensitivity import Varied
 from perception.types import Boxes
 from policies.registry import resolve
 from sim import paper, plane
+from sim.folders import RunError
 from sim.playback_frame import SHADES, save_frame
-from sim.rundir import RunError
 from sim.sortie import run_sortie
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -19,12 +19,12 @@ from sim_examples import example
 
 from scenarios.schema import Scenario
 from sim import playback
+from sim.folders import RunError
 from sim.outcome import accuracy, matched, outcome, transitions
 from sim.playback import LiveViewer, open_viewer, save_rrd, scene_of, to_file
 from sim.playback_canvas import goodput_colours
 from sim.playback_charts import in_words
 from sim.record import TABLES, SortieRecord
-from sim.rundir import RunError
 from sim.sortie import run_sortie
 
 DURATION_S = 8.0

@@ -1,0 +1,253 @@
+"""The study told by rule: what each network shows of the flip, as Markdown, and the README's sentences. Pure text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from perception.study.measure import Row
+from perception.study.plan import Plan
+
+BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
+MINUS = "−"
+UNSENT: Mapping[str, str] = {"zero": "Zero fill, as in the paper", "masked": "Masked fusion"}
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What is held fixed while one quantity is looked at."""
+
+    variant: str
+    seed: int
+    unsent: str = "zero"
+    cells_by: str = "confidence"
+    tau_name: str = "model"
+    density: str = "default"
+
+
+class Found:
+    """Rows of the study, asked for one at a time."""
+
+    def __init__(self, rows: Iterable[Row]) -> None:
+        self.rows = tuple(rows)
+        self._by = {
+            (View(r.variant, r.seed, r.unsent, r.cells_by, r.tau_name, r.density), r.quantity, _key(r.rho)): r
+            for r in self.rows
+        }
+
+    def get(self, view: View, quantity: str, rho: float = math.nan) -> Row | None:
+        """The row, or None where that was not measured."""
+        return self._by.get((view, quantity, _key(rho)))
+
+    def networks(self) -> list[tuple[str, int]]:
+        """Variant and seed of every network measured, in the rows' order."""
+        return list(dict.fromkeys((r.variant, r.seed) for r in self.rows))
+
+
+def sign(row: Row | None) -> int:
+    """+1 or −1 where the interval leaves zero out, else 0."""
+    if row is None or not (row.low > 0 or row.high < 0):
+        return 0
+    return 1 if row.value > 0 else -1
+
+
+def flips(found: Found, view: View, budgets: Sequence[float]) -> bool:
+    """Whether two peers beat four at some budget and four beat two at a larger one, both significantly."""
+    signs = [sign(found.get(view, "contrast", rho)) for rho in sorted(budgets)]
+    return any(a > 0 and min(signs[i:]) < 0 for i, a in enumerate(signs))
+
+
+def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] = ()) -> str:
+    """The whole report; `figures` are file names beside it and what they show."""
+    found = Found(rows)
+    missing = [v.job(s) for v, s in plan.jobs() if (v.name, s) not in found.networks()]
+    lines = ["# Why the flip exists: an experiment", "", "## The question", "", *_quoted(plan.paper), ""]
+    lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
+    lines += ["## The answer", "", *answers(plan, found), ""]
+    for name, caption in figures:
+        lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
+    lines += ["## Every network", "", _LEGEND, ""]
+    for unsent in plan.measured.unsent:
+        lines += [f"**{UNSENT[unsent]}**, τ = 0.1, cells by confidence:", "", *_networks(plan, found, unsent), ""]
+    first, seed = plan.variants[0], plan.variants[0].seeds[0]
+    lines += [f"## The score threshold ({first.job(seed)})", ""]
+    for unsent in plan.measured.unsent:
+        views = {
+            _tau(found, first.name, seed, str(t)): View(first.name, seed, unsent, tau_name=str(t))
+            for t in plan.measured.taus
+        }
+        lines += [f"**{UNSENT[unsent]}**:", "", *_table(plan, found, "τ", views), ""]
+    for title, others in _others(plan, first.name, seed):
+        if table := _table(plan, found, "network", others):
+            lines += [f"## {title}", "", *table, ""]
+    lines += ["## The variants", ""]
+    lines += [f"- `{v.name}` (seeds {', '.join(map(str, v.seeds))}): {v.why}" for v in plan.variants]
+    if missing:
+        lines += [
+            "",
+            f"Not trained yet, so not in these tables: {', '.join(missing)}. `sortie study train` trains them.",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def short(plan: Plan, rows: Sequence[Row], link: str) -> str:
+    """The README's section between its markers: three sentences."""
+    sentences = answers(plan, Found(rows))[:3]
+    return "\n".join(
+        [BEGIN, "", *(s.removeprefix("- ") for s in sentences), f"The whole study: [{link}]({link}).", "", END]
+    )
+
+
+def answers(plan: Plan, found: Found) -> list[str]:
+    """What the rows say of the paper's observation and of each part of the hypothesis."""
+    m, networks = plan.measured, found.networks()
+    first = plan.variants[0].name
+    seeds = [s for v, s in networks if v == first]
+    flipped = [f"{v}-{s}" for v, s in networks for u in m.unsent if flips(found, View(v, s, u), m.budgets)]
+    fallen = [
+        f"{v}-{s}" for v, s in networks for u in m.unsent if sign(found.get(View(v, s, u), "starved", m.starved)) < 0
+    ]
+    little = min(m.budgets)
+    contrast = [found.get(View(first, s), "contrast", little) for s in seeds]
+    starved = [found.get(View(first, s), "starved", m.starved) for s in seeds]
+    fill = [found.get(View(first, s), "fill", m.starved) for s in seeds]
+    masked = [found.get(View(first, s, "masked"), "contrast", little) for s in seeds]
+    swept = [
+        name
+        for v, s in networks for u in m.unsent for t in m.taus for c in m.cells_by
+        for name in [f"{v}-{s}, {u}, cells by {c}, τ {t}"]
+        if flips(found, View(v, s, u, c, str(t)), m.budgets)
+    ]  # fmt: skip
+    flip = "No network shows the flip" if not flipped else f"The flip shows in {', '.join(dict.fromkeys(flipped))}"
+    fall = "none falls" if not fallen else f"{', '.join(dict.fromkeys(fallen))} fall"
+    dropped = [v for v in plan.variants if v.recipe.get("cell_dropout")]
+    lines = [
+        f"- {flip} at the model's own threshold among {len(networks)} networks under {_and(m.unsent)} filling, and {fall} "
+        f"below a single drone at ρ = {m.starved:g}: with {first} (seeds {_and(seeds)}) two peers minus four at ρ = {little:g} "
+        f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
+        f"- What zero fill costs against masked fusion at ρ = {m.starved:g} is {_several(fill)}, and masking moves the contrast at "
+        f"ρ = {little:g} to {_several(masked)}"
+        + "".join(
+            f"; {v.name} training moves it to {_several([found.get(View(v.name, s), 'contrast', little) for s in seeds])}"
+            for v in dropped
+            if any((v.name, s) in networks for s in seeds)
+        )
+        + ".",
+        "- Over every threshold, ranking, filling and network measured the flip appears "
+        + (
+            f"in {len(swept)} of the cases: {'; '.join(swept[:6])}{' …' if len(swept) > 6 else ''}."
+            if swept
+            else "nowhere."
+        )
+        + " "
+        + (
+            "The hypothesis names what the flip would be removed by; where there is none to remove, its cause is not shown by this benchmark."
+            if not flipped
+            else "Where it appears, the tables below say what removes it."
+        ),
+    ]
+    oracles = [found.get(View(v, s, u), "oracle") for v, s in networks for u in m.unsent]
+    gains = [r for r in oracles if r is not None]
+    if gains:
+        top = max(gains, key=lambda r: r.value)
+        lines.append(
+            f"- Choosing the best of {_and(m.policies)} at each budget gains at most {_signed(top.value)} AP points over "
+            f"the best single one ({top.variant}-{top.seed}, {top.unsent})."
+        )
+    return lines
+
+
+_LEGEND = (
+    "AP@0.5 of the full scene in points; differences with paired 95 % intervals over frames. *two − four*: two peers minus "
+    "four at matched bytes; ▲ two are better, ▼ four are better, · no difference is shown. *starved*: all four at the "
+    "least budget minus a drone alone. *fill*: zero fill minus masked fusion, at that same budget."
+)
+
+
+def _others(plan: Plan, name: str, seed: int) -> Iterable[tuple[str, Mapping[str, View]]]:
+    m = plan.measured
+    yield (
+        "How cells are ranked",
+        {
+            f"{v.job(s)}, {unsent}, by {rank}": View(v.name, s, unsent, rank)
+            for v in plan.variants if not v.begins_from for s in v.seeds for unsent in m.unsent for rank in m.cells_by
+        },
+    )  # fmt: skip
+    yield (
+        f"Car density ({name}-{seed})",
+        {f"{d}, {unsent}": View(name, seed, unsent, density=d) for d in m.densities for unsent in m.unsent},
+    )
+
+
+def _networks(plan: Plan, found: Found, unsent: str) -> list[str]:
+    views = {v.job(s): View(v.name, s, unsent) for v in plan.variants for s in v.seeds}
+    return _table(plan, found, "network", views)
+
+
+def _table(plan: Plan, found: Found, head: str, views: Mapping[str, View]) -> list[str]:
+    """One row a view that was measured; empty where none was."""
+    m = plan.measured
+    shown = {name: view for name, view in views.items() if found.get(view, "gain") is not None}
+    if not shown:
+        return []
+    lines = [
+        f"| {head} | alone | all | starved, ρ = {m.starved:g} | fill |"
+        + "".join(f" two − four, ρ = {rho:g} |" for rho in m.budgets)
+        + " oracle |",
+        "|---|" + "---|" * (5 + len(m.budgets)),
+    ]
+    for name, view in shown.items():
+        alone, full = found.get(view, "level", 0.0), found.get(view, "level", 1.0)
+        cells = [_plain(alone), _plain(full), _difference(found.get(view, "starved", m.starved))]
+        cells.append(_difference(found.get(view, "fill", m.starved)))
+        for rho in m.budgets:
+            row = found.get(view, "contrast", rho)
+            cells.append(f"{'·▲▼'[sign(row)]} {_difference(row)}")
+        cells.append(_difference(found.get(view, "oracle")))
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+def _tau(found: Found, variant: str, seed: int, name: str) -> str:
+    row = found.get(View(variant, seed, tau_name=name), "gain")
+    return (
+        name
+        if row is None
+        else {"model": f"{row.tau:g}, the model's", "f1": f"{row.tau:.2f}, F1-optimal"}.get(name, name)
+    )
+
+
+def _plain(row: Row | None) -> str:
+    return "–" if row is None else f"{row.value:.1f}"
+
+
+def _difference(row: Row | None) -> str:
+    if row is None:
+        return "–"
+    if math.isnan(row.low):
+        return _signed(row.value)
+    return f"{_signed(row.value)} [{_signed(row.low)}, {_signed(row.high)}]"
+
+
+def _several(rows: Sequence[Row | None]) -> str:
+    there = [r for r in rows if r is not None]
+    return _and([_difference(r) for r in there]) if there else "not measured"
+
+
+def _signed(value: float) -> str:
+    text = f"{value:+.1f}"
+    return "0.0" if float(text) == 0 else text.replace("-", MINUS)
+
+
+def _and(items: Sequence[object]) -> str:
+    words = [str(i) for i in items]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _quoted(text: str) -> list[str]:
+    return [f"> {line}".rstrip() for line in text.splitlines()]
+
+
+def _key(rho: float) -> float | None:
+    return None if math.isnan(rho) else rho

@@ -1,0 +1,131 @@
+"""`sortie study`: train, measure and tell the study of why the flip exists."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sim.console import out, stages, user_errors
+from sim.folders import RunError, ensure_folder, replacing, write_text
+
+if TYPE_CHECKING:
+    from perception.study.measure import Row
+
+study = typer.Typer(
+    no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
+)
+TABLE, REPORT = "study.parquet", "README.md"
+WorkOption = Annotated[Path, typer.Option("--work", help="Weights, checkpoints and finished frames.")]
+BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
+
+
+@study.command("train")
+def study_train(
+    jobs: Annotated[list[str] | None, typer.Argument(help="Networks, as in dropout-1; left out, all of them.")] = None,
+    work: WorkOption = Path("runs/study"),
+    bench_dir: BenchOption = Path("runs/bench"),
+) -> None:
+    """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
+    from perception.study.plan import read_plan
+    from perception.study.run import SHIPPED, train_job
+
+    plan = read_plan()
+    with user_errors():
+        for job in jobs or [v.job(s) for v, s in plan.jobs()]:
+            with stages(f"{job}: ") as progress:
+                result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
+            if result is None:
+                out.print(f"[bold]{job}[/bold] has its weights")
+            else:
+                gain = result.validation
+                out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
+
+
+@study.command("run")
+def study_run(
+    work: WorkOption = Path("runs/study"),
+    bench_dir: BenchOption = Path("runs/bench"),
+    frames: Annotated[int, typer.Option(help="Frames of the test split.", min=2, max=80)] = 80,
+    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
+) -> None:
+    """Measure every network that has weights, and write the rows."""
+    from perception.study.measure import Row, to_table
+    from perception.study.plan import read_plan
+    from perception.study.run import SHIPPED, measure
+
+    plan, rows = read_plan(), list[Row]()
+    with user_errors(), stages() as progress:
+        cores = workers or os.cpu_count() or 1
+        for job, some in measure(
+            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, progress=progress
+        ):
+            rows += some
+            out.print(f"[bold]{job}[/bold] measured")
+    if not rows:
+        raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
+    path = work / TABLE
+    _write_table(to_table(rows), path)
+    out.print(f"kept in [bold]{path}[/bold], tell it with: sortie study report {path}")
+
+
+@study.command("report")
+def study_report(
+    table: Annotated[Path, typer.Argument(help="Rows of `sortie study run`.")] = Path("runs/study") / TABLE,
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder for README.md, figures and the rows.")] = Path(
+        "docs/study"
+    ),
+    readme: Annotated[
+        Path | None, typer.Option(help="A Markdown file whose section between the study's markers is replaced.")
+    ] = None,
+) -> None:
+    """Tell the study: a Markdown report with figures, the rows beside it, and the README's sentences."""
+    from perception.harness import figures as common
+    from perception.harness.report import put_into
+    from perception.study import figures, report
+    from perception.study.measure import to_table
+    from perception.study.plan import read_plan
+
+    plan = read_plan()
+    drawn: list[tuple[str, str]] = []
+    with user_errors():
+        ensure_folder(out_dir, TABLE, "report")
+        rows = _read_rows(table)
+        with replacing(out_dir) as folder:
+            _write_table(to_table(rows), folder / TABLE)
+            if common.available():
+                drawn = figures.draw_all(plan, rows, folder)
+            (folder / REPORT).write_text(report.report(plan, rows, drawn), encoding="utf-8")
+        if readme is not None:
+            link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
+            section = report.short(plan, rows, link)
+            write_text(readme, put_into(readme.read_text("utf-8"), section, report.BEGIN, report.END))
+            out.print(f"the study's sentences in [bold]{readme}[/bold] written")
+    for line in report.answers(plan, report.Found(rows)):
+        out.print(line)
+    if not drawn:
+        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
+    out.print(f"kept in [bold]{out_dir}[/bold]")
+
+
+def _read_rows(path: Path) -> list[Row]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from perception.study.measure import from_table
+
+    try:
+        return from_table(pq.read_table(path))
+    except (OSError, pa.ArrowInvalid, TypeError) as error:
+        raise RunError(f"{path}: not the rows of a study ({error})") from None
+
+
+def _write_table(table: object, path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    pq.write_table(table, part)
+    part.replace(path)

@@ -1,0 +1,82 @@
+"""Folders that commands write: refused before the work when they cannot be used, replaced whole when it is done."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class RunError(ValueError):
+    """What a user asked of files or folders and cannot be done; the message names the path."""
+
+
+def ensure_folder(path: Path, holds: str, what: str) -> None:
+    """Refuse a path that `replacing` could not use, before anything is flown or measured.
+
+    Args:
+        path: the folder to be.
+        holds: a file by which an older one of the kind is known.
+        what: the kind's name, as in "run".
+
+    Raises:
+        RunError: it holds something else, or cannot be made.
+    """
+    if path.exists() and not path.is_dir():
+        raise RunError(f"{path}: is a file, a {what} needs a folder")
+    if path.is_dir() and any(path.iterdir()) and not (path / holds).is_file():
+        raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
+    there = next(p for p in path.absolute().parents if p.exists())
+    if not there.is_dir():
+        raise RunError(f"{path}: cannot make its folder: {there} is a file")
+    if not os.access(there, os.W_OK):
+        raise RunError(f"{path}: its folder {there} is not writable")
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A new temporary folder beside `path` that takes its place at the end; where the block fails, nothing changes.
+
+    Raises:
+        RunError: the disk refuses.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        yield partial
+        _replace(partial, path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text under a temporary name, then rename it.
+
+    Raises:
+        RunError: the disk refuses.
+    """
+    part = path.with_name(f".{path.name}.partial")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _replace(new: Path, path: Path) -> None:
+    """Rename `new` to `path`; an older one steps aside first, since a folder cannot be renamed over a full one."""
+    if not path.exists():
+        new.rename(path)
+        return
+    aside = path.with_name(f".{path.name}.old")
+    shutil.rmtree(aside, ignore_errors=True)
+    path.rename(aside)
+    new.rename(path)
+    shutil.rmtree(aside)
