@@ -1,8 +1,7 @@
-"""`sortie train` and `sortie study`: the commands."""
+"""`sortie train`: the command."""
 
 from __future__ import annotations
 
-import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -10,11 +9,6 @@ from typing import Annotated
 import typer
 
 from sim.console import out, stages, user_errors
-from sim.rundir import RunError
-
-study = typer.Typer(
-    no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
-)
 
 
 class Exchange(StrEnum):
@@ -98,65 +92,3 @@ def train(
         )
     curves.close()
     out.print(tables.training_table(result))
-
-
-WorkOption = Annotated[Path, typer.Option("--work", help="Weights, checkpoints and finished frames.")]
-BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
-
-
-@study.command("train")
-def study_train(
-    jobs: Annotated[list[str] | None, typer.Argument(help="Networks, as in dropout-1; left out, all of them.")] = None,
-    work: WorkOption = Path("runs/study"),
-    bench_dir: BenchOption = Path("runs/bench"),
-) -> None:
-    """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
-    from perception.study.plan import read_plan
-    from perception.study.run import SHIPPED, train_job
-
-    plan = read_plan()
-    with user_errors():
-        for job in jobs or [v.job(s) for v, s in plan.jobs()]:
-            with stages(f"{job}: ") as progress:
-                result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
-            if result is None:
-                out.print(f"[bold]{job}[/bold] has its weights")
-            else:
-                gain = result.validation
-                out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
-
-
-@study.command("run")
-def study_run(
-    work: WorkOption = Path("runs/study"),
-    bench_dir: BenchOption = Path("runs/bench"),
-    frames: Annotated[int, typer.Option(help="Frames of the test split.", min=2, max=80)] = 80,
-    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
-) -> None:
-    """Measure every network that has weights, and write the rows, the report and the notebook's data."""
-    from perception.study.measure import Row, to_table
-    from perception.study.plan import read_plan
-    from perception.study.run import SHIPPED, measure
-
-    plan, rows = read_plan(), list[Row]()
-    with user_errors(), stages() as progress:
-        cores = workers or os.cpu_count() or 1
-        for job, some in measure(
-            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, progress=progress
-        ):
-            rows += some
-            out.print(f"[bold]{job}[/bold] measured")
-    if not rows:
-        raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
-    path = work / "study.parquet"
-    _write_table(to_table(rows), path)
-    out.print(f"kept in [bold]{path}[/bold], tell it with: sortie study report {path}")
-
-
-def _write_table(table: object, path: Path) -> None:
-    import pyarrow.parquet as pq
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    pq.write_table(table, part)
-    part.replace(path)

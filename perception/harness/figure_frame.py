@@ -25,10 +25,10 @@ def draw(picture: Picture) -> Figure:
     """Five nadir views over three maps of the ego's square, east right and north up."""
     from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import BoundaryNorm
+    from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 6.0), layout="constrained")
+    figure = Figure(figsize=(11.0, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.0, 3.0])
     above, below = parts
@@ -38,10 +38,11 @@ def draw(picture: Picture) -> Figure:
     _ground(axes[0], picture)
     _boxes(axes[0], picture.truth, TRUTH, filled=True, label=f"truth ({len(picture.truth)})")
     _boxes(axes[0], picture.found, FOUND, filled=False, label=f"detections ({len(picture.found)})")
-    axes[0].set_title("(a) truth, and detections under full sharing", fontsize=9, loc="left")
+    axes[0].set_title(f"(a) {picture.name}: truth and detections", fontsize=9, loc="left")
     axes[0].legend(fontsize=7, loc="upper right", framealpha=0.9)
     peers = max(1, len(picture.est_pose) - 1)
-    shades, steps = colormaps["YlGnBu"].resampled(peers + 1), BoundaryNorm(np.arange(-0.5, peers + 1), peers + 1)
+    shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.3, 1.0, peers)))
+    steps = BoundaryNorm(np.arange(0.5, peers + 1), peers)
     for k, (ax, (rho, counts)) in enumerate(zip(axes[1:], picture.shared, strict=True)):
         x, y = _cell_corners(picture)
         mesh = ax.pcolormesh(x, y, np.ma.masked_equal(counts, 0), cmap=shades, norm=steps, rasterized=True)
@@ -64,7 +65,7 @@ def _views(figure: Any, picture: Picture) -> None:
     axes = np.atleast_1d(figure.subplots(1, len(picture.views))).ravel().tolist()
     for drone, (ax, view) in enumerate(zip(axes, picture.views, strict=True)):
         ax.imshow(view[NADIR])
-        ax.set_title(f"drone {drone}" + (f", the ego · {picture.name}" if drone == picture.ego else ""), fontsize=8)
+        ax.set_title(f"drone {drone}" + (", the ego" if drone == picture.ego else ""), fontsize=8)
         ax.set_axis_off()
 
 

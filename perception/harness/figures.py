@@ -43,7 +43,7 @@ def available() -> bool:
 
 def frontier(points: Sequence[Point]) -> Figure:
     """The byte–accuracy curve, full scene and mission, under both instruments, the paper's points beside it."""
-    figure, axes = _figure(1, 2, (10.4, 3.9))
+    figure, axes = figure_of(1, 2, (10.4, 3.9))
     for ax, region, title in zip(axes, COLOURS, ("full scene", "32 m mission disc"), strict=True):
         for instrument, name in INSTRUMENTS.items():
             line = [p for rho in CURVE for p in _of(points, instrument, region, "all-4", rho)]
@@ -63,14 +63,14 @@ def frontier(points: Sequence[Point]) -> Figure:
         _budget_axis(ax, CURVE)
         ax.set_title(title, loc="left", fontsize=10)
         ax.set_ylabel("AP@0.5")
-    _legend_below(figure, axes[0])
+    legend_below(figure, axes[0])
     return figure
 
 
 def peer_selection(points: Sequence[Point]) -> Figure:
     """AP of the fixed policies by budget at matched bytes, the best of each marked, a panel an instrument."""
     shown = [i for i in INSTRUMENTS if any(p.instrument == i for p in points)]
-    figure, axes = _figure(1, len(shown), (5.2 * len(shown), 3.9), sharey=True)
+    figure, axes = figure_of(1, len(shown), (5.2 * len(shown), 3.9), sharey=True)
     for ax, instrument in zip(axes, shown, strict=True):
         place = np.arange(len(BUDGETS), dtype=float)
         for k, (policy, colour) in enumerate(POLICY_COLOURS.items()):
@@ -89,7 +89,7 @@ def peer_selection(points: Sequence[Point]) -> Figure:
         ax.set_xlabel("ρ, part of full sharing's bytes")
         ax.set_title(f"{INSTRUMENTS[instrument]}  (▼ the best)", loc="left", fontsize=10)
     axes[0].set_ylabel("AP@0.5, full scene")
-    _legend_below(figure, axes[0])
+    legend_below(figure, axes[0])
     return figure
 
 
@@ -97,7 +97,7 @@ def forest(rows: Iterable[Row]) -> Figure:
     """Every difference of APs: the paper's interval in grey, ours by verdict, masked fusion hollow."""
     rows = [r for r in rows if r.unit == "AP points"]
     ids = list(dict.fromkeys(r.id for r in rows))
-    figure, (ax,) = _figure(1, 1, (8.2, 0.9 + 0.34 * len(ids)))
+    figure, (ax,) = figure_of(1, 1, (8.2, 0.9 + 0.34 * len(ids)))
     labels = []
     for i, claim in enumerate(ids):
         its = {r.instrument: r for r in rows if r.id == claim}
@@ -142,7 +142,7 @@ def save(figure: Figure, path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Sequence[Axes]]:
+def figure_of(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Sequence[Axes]]:
     """A figure without a window or pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -157,7 +157,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float], **options: Any) 
     return figure, axes
 
 
-def _legend_below(figure: Figure, ax: Axes) -> None:
+def legend_below(figure: Figure, ax: Axes) -> None:
     """One legend for all panels, under them."""
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=len(labels))
@@ -193,4 +193,4 @@ def _bar(
     ax.plot(value, y, marker, color=colour, mfc=colour if filled else "white", ms=4.8)
 
 
-__all__ = ["available", "forest", "frontier", "peer_selection", "save"]
+__all__ = ["available", "figure_of", "forest", "frontier", "legend_below", "peer_selection", "save"]

@@ -117,16 +117,16 @@ def short(rows: Sequence[Row], facts: Mapping[str, Any], link: str) -> str:
     return "\n".join([*head, *table, *tail])
 
 
-def put_into(text: str, section: str) -> str:
+def put_into(text: str, section: str, begin: str = BEGIN, end: str = END) -> str:
     """A README with its section between the markers replaced.
 
     Raises:
         ValueError: the markers are missing, doubled or in the wrong order.
     """
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise ValueError(f"must hold {BEGIN} and {END} once each, in this order")
-    before, _, rest = text.partition(BEGIN)
-    return before + section + rest.partition(END)[2]
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"must hold {begin} and {end} once each, in this order")
+    before, _, rest = text.partition(begin)
+    return before + section + rest.partition(end)[2]
 
 
 _RULE = """\
