@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from perception.study.measure import Row
+from perception.study.measure import MODEL_TAU, Row
 from perception.study.plan import Plan
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
@@ -67,17 +67,9 @@ def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] =
     lines += ["## The answer", "", *answers(plan, found), ""]
     for name, caption in figures:
         lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
-    lines += ["## Every network", "", _LEGEND, ""]
-    for unsent in plan.measured.unsent:
-        lines += [f"**{UNSENT[unsent]}**, τ = 0.1, cells by confidence:", "", *_networks(plan, found, unsent), ""]
     first, seed = plan.variants[0], plan.variants[0].seeds[0]
-    lines += [f"## The score threshold ({first.job(seed)})", ""]
-    for unsent in plan.measured.unsent:
-        views = {
-            _tau(found, first.name, seed, str(t)): View(first.name, seed, unsent, tau_name=str(t))
-            for t in plan.measured.taus
-        }
-        lines += [f"**{UNSENT[unsent]}**:", "", *_table(plan, found, "τ", views), ""]
+    lines += ["## Every network", "", networks(plan, found)]
+    lines += [f"## The score threshold ({first.job(seed)})", "", thresholds(plan, found)]
     for title, others in _others(plan, first.name, seed):
         if table := _table(plan, found, "network", others):
             lines += [f"## {title}", "", *table, ""]
@@ -89,6 +81,30 @@ def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] =
             f"Not trained yet, so not in these tables: {', '.join(missing)}. `sortie study train` trains them.",
         ]
     return "\n".join(lines) + "\n"
+
+
+def networks(plan: Plan, found: Found) -> str:
+    """Every network at the model's own threshold, a table a filling."""
+    lines = [_LEGEND, ""]
+    for unsent in plan.measured.unsent:
+        views = {v.job(s): View(v.name, s, unsent) for v in plan.variants for s in v.seeds}
+        lines += [f"**{UNSENT[unsent]}**, τ = {MODEL_TAU:g}, cells by confidence:", ""]
+        lines += [*_table(plan, found, "network", views), ""]
+    return "\n".join(lines)
+
+
+def thresholds(plan: Plan, found: Found) -> str:
+    """The first network at every score threshold, a table a filling."""
+    variant, lines = plan.variants[0], []
+    for unsent in plan.measured.unsent:
+        views = {
+            _tau(found, variant.name, variant.seeds[0], str(t)): View(
+                variant.name, variant.seeds[0], unsent, tau_name=str(t)
+            )
+            for t in plan.measured.taus
+        }
+        lines += [f"**{UNSENT[unsent]}**:", "", *_table(plan, found, "τ", views), ""]
+    return "\n".join(lines)
 
 
 def short(plan: Plan, rows: Sequence[Row], link: str) -> str:
@@ -178,11 +194,6 @@ def _others(plan: Plan, name: str, seed: int) -> Iterable[tuple[str, Mapping[str
         f"Car density ({name}-{seed})",
         {f"{d}, {unsent}": View(name, seed, unsent, density=d) for d in m.densities for unsent in m.unsent},
     )
-
-
-def _networks(plan: Plan, found: Found, unsent: str) -> list[str]:
-    views = {v.job(s): View(v.name, s, unsent) for v in plan.variants for s in v.seeds}
-    return _table(plan, found, "network", views)
 
 
 def _table(plan: Plan, found: Found, head: str, views: Mapping[str, View]) -> list[str]:
