@@ -12,6 +12,7 @@ from functools import lru_cache
 from math import ceil
 
 from radio.contention import DIFS_S, SIFS_S, SLOT_S, Contention
+from radio.rates import STANDARDS, Standard
 
 # Bytes (OMG DDSI-RTPS 2.5; RFC 791, 768; IEEE 802.11)
 RTPS_HEADER, INFO_TS, INFO_DST = 20, 12, 16
@@ -22,7 +23,6 @@ MAC_UNICAST, MAC_GROUP = 38, 36
 MPDU_DELIMITER = 4
 
 # Seconds
-HE_PREAMBLE_S, HE_SYMBOL_S = 44e-6, 13.6e-6
 LEGACY_PREAMBLE_S, LEGACY_SYMBOL_S = 20e-6, 4e-6
 MAX_PPDU_S = 5.484e-3
 SERVICE_TAIL_BITS = 22
@@ -60,10 +60,14 @@ def repair_wire_bytes(lost: int) -> int:
     return around + HEARTBEAT + ACKNACK + 4 * max(1, ceil(min(lost, 256) / 32))
 
 
-def he_ppdu_s(psdu_bytes: int, rate_mbps: float) -> float:
-    """Time of an HE frame: 44 µs preamble, then 13.6 µs symbols."""
-    bits_per_symbol = rate_mbps * 1e6 * HE_SYMBOL_S
-    return HE_PREAMBLE_S + HE_SYMBOL_S * ceil((SERVICE_TAIL_BITS + 8 * psdu_bytes) / bits_per_symbol - 1e-9)
+AX = STANDARDS["ax"]
+
+
+def ppdu_s(psdu_bytes: int, rate_mbps: float, standard: Standard = AX) -> float:
+    """Time of an HT, VHT or HE frame: its preamble (44 µs with 802.11ax), then whole symbols (13.6 µs)."""
+    symbol_s = standard.symbol_s
+    bits_per_symbol = rate_mbps * 1e6 * symbol_s
+    return standard.preamble_s + symbol_s * ceil((SERVICE_TAIL_BITS + 8 * psdu_bytes) / bits_per_symbol - 1e-9)
 
 
 def legacy_ppdu_s(psdu_bytes: int, rate_mbps: float) -> float:
@@ -82,10 +86,11 @@ ACK_S = legacy_ppdu_s(14, CONTROL_MBPS)
 BLOCK_ACK_S = legacy_ppdu_s(32, CONTROL_MBPS)
 
 
-def ampdu_frames(frame: int, rate_mbps: float, max_frames: int) -> int:
-    """How many frames of `frame` bytes one A-MPDU takes, by number and by the 5.484 ms limit; at least 1."""
-    fit = int((MAX_PPDU_S - HE_PREAMBLE_S) * rate_mbps * 1e6 / (8 * (frame + MPDU_DELIMITER)))
-    return max(1, min(max_frames, fit))
+def ampdu_frames(frame: int, rate_mbps: float, max_frames: int, standard: Standard = AX) -> int:
+    """How many frames of `frame` bytes one A-MPDU takes: by number, length and the 5.484 ms limit; at least 1."""
+    fit = int((MAX_PPDU_S - standard.preamble_s) * rate_mbps * 1e6 / (8 * (frame + MPDU_DELIMITER)))
+    by_length = standard.max_ampdu_bytes // (frame + MPDU_DELIMITER)
+    return max(1, min(max_frames, standard.max_ampdu_frames, fit, by_length))
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,24 +124,33 @@ def _exchange(ppdu_s: float, ack_s: float) -> Exchanges:
 
 
 def frames_exchanges(
-    count: int, frame: int, last_frame: int, rate_mbps: float, max_frames: int, ack_s: float = BLOCK_ACK_S
+    count: int,
+    frame: int,
+    last_frame: int,
+    rate_mbps: float,
+    max_frames: int,
+    ack_s: float = BLOCK_ACK_S,
+    standard: Standard = AX,
 ) -> Exchanges:
     """Exchanges for `count` frames of `frame` bytes, the last of them of `last_frame` bytes, in full A-MPDUs."""
-    m = ampdu_frames(frame, rate_mbps, max_frames)
+    m = ampdu_frames(frame, rate_mbps, max_frames, standard)
     if m == 1:
-        full = _exchange(he_ppdu_s(frame, rate_mbps), ack_s).scaled(count - 1)
-        return full + _exchange(he_ppdu_s(last_frame, rate_mbps), ack_s)
+        full = _exchange(ppdu_s(frame, rate_mbps, standard), ack_s).scaled(count - 1)
+        return full + _exchange(ppdu_s(last_frame, rate_mbps, standard), ack_s)
     whole, rest = divmod(count - 1, m)  # the last frame rides in the last, perhaps partial, A-MPDU
-    full = _exchange(he_ppdu_s(m * (frame + MPDU_DELIMITER), rate_mbps), ack_s).scaled(whole)
+    full = _exchange(ppdu_s(m * (frame + MPDU_DELIMITER), rate_mbps, standard), ack_s).scaled(whole)
     tail_bytes = rest * (frame + MPDU_DELIMITER) + last_frame + MPDU_DELIMITER
-    return full + _exchange(he_ppdu_s(tail_bytes, rate_mbps), ack_s)
+    return full + _exchange(ppdu_s(tail_bytes, rate_mbps, standard), ack_s)
 
 
-def sample_exchanges(payload_bytes: int, fragment_bytes: int, rate_mbps: float, max_frames: int) -> Exchanges:
+def sample_exchanges(
+    payload_bytes: int, fragment_bytes: int, rate_mbps: float, max_frames: int, standard: Standard = AX
+) -> Exchanges:
     """Exchanges of a whole unicast sample."""
     k = fragments(payload_bytes, fragment_bytes)
     last = frame_bytes(payload_bytes - (k - 1) * fragment_bytes, fragmented=k > 1)
-    return frames_exchanges(k, frame_bytes(fragment_bytes, fragmented=True), last, rate_mbps, max_frames)
+    full = frame_bytes(fragment_bytes, fragmented=True)
+    return frames_exchanges(k, full, last, rate_mbps, max_frames, standard=standard)
 
 
 def tries(per: float, retry_limit: int) -> float:

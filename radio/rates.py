@@ -1,8 +1,9 @@
-"""802.11ax rates, packet error rates and the rate that an ideal sender picks.
+"""802.11n, ac and ax rates, packet error rates and the rate that an ideal sender picks.
 
 One spatial stream. The packet error rate (PER) of a 1458 B LDPC frame over white noise is a logistic
 in dB, 1 / (1 + e^{a (SNR − s50)}), fitted per MCS (error ≤ 0.036); a frame of L bytes fails with
 1 − (1 − PER)^{L/1458}. On a fading link the *mean* PER is the average of that over the Rician power gain.
+The fits were made for 802.11ax; n and ac use the same modulations and codes, and are given the same curves.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from math import exp, expm1, log1p
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +19,52 @@ from scipy.special import chndtr
 
 FloatArray = NDArray[np.float64]
 
-RATES_MBPS: dict[int, tuple[float, ...]] = {
-    20: (8.6, 17.2, 25.8, 34.4, 51.5, 68.8, 77.4, 86.0, 103.2, 114.7, 129.0, 143.4),
-    40: (17.2, 34.4, 51.6, 68.8, 103.0, 137.6, 154.8, 172.0, 206.4, 229.4, 258.0, 286.8),
-    80: (36.0, 72.1, 108.1, 144.1, 216.2, 288.2, 324.3, 360.3, 432.4, 480.4, 540.4, 600.5),
-}
-"""Data rate by channel width (MHz) and MCS 0 … 11, 0.8 µs guard interval (IEEE 802.11ax)."""
+StandardName = Literal["n", "ac", "ax"]
+
+
+@dataclass(frozen=True, slots=True)
+class Standard:
+    """What a sender of one 802.11 generation puts around its bits (IEEE 802.11-2020, 802.11ax-2021)."""
+
+    name: StandardName
+    preamble_s: float
+    """Legacy, signal and training fields of a single-stream frame."""
+    symbol_s: float
+    """OFDM symbol with a guard interval of 0.8 µs."""
+    max_ampdu_bytes: int
+    """Longest A-MPDU by its length exponent."""
+    max_ampdu_frames: int
+    """Frames that one block ack answers."""
+    rates_mbps: dict[int, tuple[float, ...]]
+    """Data rate by channel width (MHz) and MCS."""
+
+
+STANDARDS: dict[StandardName, Standard] = {
+    "n": Standard(
+        "n", 36e-6, 4e-6, 65_535, 64,
+        {
+            20: (6.5, 13.0, 19.5, 26.0, 39.0, 52.0, 58.5, 65.0),
+            40: (13.5, 27.0, 40.5, 54.0, 81.0, 108.0, 121.5, 135.0),
+        },
+    ),
+    "ac": Standard(
+        "ac", 40e-6, 4e-6, 1_048_575, 64,
+        {
+            20: (6.5, 13.0, 19.5, 26.0, 39.0, 52.0, 58.5, 65.0, 78.0),
+            40: (13.5, 27.0, 40.5, 54.0, 81.0, 108.0, 121.5, 135.0, 162.0, 180.0),
+            80: (29.3, 58.5, 87.8, 117.0, 175.5, 234.0, 263.3, 292.5, 351.0, 390.0),
+        },
+    ),
+    "ax": Standard(
+        "ax", 44e-6, 13.6e-6, 6_500_631, 256,
+        {
+            20: (8.6, 17.2, 25.8, 34.4, 51.5, 68.8, 77.4, 86.0, 103.2, 114.7, 129.0, 143.4),
+            40: (17.2, 34.4, 51.6, 68.8, 103.0, 137.6, 154.8, 172.0, 206.4, 229.4, 258.0, 286.8),
+            80: (36.0, 72.1, 108.1, 144.1, 216.2, 288.2, 324.3, 360.3, 432.4, 480.4, 540.4, 600.5),
+        },
+    ),
+}  # fmt: skip
+"""One spatial stream, guard interval 0.8 µs. 802.11n has no 80 MHz, 802.11ac no MCS 9 at 20 MHz."""
 
 S50_DB = (-0.94, 2.07, 4.56, 7.55, 10.61, 14.78, 16.15, 17.66, 21.29, 23.10, 26.39, 28.45)
 SLOPE_PER_DB = (9.3, 9.1, 10.1, 7.8, 9.1, 7.9, 7.9, 7.4, 7.0, 6.8, 6.4, 5.8)
@@ -93,24 +135,27 @@ class RateTable:
         return self.mcs[i], self.rate_mbps[i], self.mean_per[i]
 
 
-@lru_cache(maxsize=32)
-def rate_table(bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYTES) -> RateTable:
+@lru_cache(maxsize=64)
+def rate_table(
+    bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYTES, standard: StandardName = "ax"
+) -> RateTable:
     """Build the table of one channel: mean PER by quadrature, then the MCS of highest rate × (1 − mean PER).
 
     Args:
-        bandwidth_mhz: 20, 40 or 80.
+        bandwidth_mhz: 20, 40 or 80, as far as the standard has it.
         k_db: Rician factor of the fading.
         frame_bytes: length of the frames that rate control has in mind.
+        standard: whose rates; its MCS are the first ones of 802.11ax.
     """
+    rates = np.array(STANDARDS[standard].rates_mbps[bandwidth_mhz])
     _, weights = fading_weights(k_db)
     grid = np.arange(_LOW_DB, _HIGH_DB + _STEP_DB / 2, _STEP_DB)
     wide = np.arange(_LOW_DB + _FADE_LOW_DB, _HIGH_DB + _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
-    s50, slope = np.array(S50_DB)[:, None], np.array(SLOPE_PER_DB)[:, None]
+    s50, slope = np.array(S50_DB)[: len(rates), None], np.array(SLOPE_PER_DB)[: len(rates), None]
     log_success = -np.logaddexp(0.0, -slope * (wide - s50))
     awgn = -np.expm1(log_success * (frame_bytes / REFERENCE_BYTES))
     # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities
     mean = np.stack([np.correlate(row, weights, mode="valid") for row in awgn])[:, : len(grid)].clip(0.0, 1.0)
-    rates = np.array(RATES_MBPS[bandwidth_mhz])
     best = (rates[:, None] * (1.0 - mean)).argmax(axis=0)
     dead = mean[0] > NO_LINK_PER
     columns = np.arange(len(grid))
@@ -125,10 +170,14 @@ def rate_table(bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYT
 
 
 def choose_mcs(
-    mean_snr_db: float, bandwidth_mhz: int, k_db: float, frame_bytes: int = REFERENCE_BYTES
+    mean_snr_db: float,
+    bandwidth_mhz: int,
+    k_db: float,
+    frame_bytes: int = REFERENCE_BYTES,
+    standard: StandardName = "ax",
 ) -> tuple[int, float, float]:
     """(MCS, rate in Mb/s, mean PER) of the ideal rate control; MCS −1 when even MCS 0 fails (mean PER > 0.9)."""
-    return rate_table(bandwidth_mhz, k_db, frame_bytes).at(mean_snr_db)
+    return rate_table(bandwidth_mhz, k_db, frame_bytes, standard).at(mean_snr_db)
 
 
 def group_mcs(rate_mbps: float) -> int:

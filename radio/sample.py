@@ -18,7 +18,7 @@ from radio.airtime import (
 )
 from radio.contention import contention
 from radio.medium import Job
-from radio.rates import RATES_MBPS, rate_table, rescale
+from radio.rates import STANDARDS, rate_table, rescale
 from radio.transmission import Status, Transmission
 from scenarios.schema import Radio
 
@@ -136,10 +136,11 @@ class Service:
     def __init__(self, config: Radio) -> None:
         self._config = config
         self._frame_bytes = frame_bytes(config.fragment_bytes, fragmented=True)
-        self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes)
-        self._rates = RATES_MBPS[config.bandwidth_mhz]
+        self._standard = STANDARDS[config.standard]
+        self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes, config.standard)
+        self._rates = self._standard.rates_mbps[config.bandwidth_mhz]
         self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
-        probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S)
+        probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S, self._standard)
         self._probe = probe.scaled(config.retry_limit + 1.0)
         # both are the same again and again: links are looked up on a grid of SNR, payloads come in few sizes
         self._demands: dict[tuple[int, int, bool], Exchanges] = {}
@@ -206,15 +207,17 @@ class Service:
 
     def _demand(self, payload_bytes: int, mcs: int, reliable: bool) -> Exchanges:
         c, rate = self._config, self._rates[mcs]
-        demand = sample_exchanges(payload_bytes, c.fragment_bytes, rate, c.max_ampdu_frames)
+        demand = sample_exchanges(payload_bytes, c.fragment_bytes, rate, c.max_ampdu_frames, self._standard)
         if reliable:  # heartbeat and ACKNACK, each an exchange of its own
             length = repair_wire_bytes(1) // 2
-            demand = demand + frames_exchanges(1, length, length, rate, 1, ACK_S).scaled(2.0)
+            demand = demand + frames_exchanges(1, length, length, rate, 1, ACK_S, self._standard).scaled(2.0)
         return demand
 
     def _full_goodput(self, rate_mbps: float) -> float:
         """Payload Mb/s of full A-MPDUs without loss, alone on the channel."""
         c = self._config
-        m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames)
-        exchanges = frames_exchanges(m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames)
+        m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames, self._standard)
+        exchanges = frames_exchanges(
+            m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames, standard=self._standard
+        )
         return m * c.fragment_bytes * 8e-6 / exchanges.channel_s(contention(1))

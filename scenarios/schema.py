@@ -77,6 +77,25 @@ class Motion(Section):
     )
 
 
+class Airframe(Section):
+    mass_kg: float = Field(2.04, gt=0, le=100, description="All-up mass without payload, battery included.")
+    payload_kg: float = Field(0.0, ge=0, le=100, description="What is carried besides.")
+    disc_area_m2: float = Field(0.503, gt=0, le=50, description="Area that all rotors sweep.")
+    figure_of_merit: float = Field(
+        0.478,
+        ge=0.1,
+        le=0.9,
+        description="Ideal over true power at the rotors in hover; real small propellers 0.5 to 0.7.",
+    )
+    tip_speed_mps: float = Field(120.0, ge=10, le=300, description="Speed of the blades' tips in hover, no payload.")
+    drag_area_m2: float = Field(0.01509, ge=0, le=5, description="Drag over dynamic pressure.")
+    air_density_kgpm3: float = Field(1.225, ge=0.3, le=1.5, description="1.225 at sea level, 1.11 at 1,000 m.")
+    power_model: Literal["level", "momentum"] = Field(
+        "level",
+        description="level: the formula for level flight, and m·g·v_z while climbing; momentum: momentum theory with climb's inflow, vertical gusts and acceleration.",
+    )
+
+
 class Battery(Section):
     capacity_wh: float = Field(130.0, gt=0, le=5000, description="Energy of a full pack at rest (open circuit).")
     cells: int = Field(4, ge=1, le=24, description="LiPo cells in series.")
@@ -96,13 +115,39 @@ class Battery(Section):
     radio_idle_w: float = Field(2.0, ge=0, le=50, description="Radio while it listens.")
     radio_tx_w: float = Field(6.0, ge=0, le=50, description="Radio while it sends, the whole draw.")
     landing_soc: float = Field(0.1, ge=0, lt=1, description="The drone lands when its charge reaches this.")
+    cutoff_cell_v: float = Field(
+        0.0, ge=0, le=4.2, description="It also lands when a cell's mean voltage under load falls below this; 0: never."
+    )
+    polarisation_mohm: float = Field(
+        0.0, ge=0, le=500, description="Resistance of one cell that builds up over polarisation_time_s under load."
+    )
+    polarisation_time_s: float = Field(20.0, gt=0, le=3600, description="Time constant of polarisation.")
+    ambient_c: float | None = Field(
+        None,
+        ge=-40,
+        le=60,
+        description="Temperature of the air, and of the pack at take-off; left out, packs stay at 25 °C.",
+    )
+    cycles: float = Field(0.0, ge=0, le=10000, description="Full cycles behind the pack, which age it.")
+    life_cycles: float = Field(
+        300.0, gt=0, le=10000, description="Cycles to a pack's end of life: 80 % of its capacity, twice its resistance."
+    )
+
+    @model_validator(mode="after")
+    def _still_a_pack(self) -> Battery:
+        if self.cycles > 2 * self.life_cycles:
+            bound = f"at most twice life_cycles = {self.life_cycles:g}"
+            raise _inconsistent(("cycles",), f"{self.cycles:g}", bound)
+        return self
 
 
 class DroneOverride(Section):
-    drone: DroneId = Field(description="Whose battery differs.")
+    drone: DroneId = Field(description="Whose battery or load differs.")
     initial_soc: Soc | None = Field(None, description="As fleet.battery.initial_soc.")
     capacity_wh: float | None = Field(None, gt=0, le=5000, description="As fleet.battery.capacity_wh.")
     cell_resistance_mohm: float | None = Field(None, ge=0, le=500, description="As fleet.battery.cell_resistance_mohm.")
+    cycles: float | None = Field(None, ge=0, le=10000, description="As fleet.battery.cycles.")
+    payload_kg: float | None = Field(None, ge=0, le=100, description="As fleet.airframe.payload_kg.")
 
 
 class Fleet(Section):
@@ -110,8 +155,15 @@ class Fleet(Section):
     formation: Formation = Formation()
     route: Route = Route()
     motion: Motion = Motion()
+    airframe: Airframe = Airframe()
     battery: Battery = Battery()
-    overrides: tuple[DroneOverride, ...] = Field((), description="Drones whose battery differs from fleet.battery.")
+    overrides: tuple[DroneOverride, ...] = Field(
+        (), description="Drones whose battery or payload differs from the fleet's."
+    )
+    trace: str | None = Field(
+        None,
+        description="CSV or Parquet (fleet/traces.py): drones named in it take pose or battery from it, not from the models.",
+    )
 
     @model_validator(mode="after")
     def _overrides_fit(self) -> Fleet:
@@ -123,6 +175,9 @@ class Fleet(Section):
             if override.drone in seen:
                 raise _inconsistent(at, f"{override.drone}", "named once, it has an override above")
             seen.add(override.drone)
+            if override.cycles is not None and override.cycles > 2 * self.battery.life_cycles:
+                bound = f"at most twice fleet.battery.life_cycles = {self.battery.life_cycles:g}"
+                raise _inconsistent(("overrides", i, "cycles"), f"{override.cycles:g}", bound)
         return self
 
 
@@ -173,22 +228,49 @@ class Mission(Section):
 
 
 class Radio(Section):
+    standard: Literal["n", "ac", "ax"] = Field(
+        "ax", description="802.11 generation, one spatial stream: rates, preamble, aggregation."
+    )
     carrier_ghz: float = Field(5.2, ge=0.4, le=7.2, description="Carrier frequency.")
-    bandwidth_mhz: Literal[20, 40, 80] = Field(80, description="Channel width, 802.11ax, one spatial stream.")
+    bandwidth_mhz: Literal[20, 40, 80] = Field(80, description="Channel width; 802.11n has no 80 MHz.")
     tx_power_dbm: float = Field(20.0, ge=-20, le=36, description="Transmit power, antenna gains included.")
     noise_figure_db: float = Field(7.0, ge=0, le=30, description="Receiver noise figure.")
+    antenna: Literal["isotropic", "dipole"] = Field(
+        "isotropic", description="Pattern of every drone's antenna; a dipole stands along the airframe's z axis."
+    )
+    path_loss: Literal["log_distance", "free_space", "two_ray"] = Field(
+        "log_distance", description="Path loss; two_ray adds the ground's reflection (ground is z = 0) to free space."
+    )
     path_loss_exponent: float = Field(2.1, ge=1.5, le=6, description="Log-distance exponent beyond 1 m.")
+    ground_roughness_m: float = Field(
+        0.05, ge=0, le=10, description="Standard deviation of the ground's height, for two_ray: rough ground scatters."
+    )
     shadowing_sigma_db: float = Field(3.5, ge=0, le=20, description="Standard deviation of shadowing.")
     shadowing_time_s: float = Field(
         4.5, gt=0, le=600, description="Correlation time of shadowing (4.5 s is 0.8 at 1 s)."
     )
+    shadowing_distance_m: float | None = Field(
+        None,
+        gt=0,
+        le=5000,
+        description="Correlation distance of shadowing, for both ends of a link; left out, every pair has its own, in time alone.",
+    )
     rician_k_db: float = Field(12.0, ge=-10, le=40, description="Rician factor of small-scale fading.")
     group_rate_mbps: float = Field(6.0, ge=1, le=54, description="Basic rate of group-addressed frames (descriptors).")
+    rate_control: Literal["ideal", "minstrel"] = Field(
+        "ideal", description="Who picks the MCS: the SNR of the frame before, or statistics of what got through."
+    )
     retry_limit: int = Field(7, ge=0, le=32, description="MAC retries of a unicast frame.")
     max_ampdu_frames: int = Field(64, ge=1, le=256, description="Frames aggregated into one A-MPDU.")
     fragment_bytes: int = Field(1344, ge=64, le=65000, description="DDS fragment payload.")
     heartbeat_s: float = Field(0.02, gt=0, le=10, description="Heartbeat period of the reliable writer.")
     nack_delay_s: float = Field(0.005, ge=0, le=10, description="The reader's delay before it asks for a repair.")
+
+    @model_validator(mode="after")
+    def _width_exists(self) -> Radio:
+        if self.standard == "n" and self.bandwidth_mhz == 80:
+            raise _inconsistent(("bandwidth_mhz",), "80", "20 or 40 where standard is n")
+        return self
 
 
 # --- context plane -------------------------------------------------------------------------------
@@ -318,6 +400,11 @@ class BatteryFault(_Event):
     lost_fraction: float = Field(gt=0, le=1, description="Fraction of the remaining energy that is gone at once.")
 
 
+class CellFailure(_Event):
+    kind: Literal["cell_failure"]
+    drone: DroneId = Field(description="Whose pack loses a cell: its voltage and its energy are gone.")
+
+
 class ClockSkew(_Event):
     kind: Literal["clock_skew"]
     drone: DroneId = Field(description="Whose clock is off.")
@@ -336,7 +423,9 @@ class Spoof(_Event):
     rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
 
 
-Event = Annotated[LinkDrop | Jam | DroneLost | BatteryFault | ClockSkew | Spoof, Field(discriminator="kind")]
+Event = Annotated[
+    LinkDrop | Jam | DroneLost | BatteryFault | CellFailure | ClockSkew | Spoof, Field(discriminator="kind")
+]
 
 
 class Expectation(Section):

@@ -15,7 +15,7 @@ from radio_examples import CROSS_M, still
 from scipy import stats
 
 from radio import Air, Status, Transmission
-from radio.rates import RATES_MBPS
+from radio.rates import STANDARDS
 from radio.transmission import losses
 from scenarios.schema import Radio
 
@@ -325,7 +325,7 @@ def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
         k = round(t * 10)
         for i in range(4):
             f.publish(i)
-            assert all(0 <= g < RATES_MBPS[80][11] for g in f.air.goodput_mbps(i))
+            assert all(0 <= g < STANDARDS["ax"].rates_mbps[80][11] for g in f.air.goodput_mbps(i))
         for frame, sender, hop, payload, kind, reliable, deadline_s in samples:
             if frame == k:
                 f.send(sender, (sender + hop) % 4, payload, kind=kind, reliable=reliable, deadline_s=deadline_s)

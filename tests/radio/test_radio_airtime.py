@@ -44,8 +44,8 @@ def test_control_frames_last_as_the_standard_says() -> None:
 def test_an_ampdu_ends_at_its_number_or_at_5484_us() -> None:
     assert airtime.ampdu_frames(1494, 600.5, 64) == 64
     slow = airtime.ampdu_frames(1494, 36.0, 64)
-    assert airtime.he_ppdu_s(slow * 1498, 36.0) <= 5.484e-3 + airtime.HE_SYMBOL_S
-    assert airtime.he_ppdu_s((slow + 1) * 1498, 36.0) > 5.484e-3
+    assert airtime.ppdu_s(slow * 1498, 36.0) <= 5.484e-3 + 13.6e-6
+    assert airtime.ppdu_s((slow + 1) * 1498, 36.0) > 5.484e-3
     assert airtime.ampdu_frames(65_000, 8.6, 64) == 1
 
 
@@ -53,7 +53,7 @@ def test_a_sample_is_cut_into_full_ampdus_and_a_rest() -> None:
     whole = airtime.sample_exchanges(130 * 1344, 1344, 600.5, 64)
     assert whole.count == 3
     frame = 1344 + 20 + 12 + 16 + 36 + 28 + 38 + 4
-    ppdus = 2 * airtime.he_ppdu_s(64 * frame, 600.5) + airtime.he_ppdu_s(2 * frame, 600.5)
+    ppdus = 2 * airtime.ppdu_s(64 * frame, 600.5) + airtime.ppdu_s(2 * frame, 600.5)
     assert whole.ppdu_s == pytest.approx(ppdus)
     assert whole.clean_s == pytest.approx(ppdus + 3 * (SIFS_S + airtime.BLOCK_ACK_S + DIFS_S + SLOT_S))
 

@@ -8,7 +8,7 @@ from radio_examples import CROSS_M, still
 from scipy import integrate, stats
 
 from radio.channel import Channel, free_space_loss_db, noise_dbm, path_loss_db
-from radio.rates import LEGACY_RATES_MBPS, NO_LINK_PER, RATES_MBPS, choose_mcs, group_mcs, per, rate_table, rescale
+from radio.rates import LEGACY_RATES_MBPS, NO_LINK_PER, STANDARDS, choose_mcs, group_mcs, per, rate_table, rescale
 from scenarios.schema import Radio
 
 
@@ -186,7 +186,9 @@ def test_the_chosen_mcs_has_the_highest_goodput() -> None:
     table = rate_table(80, 12.0)
     for snr_db in np.arange(-1.5, 45.0, 0.5):
         mcs, rate, mean_per = choose_mcs(snr_db, 80, 12.0)
-        goodputs = [r * (1 - table.all_per[m][table.index(snr_db)]) for m, r in enumerate(RATES_MBPS[80])]
+        goodputs = [
+            r * (1 - table.all_per[m][table.index(snr_db)]) for m, r in enumerate(STANDARDS["ax"].rates_mbps[80])
+        ]
         assert rate * (1 - mean_per) == max(goodputs)
         assert goodputs[mcs] == max(goodputs)
 
