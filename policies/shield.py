@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, FleetView, Policy, Representation
+from policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
 from policies.invariants import (
     Binary,
     Invariant,
@@ -27,7 +27,6 @@ from policies.invariants import (
     Scope,
     evaluate,
     just_heard,
-    violations,
     walk,
 )
 
@@ -82,65 +81,56 @@ def enforce(
         decided: what it decided.
         fresh: what it decides at age 0, for rules that ask.
     """
-    directives = list(decided)
+    me, directives = view.me, list(decided)
+    if me is None:
+        return directives
     of_link = [rule for rule in rules if rule.of_link]
+    scope = Scope(view, me, directives, {d.destination: d for d in fresh})
     for k, directive in enumerate(directives):
-        broken = [r for r in of_link if _breaks(r, view, directives, fresh, directive)]
+        broken = [r for r in of_link if not _keeps(r, scope, directive)]
         if broken:
-            directives[k] = _mended(directives, k, of_link, broken, view, fresh)
+            directives[k] = _mended(scope, k, of_link, broken)
     for rule in rules:
-        if not rule.of_link and violations(rule, view, directives, fresh):
-            directives = _mended_together(directives, rule, of_link, view, fresh)
+        if not rule.of_link and not _keeps(rule, scope, None):
+            _mend_together(scope, directives, rule, of_link)
     return directives
 
 
-def _breaks(
-    rule: Invariant, view: FleetView, directives: Sequence[Directive], fresh: Sequence[Directive], one: Directive
-) -> bool:
-    return any(d is one for d in violations(rule, view, directives, fresh))
+def _keeps(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
+    here = scope._replace(link=link)
+    return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
 
 
-def _mended(
-    directives: list[Directive],
-    k: int,
-    rules: Sequence[Invariant],
-    broken: Sequence[Invariant],
-    view: FleetView,
-    fresh: Sequence[Directive],
-) -> Directive:
+def _mended(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
     """The nearest directive on this link that keeps every rule of links."""
-    before = directives[k]
-    for after in _nearest(before, rules, directives, view, fresh):
-        trial = [*directives[:k], after, *directives[k + 1 :]]
-        if not any(_breaks(r, view, trial, fresh, after) for r in rules):
+    before = scope.directives[k]
+    for _, after in _nearest(before, rules, scope):
+        if all(_keeps(r, scope, after) for r in rules):
             return _told(before, after, broken)
     return _unkept(before, broken)
 
 
-def _mended_together(
-    directives: list[Directive],
-    rule: Invariant,
-    of_link: Sequence[Invariant],
-    view: FleetView,
-    fresh: Sequence[Directive],
-) -> list[Directive]:
-    """The directives with one link changed, the least change of all links', so that a rule over all of them holds."""
+def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
+    """Change one link, the least change of all links', so that a rule over all of them holds.
+
+    Args:
+        scope: of these very directives.
+    """
     best: tuple[tuple[int, float], int, Directive] | None = None
-    for k, before in enumerate(directives):
-        for after in _nearest(before, [*of_link, rule], directives, view, fresh):
-            far = _distance(before, after)
+    for k, before in enumerate(list(directives)):
+        for far, after in _nearest(before, [*of_link, rule], scope):
             if best is not None and far >= best[0]:
                 break
-            trial = [*directives[:k], after, *directives[k + 1 :]]
-            if not violations(rule, view, trial, fresh) and not any(
-                _breaks(r, view, trial, fresh, after) for r in of_link
-            ):
+            directives[k] = after
+            if _keeps(rule, scope, None) and all(_keeps(r, scope, after) for r in of_link):
                 best = (far, k, after)
                 break
-    if best is not None:
+        directives[k] = before
+    if best is None:
+        directives[:] = [_unkept(d, [rule]) for d in directives]
+    else:
         _, k, after = best
-        return [*directives[:k], _told(directives[k], after, [rule]), *directives[k + 1 :]]
-    return [_unkept(d, [rule]) for d in directives]
+        directives[k] = _told(directives[k], after, [rule])
 
 
 def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
@@ -158,28 +148,28 @@ def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
 
 
 def _nearest(
-    before: Directive,
-    rules: Sequence[Invariant],
-    directives: Sequence[Directive],
-    view: FleetView,
-    fresh: Sequence[Directive],
-) -> Iterator[Directive]:
-    """Directives that differ in the decisions that the rules speak of, nearest first."""
-    me = view.me
-    if me is None:
-        return
-    scope = Scope(view, me, directives, {d.destination: d for d in fresh}, before)
+    before: Directive, rules: Sequence[Invariant], scope: Scope
+) -> Iterator[tuple[tuple[int, float], Directive]]:
+    """How far, and which: directives that differ in the decisions that the rules speak of, nearest first."""
+    here = scope._replace(link=before)
     values: dict[str, set[float]] = {}
     for rule in rules:
         for top in (rule.when, rule.then):
             if top is not None:
-                _collect(top, scope, values)
-    if not values:
-        return
-    words = sorted(values)
-    choices = [sorted({_value(before, w), 0.0, _HIGHEST[w], *values[w]}) for w in words]
-    found = (_with(before, dict(zip(words, pick, strict=True)), view) for pick in itertools.product(*choices))
-    yield from sorted({d for d in found if d is not None}, key=lambda d: (*_distance(before, d), tuple(map(repr, d))))
+                _collect(top, here, values)
+    now = {word: _value(before, word) for word in values}
+    steps = {w: sorted(({0.0, _HIGHEST[w]} | values[w]) - {now[w]}) for w in sorted(values)}
+    waiting: list[tuple[tuple[int, float], Directive]] = []
+    # A change of so many words changes so many fields or, where a rung takes its budget along, one more.
+    for changes in range(1, len(steps) + 2):
+        for words in itertools.combinations(steps, changes):
+            for pick in itertools.product(*(steps[w] for w in words)):
+                found = _with(before, dict(zip(words, pick, strict=True)), scope.me.region)
+                if found is not None:
+                    waiting.append((_distance(before, found), found))
+        near = [w for w in waiting if w[0][0] <= changes]
+        waiting = [w for w in waiting if w[0][0] > changes]
+        yield from sorted(near, key=lambda w: w[0])
 
 
 def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
@@ -208,12 +198,10 @@ def _value(d: Directive, word: str) -> float:
     return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
 
 
-def _with(before: Directive, wanted: dict[str, float], view: FleetView) -> Directive | None:
+def _with(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
     """The directive with decisions changed; None where there is no such directive."""
     changed: dict[str, Any] = {}
     for word, value in wanted.items():
-        if value == _value(before, word):
-            continue
         if word == "representation":
             if value != int(value):
                 return None
@@ -221,7 +209,6 @@ def _with(before: Directive, wanted: dict[str, float], view: FleetView) -> Direc
         elif word == "duty":
             changed["duty_percent"] = round(value * 100)
         elif word == "roi":
-            region = view.me.region if view.me is not None else None
             if value and region is None:
                 return None
             changed["roi"] = region if value else None

@@ -1,0 +1,141 @@
+"""The shield keeps what it is given, changes as little as can be, and says where it stepped in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+from policies_examples import fleet_of
+
+from policies.baselines import everyone, silence
+from policies.conformance import conform, failing
+from policies.contract import Directive, FleetView, Policy, Representation, TaskPhase
+from policies.invariants import InvariantError, just_heard, parse, violations
+from policies.proof import prove
+from policies.shield import MARK, interventions, shield
+from policies.views import draw_views
+from policies.worked import worked
+
+HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
+SPARING = """
+    when battery < 0.5: rate_hz <= 2 and representation <= detections
+    when goodput_mbps < 5: representation == none
+"""
+RULES = {
+    "sparing": SPARING,
+    "humane": HUMANE,
+    "both": SPARING.replace("representation == none", "rate_hz < 2") + HUMANE,
+    "confined": "when region and representation > none: roi\nrho <= 0.1\nduty >= 0.5",
+    "strict": "when battery < 0.9: rate_hz < 3\nfusion_weight > 0.2",
+    "aged": "when age_periods > 2: representation <= tracks\nrate_hz <= fresh.rate_hz",
+}
+
+
+def drops(view: FleetView) -> list[Directive]:
+    """The worked policy with a fault: silent in a sliver of charge."""
+    me = view.me
+    tired = me is not None and 0.4 < me.battery_soc < 0.5
+    return [d._replace(representation=Representation.NONE) if tired else d for d in worked(view)]
+
+
+def rises_with_age(view: FleetView) -> list[Directive]:
+    return [d._replace(rate_hz=min(30.0, 1.0 + view.age_s[d.destination])) for d in everyone(view)]
+
+
+POLICIES: dict[str, Policy] = {
+    "worked": worked, "everyone": everyone, "silence": silence, "drops": drops, "rises": rises_with_age,
+}  # fmt: skip
+
+
+def broken(policy: Policy, text: str, view: FleetView) -> list[str]:
+    directives, fresh = policy(view), policy(just_heard(view))
+    return [rule.text for rule in parse(text) if violations(rule, view, directives, fresh)]
+
+
+@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("rules", RULES)
+def test_whatever_the_policy_decides_the_shielded_one_keeps_the_rules(name: str, rules: str) -> None:
+    policy, text = POLICIES[name], RULES[rules]
+    shielded = shield(policy, parse(text))
+    stepped_in = 0
+    for view in draw_views(3, 60):
+        decided = list(policy(view))
+        directives = shielded(view)
+        stepped_in += interventions(directives)
+        kept = [d for d in directives if not d.reason.startswith(f"{MARK}cannot keep")]
+        if len(kept) == len(directives):
+            left = [r.text for r in parse(text) if violations(r, view, directives, policy(just_heard(view)))]
+            assert not left, (left, view)
+        for before, after in zip(decided, directives, strict=True):
+            assert before == after or after.reason.startswith(MARK), "a change without its mark"
+    assert stepped_in or not any(broken(policy, text, v) for v in draw_views(3, 60))
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_a_policy_that_keeps_the_rules_passes_untouched(rules: str) -> None:
+    for view in draw_views(4, 60):
+        if not broken(worked, RULES[rules], view):
+            assert [tuple(d) for d in shield(worked, parse(RULES[rules]))(view)] == [tuple(d) for d in worked(view)]
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_shielding_twice_is_shielding_once(rules: str) -> None:
+    once = shield(everyone, parse(RULES[rules]))
+    twice = shield(once, parse(RULES[rules]))
+    for view in draw_views(5, 40):
+        assert [tuple(d) for d in twice(view)] == [tuple(d) for d in once(view)]
+
+
+def test_the_least_is_changed() -> None:
+    (one, *_) = shield(everyone, parse("rate_hz <= 2"))(fleet_of(3))
+    (before, *_) = everyone(fleet_of(3))
+    assert one == before._replace(rate_hz=2.0), "the rate alone, and to its bound"
+    assert one.reason == f"{MARK}rate_hz <= 2 (decided features at 10 Hz: {before.reason})"
+    # Either part mends it: a fraction of the rate's bounds is less than a rung's quarter.
+    (either, *_) = shield(everyone, parse("representation < features or rate_hz <= 9"))(fleet_of(3))
+    assert either == before._replace(rate_hz=9.0)
+
+
+def test_a_rule_over_all_links_changes_one_of_them() -> None:
+    view = fleet_of(4, phase=TaskPhase.TRACK)
+    view = view._replace(descriptors={i: d._replace(priority_target_ids=(7,)) for i, d in view.descriptors.items()})
+    directives = shield(silence, parse(HUMANE))(view)
+    assert interventions(directives) == 1
+    (raised,) = [d for d in directives if d.representation > Representation.NONE]
+    assert raised.representation == Representation.DETECTIONS, "the lowest rung that keeps it"
+
+
+def test_rules_that_contradict_each_other_leave_the_decision_and_say_so() -> None:
+    directives = shield(everyone, parse("rate_hz <= 2\nrate_hz >= 5"))(fleet_of(3))
+    assert all(d.rate_hz == 10 and d.reason.startswith(f"{MARK}cannot keep") for d in directives)
+    of_view = shield(everyone, parse("battery > 2"))(fleet_of(3))
+    assert [d.rate_hz for d in of_view] == [10, 10]
+    assert all(d.reason.startswith(f"{MARK}cannot keep battery > 2") for d in of_view)
+
+
+@pytest.mark.parametrize("function", ["sum_links(rate_hz) <= 5", "count_links(rate_hz > 1) <= 2", "every_link(roi)"])
+def test_sums_and_counts_are_refused_where_the_shield_is_made(function: str) -> None:
+    with pytest.raises(InvariantError, match=r"a shield cannot keep \w+_links?\(…\), only prove it"):
+        shield(worked, parse(function))
+
+
+@pytest.mark.parametrize("rules", ["sparing", "humane", "strict"])
+def test_a_shielded_policy_conforms(rules: str) -> None:
+    assert not failing([c for c in conform(shield(worked, parse(RULES[rules])), count=60) if c.name != "budget kept"])
+
+
+def test_the_shielded_fault_is_proved_harmless() -> None:
+    """The proof explores the shield together with the policy: it holds on every view, not on drawn ones alone."""
+    bare = prove(drops, parse(HUMANE), max_drones=2)[-1]
+    assert bare.outcome == "refuted"
+    verdicts = prove(shield(drops, parse(HUMANE)), parse(HUMANE), max_drones=2)
+    assert [v.outcome for v in verdicts] == ["proved", "proved", "proved"]
+
+
+def test_no_shield_reaches_further_than_the_ladder() -> None:
+    def always(view: FleetView) -> Sequence[Directive]:
+        return silence(view)
+
+    for view in draw_views(6, 60):
+        for d in shield(always, parse("representation >= raw and rate_hz >= 30 and rho >= 1"))(view):
+            assert (d.representation, d.rate_hz, d.rho) == (Representation.RAW, 30.0, 1.0)
