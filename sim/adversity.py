@@ -12,7 +12,7 @@ import simpy
 
 from fleet.auth import TRAILER_BYTES, Sealer
 from fleet.wire import decode_descriptor, encode_descriptor
-from scenarios.schema import BatteryFault, ClockSkew, DroneLost, Event, Jam, LinkDrop, Scenario, Spoof
+from scenarios.schema import BatteryFault, CellFailure, ClockSkew, DroneLost, Event, Jam, LinkDrop, Scenario, Spoof
 from scenarios.streams import stream
 from sim.ether import Ether
 from sim.world import World, at
@@ -65,6 +65,11 @@ class _Begin:
                 world.note(event.drone, "battery_fault", f"{event.lost_fraction:.0%} of the remaining energy is gone")
                 world.drain()
                 world.batteries.fault(event.drone, event.lost_fraction)
+                world.ground_landed()
+            case CellFailure():
+                world.drain()
+                world.batteries.drop_cell(event.drone)
+                world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
                 world.ground_landed()
             case ClockSkew():
                 world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")

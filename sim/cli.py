@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from fleet.motion import MotionError
+from fleet.traces import TraceError
 from fleet.wire import DescriptorTooLarge
 from perception.detectors import DETECTORS
 from perception.errors import InputError
@@ -36,7 +37,7 @@ app = typer.Typer(
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_recording.app, name="recording")
 
-USER_ERRORS = (ScenarioError, PolicyError, MotionError, DescriptorTooLarge, InputError, RunError)
+USER_ERRORS = (ScenarioError, PolicyError, MotionError, TraceError, DescriptorTooLarge, InputError, RunError)
 """What a user can mend: one line and exit code 2, no traceback."""
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]

@@ -17,6 +17,7 @@ from fleet.agent import Agent, PlaneRules
 from fleet.auth import Sealer
 from fleet.battery import FleetBatteries
 from fleet.motion import fly
+from fleet.traces import follow, read_traces
 from perception.detectors import DetectsMany, make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
@@ -89,7 +90,10 @@ def run_sortie(
     env, recorder = simpy.Environment(), Recorder()
 
     motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
-    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n)
+    traces = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, n)
+    motion = follow(motion, traces, scenario.frame_s)
+    charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
+    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n, charges)
     air = Air(env, scenario.radio, motion.position_m, seed=seed, replication=replication, frame_s=scenario.frame_s)
     scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
     plan = MissionPlan(scenario.mission)

@@ -13,9 +13,10 @@ import numpy as np
 import simpy
 
 from fleet.agent import Agent, Platform, Task
-from fleet.battery import FleetBatteries, climb_power_w, rotor_power_w
+from fleet.battery import FleetBatteries
 from fleet.coverage import RANGE_M
 from fleet.motion import Motion
+from fleet.rotor import fleet_power_w
 from fleet.senses import FlightSenses, Sensed
 from perception.scene import SceneModel
 from perception.types import Capture
@@ -65,8 +66,7 @@ class World:
         """Called once a simulated second; must not change anything."""
         self._scenario, self._recorder = scenario, recorder
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
-        rotor_w = rotor_power_w(motion.air_speed_mps) + climb_power_w(motion.velocity_mps[..., 2])
-        self._rotor_w: list[list[float]] = rotor_w.tolist()
+        self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
         self._flight = FlightSenses(motion, scenario.frame_s)
         recorder.unfold["states"] = self._unfold_states
         self.busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)

@@ -12,16 +12,10 @@ from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from fleet import battery
-from fleet.battery import (
-    CAUSES,
-    FleetBatteries,
-    climb_power_w,
-    current_a,
-    energy_fraction,
-    open_circuit_cell_v,
-    rotor_power_w,
-)
+from fleet import cell
+from fleet.battery import CAUSES, FleetBatteries
+from fleet.cell import current_a, energy_fraction, open_circuit_cell_v
+from fleet.rotor import climb_power_w, rotor_power_w
 from scenarios.schema import Battery, DroneOverride
 
 HOVER_W = 168.48
@@ -246,9 +240,9 @@ def test_the_tables_are_good_to_a_millionth(soc: float) -> None:
 
 
 def test_the_cells_curve_is_the_monotone_cubic_through_its_points() -> None:
-    curve = PchipInterpolator(battery._SOC, battery._CELL_V)
+    curve = PchipInterpolator(cell._SOC, cell._CELL_V)
     energy = curve.antiderivative()
     soc = np.linspace(0.0, 1.0, 10_001)
-    np.testing.assert_allclose(battery.open_circuit_cell_v(soc), curve(soc), rtol=1e-15)
-    np.testing.assert_allclose(battery.energy_fraction(soc), energy(soc) / energy(1.0), rtol=1e-14)
-    assert np.diff(battery.open_circuit_cell_v(soc)).min() > 0
+    np.testing.assert_allclose(cell.open_circuit_cell_v(soc), curve(soc), rtol=1e-15)
+    np.testing.assert_allclose(cell.energy_fraction(soc), energy(soc) / energy(1.0), rtol=1e-14)
+    assert np.diff(cell.open_circuit_cell_v(soc)).min() > 0

@@ -26,8 +26,9 @@ DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"
 SPOOF = "events=[{kind: spoof, at_s: 1, drone: 1, until_s: 4}]"
 LOST = "events=[{kind: drone_lost, at_s: 1, drone: 1}]"
 FAULT = "events=[{kind: battery_fault, at_s: 1, drone: 1, lost_fraction: 0.5}]"
+CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
-TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20}]"
+TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20, cycles: 10, payload_kg: 0.1}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
 HEAVY = ("policy.name=all-4", "policy.params={rho: 0.4}")  # fills the medium
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
@@ -64,10 +65,27 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.battery.radio_idle_w": ("3", ()),
     "fleet.battery.radio_tx_w": ("8", ()),
     "fleet.battery.landing_soc": ("0.3", ("fleet.battery.initial_soc=0.3005",)),
+    "fleet.battery.cutoff_cell_v": ("4", ()),
+    "fleet.battery.polarisation_mohm": ("5", ()),
+    "fleet.battery.polarisation_time_s": ("5", ("fleet.battery.polarisation_mohm=5",)),
+    "fleet.battery.ambient_c": ("5", ()),
+    "fleet.battery.cycles": ("100", ()),
+    "fleet.battery.life_cycles": ("500", ("fleet.battery.cycles=100",)),
+    "fleet.airframe.mass_kg": ("2.2", ()),
+    "fleet.airframe.payload_kg": ("0.3", ()),
+    "fleet.airframe.disc_area_m2": ("0.4", ()),
+    "fleet.airframe.figure_of_merit": ("0.6", ()),
+    "fleet.airframe.tip_speed_mps": ("80", ()),
+    "fleet.airframe.drag_area_m2": ("0.03", ()),
+    "fleet.airframe.air_density_kgpm3": ("1.1", ()),
+    "fleet.airframe.power_model": ("momentum", ()),
+    "fleet.trace": ("TRACE", ()),
     "fleet.overrides.drone": ("2", (TIRED,)),
     "fleet.overrides.initial_soc": ("0.4", (TIRED,)),
     "fleet.overrides.capacity_wh": ("40", (TIRED,)),
     "fleet.overrides.cell_resistance_mohm": ("30", (TIRED,)),
+    "fleet.overrides.cycles": ("200", (TIRED,)),
+    "fleet.overrides.payload_kg": ("0.5", (TIRED,)),
     "mission.phases.at_s": ("2", ()),
     "mission.phases.phase": ("return", ()),
     "mission.phases.region.radius_m": ("20", ()),
@@ -183,14 +201,17 @@ def place(field: str, shared: tuple[str, ...]) -> str:
 
 
 @pytest.mark.parametrize("field", [f for f in TRAFFIC if f != "events.kind"])
-def test_a_knob_changes_the_record(field: str) -> None:
+def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     value, shared = TRAFFIC[field]
+    if value == "TRACE":
+        value = str(tmp_path / "trace.csv")
+        Path(value).write_text("t_s,drone,soc\n0,1,0.7\n6,1,0.5\n")
     before = run_sortie(example(*shared))
     after = run_sortie(example(*shared, f"{place(field, shared)}={value}"))
     assert after.fingerprint != before.fingerprint
 
 
-@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LOST, FAULT, SKEW])
+@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LOST, FAULT, CELL, SKEW])
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
     assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
 

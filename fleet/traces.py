@@ -1,0 +1,325 @@
+"""Context traces: what a real or a simulated drone did, flown again in place of the models.
+
+A trace is a CSV or Parquet table with one row a drone and time. Names, units and frames are those of the record's
+`states` table, so that any run's `states.parquet` is a trace:
+
+    t_s                       seconds since the sortie's begin, increasing for each drone        must be there
+    drone                     whose row; left out, everything is drone 0's
+    x_m, y_m, z_m             pose, ENU                                                           all three, or no pose
+    qx, qy, qz, qw            attitude, FLU in ENU                             } one of the two, or level and heading
+    yaw_deg                   heading, counter-clockwise from east             } along the track
+    vx_mps, vy_mps, vz_mps    velocity, ENU; left out, the slope of the positions
+    soc                       state of charge by charge, 0 … 1; it never rises
+    voltage_v, current_a      at the terminals
+    rssi_dbm                  what the drone's radio heard; kept for people, nothing reads it yet
+
+Between rows values run linearly (attitudes on the shorter arc), before the first and after the last they hold. A
+drone without a column's values keeps its model there. Empty cells are gaps: the row says nothing of that column.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from fleet.cell import energy_fraction
+from fleet.frames import yaw_rad
+from fleet.motion import Motion, body_rates
+
+Array = npt.NDArray[np.float64]
+
+POSITION = ("x_m", "y_m", "z_m")
+ATTITUDE = ("qx", "qy", "qz", "qw")
+VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
+BATTERY = ("soc", "voltage_v", "current_a")
+COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm")
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "t_s": (0.0, 86_400.0),
+    "drone": (0, 254),
+    **dict.fromkeys(POSITION, (-20_000.0, 20_000.0)),
+    **dict.fromkeys(ATTITUDE, (-1.000001, 1.000001)),
+    **dict.fromkeys(VELOCITY, (-200.0, 200.0)),
+    "yaw_deg": (-360.0, 360.0),
+    "soc": (0.0, 1.0),
+    "voltage_v": (0.0, 200.0),
+    "current_a": (-1000.0, 2000.0),
+    "rssi_dbm": (-200.0, 50.0),
+}
+MAX_ROWS = 5_000_000
+
+
+class TraceError(ValueError):
+    """A trace is not as it must be; the message names the file, the column, the row and the bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryTrace:
+    """One drone's charge over time; lists, because single values are asked for once a frame."""
+
+    time_s: list[float]
+    soc: list[float]
+    energy: list[float]
+    """Energy fraction of the charge."""
+    voltage_time_s: list[float]
+    voltage_v: list[float]
+    current_time_s: list[float]
+    current_a: list[float]
+
+    def soc_at(self, t_s: float) -> float:
+        """State of charge, 0 … 1."""
+        return _between(self.time_s, self.soc, t_s)
+
+    def energy_fraction_at(self, t_s: float) -> float:
+        """Share of a full pack's energy that is left."""
+        return _between(self.time_s, self.energy, t_s)
+
+    def voltage_at(self, t_s: float) -> float | None:
+        """Terminal voltage, or None where the trace has none."""
+        return _between(self.voltage_time_s, self.voltage_v, t_s) if self.voltage_v else None
+
+    def current_at(self, t_s: float) -> float | None:
+        """Current, or None where the trace has none."""
+        return _between(self.current_time_s, self.current_a, t_s) if self.current_a else None
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTrace:
+    """One drone's motion over time; arrays over the rows that have a position."""
+
+    time_s: Array  # [K]
+    position_m: Array  # [K, 3] ENU
+    orientation_xyzw: Array | None  # [K, 4]
+    velocity_mps: Array | None  # [K, 3]
+
+
+@dataclass(frozen=True, slots=True)
+class DroneTrace:
+    """What a trace says of one drone; None where the model keeps."""
+
+    pose: PoseTrace | None
+    battery: BatteryTrace | None
+
+
+def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
+    """Read a trace.
+
+    Args:
+        path: *.csv, or anything else as Parquet.
+        drones: drones of the fleet; a trace of another is refused.
+
+    Raises:
+        TraceError: no such file, no table, a column missing or unknown, a value out of bounds, time that does not
+            increase, a charge that rises.
+    """
+    path = Path(path)
+    columns = _columns(path)
+    rows = len(columns["t_s"])
+    who = columns.get("drone", np.zeros(rows))
+    if np.isnan(who).any() or (who != np.round(who)).any():
+        raise TraceError(
+            f"{path}: drone in row {_first(np.isnan(who) | (who != np.round(who)))}, must be a whole number"
+        )
+    found = {}
+    for drone in np.unique(who).astype(int).tolist():
+        if drone >= drones:
+            raise TraceError(f"{path}: drone {drone}, must be below fleet.drones = {drones}")
+        row = np.flatnonzero(who == drone)
+        own = {name: values[row] for name, values in columns.items()}
+        late = np.diff(own["t_s"]) <= 0
+        if late.any():
+            at = int(row[_first(late)])  # _first counts from 1: the later row of the pair
+            raise TraceError(f"{path}: t_s in row {at + 1} of drone {drone} is {columns['t_s'][at]:g}, must increase")
+        found[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
+    return found
+
+
+def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> Motion:
+    """The motion with every drone that has a pose trace flying it: what it believes keeps the errors of its model."""
+    posed = {drone: trace.pose for drone, trace in traces.items() if trace.pose is not None}
+    if not posed:
+        return motion
+    names = (
+        "position_m", "orientation_xyzw", "velocity_mps", "acceleration_mps2", "body_rates_radps", "yaw_rad",
+        "est_position_m", "est_yaw_rad",
+    )  # fmt: skip
+    new: dict[str, Array] = {name: getattr(motion, name).copy() for name in names}
+    for drone, pose in posed.items():
+        t_s = np.clip(motion.time_s, pose.time_s[0], pose.time_s[-1])
+        position = _sample(t_s, pose.time_s, pose.position_m)
+        if pose.velocity_mps is not None:
+            velocity = _sample(t_s, pose.time_s, pose.velocity_mps)
+        else:
+            velocity = _slope(position, frame_s)
+        if pose.orientation_xyzw is None:
+            orientation = _level(velocity)
+        elif len(pose.time_s) == 1:
+            orientation = np.repeat(pose.orientation_xyzw, len(t_s), axis=0)
+        else:
+            orientation = Slerp(pose.time_s, Rotation.from_quat(pose.orientation_xyzw))(t_s).as_quat()
+        flips = np.sign((orientation[1:] * orientation[:-1]).sum(axis=-1))
+        orientation[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips))[:, None]
+        yaw = yaw_rad(orientation)
+        believed_yaw = yaw + motion.est_yaw_rad[:, drone] - motion.yaw_rad[:, drone]
+        new["est_position_m"][:, drone] += position - motion.position_m[:, drone]
+        new["est_yaw_rad"][:, drone] = np.mod(believed_yaw + np.pi, 2 * np.pi) - np.pi
+        new["position_m"][:, drone], new["velocity_mps"][:, drone] = position, velocity
+        new["orientation_xyzw"][:, drone], new["yaw_rad"][:, drone] = orientation, yaw
+        new["acceleration_mps2"][:, drone] = _slope(velocity, frame_s)
+        new["body_rates_radps"][:, drone] = body_rates(orientation[:, None], frame_s)[:, 0]
+    flown = replace(motion, **new)
+    for each in fields(flown):
+        getattr(flown, each.name).setflags(write=False)
+    return flown
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def _columns(path: Path) -> dict[str, Array]:
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    if not path.is_file():
+        raise TraceError(f"{path}: no such trace")
+    try:
+        table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise TraceError(f"{path}: is not a {path.suffix or 'Parquet'} table: {str(error).splitlines()[0]}") from error
+    known = [name for name in table.column_names if name in COLUMNS]
+    if "t_s" not in known:
+        raise TraceError(f"{path}: no column t_s, a trace needs one and some of {', '.join(COLUMNS[1:])}")
+    if not 0 < table.num_rows <= MAX_ROWS:
+        raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
+    columns = {}
+    for name in known:
+        try:
+            values = table[name].cast(pa.float64()).to_numpy()
+        except pa.ArrowException:
+            raise TraceError(f"{path}: column {name} does not hold numbers") from None
+        low, high = BOUNDS[name]
+        wrong = ~((values >= low) & (values <= high) | np.isnan(values))
+        if name == "t_s":
+            wrong |= np.isnan(values)
+        if wrong.any():
+            at = _first(wrong)
+            raise TraceError(f"{path}: {name} in row {at} is {values[at - 1]:g}, must be within {low:g} … {high:g}")
+        columns[name] = values
+    if 0 < sum(name in columns for name in POSITION) < 3:
+        raise TraceError(f"{path}: a pose needs all of {', '.join(POSITION)}")
+    return columns
+
+
+def _pose(own: Mapping[str, Array]) -> PoseTrace | None:
+    if "x_m" not in own:
+        return None
+    position = _stack(own, POSITION)
+    there = ~np.isnan(position).any(axis=-1)
+    if not there.any():
+        return None
+    t_s = own["t_s"][there]
+    orientation = velocity = None
+    if all(name in own for name in VELOCITY):
+        velocity = _filled(t_s, _stack(own, VELOCITY)[there])
+    if all(name in own for name in ATTITUDE):
+        quaternion = _stack(own, ATTITUDE)[there]
+        norm = np.linalg.norm(quaternion, axis=-1)
+        sound = norm > 0.5  # NaN compares false
+        if sound.any():
+            nearest = _nearest(t_s, t_s[sound])
+            orientation = (quaternion[sound] / norm[sound, None])[nearest]
+    elif "yaw_deg" in own:
+        yaw = np.radians(own["yaw_deg"][there])
+        sound = ~np.isnan(yaw)
+        if sound.any():
+            half = 0.5 * yaw[sound][_nearest(t_s, t_s[sound])]
+            zero = np.zeros_like(half)
+            orientation = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
+    return PoseTrace(t_s, position[there], orientation, velocity)
+
+
+def _battery(own: Mapping[str, Array], where: str) -> BatteryTrace | None:
+    if "soc" not in own:
+        return None
+    there = ~np.isnan(own["soc"])
+    if not there.any():
+        return None
+    t_s, soc = own["t_s"][there], own["soc"][there]
+    rises = np.diff(soc) > 0
+    if rises.any():
+        at = int(_first(rises))
+        raise TraceError(
+            f"{where}: soc rises from {soc[at - 1]:g} to {soc[at]:g} at {t_s[at]:g} s, must not rise in flight"
+        )
+
+    def some(name: str) -> tuple[list[float], list[float]]:
+        values = own.get(name, np.full(len(there), np.nan))
+        sound = ~np.isnan(values)
+        return own["t_s"][sound].tolist(), values[sound].tolist()
+
+    return BatteryTrace(
+        t_s.tolist(), soc.tolist(), energy_fraction(soc).tolist(), *some("voltage_v"), *some("current_a")
+    )
+
+
+# --- arithmetic ----------------------------------------------------------------------------------
+
+
+def _between(time_s: Sequence[float], values: Sequence[float], t_s: float) -> float:
+    """Linear between samples, held beyond them."""
+    k = bisect_right(time_s, t_s)
+    if k == 0:
+        return values[0]
+    if k == len(time_s):
+        return values[-1]
+    share = (t_s - time_s[k - 1]) / (time_s[k] - time_s[k - 1])
+    return values[k - 1] + share * (values[k] - values[k - 1])
+
+
+def _sample(t_s: Array, time_s: Array, values: Array) -> Array:
+    return np.stack([np.interp(t_s, time_s, column) for column in values.T], axis=-1)
+
+
+def _slope(values: Array, step_s: float) -> Array:
+    """Central differences [T, 3]; of a single frame, zeros."""
+    return np.gradient(values, step_s, axis=0) if len(values) > 1 else np.zeros_like(values)
+
+
+def _level(velocity: Array) -> Array:
+    """Upright, heading along the track; where it hardly moves, as before."""
+    moving = np.hypot(velocity[:, 0], velocity[:, 1]) > 0.5
+    heading = np.where(moving, np.arctan2(velocity[:, 1], velocity[:, 0]), 0.0)
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), 0))
+    half = 0.5 * heading[last]
+    zero = np.zeros_like(half)
+    return np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
+
+
+def _filled(t_s: Array, values: Array) -> Array | None:
+    """Gaps filled linearly; None where nothing is known."""
+    sound = ~np.isnan(values).any(axis=-1)
+    return _sample(t_s, t_s[sound], values[sound]) if sound.any() else None
+
+
+def _nearest(t_s: Array, known_s: Array) -> npt.NDArray[np.intp]:
+    """Index of the known time nearest to each."""
+    after = np.clip(np.searchsorted(known_s, t_s), 0, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer: npt.NDArray[np.intp] = np.where(t_s - known_s[before] < known_s[after] - t_s, before, after)
+    return nearer
+
+
+def _stack(own: Mapping[str, Array], names: Sequence[str]) -> Array:
+    return np.stack([own[name] for name in names], axis=-1)
+
+
+def _first(wrong: Any) -> int:
+    """Row of the first true value, counted from 1."""
+    return int(np.argmax(wrong)) + 1
