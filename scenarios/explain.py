@@ -34,8 +34,8 @@ _WITH_UNIT = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?\s*[a-zµ°%/]", re.IGNOREC
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?", re.IGNORECASE)
 
 
-def explain(error: ValidationError, root: Node) -> list[Issue]:
-    """The errors of a scenario's validation, one issue a field, in pydantic's order."""
+def explain(error: ValidationError, root: Node, top: type[BaseModel] = Scenario) -> list[Issue]:
+    """The errors of a scenario's validation (or of another model on top), one issue a field, in pydantic's order."""
     wanted: dict[Path, list[str]] = {}  # a union reports each of its members: gather them into one line
     issues: dict[Path, Issue] = {}
     for detail in error.errors(include_url=False):
@@ -51,11 +51,11 @@ def explain(error: ValidationError, root: Node) -> list[Issue]:
             what = f"{node.shown()}, must be {_wants(wanted[path])}{_hint(node, path, wanted[path])}"
             issues[path] = Issue(node, path, what)
         elif path not in issues:
-            issues[path] = Issue(node, path, partial(_say, detail, node, path, root))
+            issues[path] = Issue(node, path, partial(_say, detail, node, path, root, top))
     return list(issues.values())
 
 
-def _say(detail: ErrorDetails, node: Node, path: Path, root: Node) -> str:
+def _say(detail: ErrorDetails, node: Node, path: Path, root: Node, top: type[BaseModel]) -> str:
     kind, context = detail["type"], detail.get("ctx", {})
     if kind in _BOUNDS:
         key, sign = _BOUNDS[kind]
@@ -63,7 +63,7 @@ def _say(detail: ErrorDetails, node: Node, path: Path, root: Node) -> str:
     if kind == "inconsistent":
         return f"{context['value']}, must be {context['bound']}"
     if kind == "extra_forbidden":
-        return f"unknown key, {_known(path, root)}"
+        return f"unknown key, {_known(path, root, top)}"
     if kind in ("missing", "union_tag_not_found"):
         return "missing, must be given"
     if kind == "literal_error":
@@ -149,12 +149,12 @@ def _meant(node: Node, expected: str) -> str:
     return f", did you mean {near}?" if near else ""
 
 
-def _known(path: Path, root: Node) -> str:
+def _known(path: Path, root: Node, top: type[BaseModel] = Scenario) -> str:
     """What could have been meant by an unknown key."""
     key = str(path[-1])
-    section = section_at(path[:-1], root)
+    section = section_at(path[:-1], root, top)
     names = list(section.model_fields) if section else []
-    homes = [f"in {dotted(at)}" if at else "at the top level" for at, name in _all_fields(Scenario) if name == key]
+    homes = [f"in {dotted(at)}" if at else "at the top level" for at, name in _all_fields(top) if name == key]
     if homes:
         return f"it belongs {one_of(homes)}"
     if near := nearest(key, names):
@@ -172,21 +172,29 @@ def sections_of(annotation: Any) -> tuple[type[BaseModel], ...]:
     origin = get_origin(annotation)
     if origin is Annotated:
         return sections_of(get_args(annotation)[0])
+    if origin is dict:
+        return sections_of(get_args(annotation)[1])
     if origin in (Union, UnionType, tuple):
         return tuple(section for member in get_args(annotation) for section in sections_of(member))
     return ()
 
 
-def section_at(path: Path, root: Node) -> type[BaseModel] | None:
+def section_at(path: Path, root: Node, top: type[BaseModel] = Scenario) -> type[BaseModel] | None:
     """The section of the schema that a mapping at `path` is held against."""
-    section: type[BaseModel] | None = Scenario
+    section: type[BaseModel] | None = top
     node: Node | None = root
-    candidates: tuple[type[BaseModel], ...] = (Scenario,)
+    candidates: tuple[type[BaseModel], ...] = (top,)
+    keyed = False  # the next part is a key that the file chooses, as below `vary`
     for part in path:
         node = child(node, part) if node else None
-        if isinstance(part, str):
+        if isinstance(part, str) and not keyed:
             field = section.model_fields.get(part) if section else None
             candidates = sections_of(field.annotation) if field else ()
+            keyed = field is not None and get_origin(field.annotation) is dict
+            if keyed:
+                section = None
+                continue
+        keyed = False
         section = _of_kind(candidates, node)
     return section
 

@@ -8,16 +8,17 @@ text, `5.0` no whole number; a whole number does where a number is asked for.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from scenarios.explain import explain
 from scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, nearest, plain, problems
@@ -25,6 +26,7 @@ from scenarios.schema import Scenario
 
 __all__ = ["ScenarioError", "dump", "library", "load", "loads"]
 
+Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 1_000_000
 MAX_WEIGHT = 50_000
 """Values after alias expansion; long text counts once a hundred characters."""
@@ -47,7 +49,20 @@ def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     Raises:
         ScenarioError: one line that says which file, line and field, what is wrong and the bound.
     """
-    path = library().get(str(path_or_name), Path(path_or_name))
+    return loads(*read(path_or_name), overrides)
+
+
+def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario from text; `source` stands for the file name in errors. Raises ScenarioError."""
+    root = tree(text, source)
+    for override in overrides:
+        root = _override(root, override)
+    return validated(root, Scenario)
+
+
+def read(path_or_name: str | Path) -> tuple[str, str]:
+    """A file's text and its path; a bare name is looked up in the library first. Raises ScenarioError."""
+    path = {**library(), **campaigns()}.get(str(path_or_name), Path(path_or_name))
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -61,34 +76,36 @@ def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     if len(data) > MAX_BYTES:
         raise ScenarioError(f"{path}: more than {MAX_BYTES} bytes, a scenario must have at most that")
     try:
-        text = data.decode("utf-8-sig")
+        return data.decode("utf-8-sig"), str(path)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{path}:{line}: byte 0x{data[error.start]:02x} is not UTF-8 text") from None
-    return loads(text, str(path), overrides)
 
 
-def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> Scenario:
-    """Read a scenario from text; `source` stands for the file name in errors. Raises ScenarioError."""
+def tree(text: str, source: str) -> Node:
+    """The text as a section of nodes, not yet held against any schema. Raises ScenarioError."""
     root = _read(text, source)
     if root is None or root.value is None:
         raise ScenarioError(f"{source}: is empty, must hold at least a name")
     if not isinstance(root.value, dict):
         raise ScenarioError(f"{root.where}: {root.shown()} on top, must be a section that holds at least a name")
-    for override in overrides:
-        root = _override(root, override)
+    return root
+
+
+def validated(root: Node, model: type[Model]) -> Model:
+    """The tree as a frozen model. Raises ScenarioError, with the first of its issues."""
     found = {issue.path: issue for issue in problems(root)}
     try:
         # through JSON, where strict still lets a list be a tuple and a whole number a float
-        scenario = Scenario.model_validate_json(json.dumps(plain(root)), strict=True)
+        made = model.model_validate_json(json.dumps(plain(root)), strict=True)
     except ValidationError as error:
-        for issue in explain(error, root):
+        for issue in explain(error, root, model):
             above = (found.get(issue.path[:n]) for n in range(len(issue.path) + 1))
             if not any(known and known.node.problem for known in above):
                 found[issue.path] = issue  # says more than a doubt
     if found:
         raise _first(list(found.values()))
-    return scenario
+    return made
 
 
 def dump(scenario: Scenario) -> str:
@@ -99,7 +116,14 @@ def dump(scenario: Scenario) -> str:
 
 def library() -> dict[str, Path]:
     """The shipped scenarios by name."""
-    return {path.stem: path for path in sorted(_LIBRARY.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(_LIBRARY.glob("*.yaml")) if path.stem not in campaigns()}
+
+
+@functools.cache
+def campaigns() -> dict[str, Path]:
+    """The shipped campaigns by name: files with `campaign` on top."""
+    texts = {path: path.read_text("utf-8") for path in sorted(_LIBRARY.glob("*.yaml"))}
+    return {path.stem: path for path, text in texts.items() if re.search("^campaign:", text, re.MULTILINE)}
 
 
 # --- overrides and errors ------------------------------------------------------------------------

@@ -1,0 +1,165 @@
+"""A campaign file in, a `Study` out: the campaign, its base scenario, and everything varied held against the schema.
+
+What is wrong is told as for scenarios, in one line with the campaign file's own place, before anything is flown.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scenarios.campaign import (
+    Campaign,
+    Choice,
+    Column,
+    Grid,
+    Integers,
+    Linspace,
+    Normal,
+    Spread,
+    Triangular,
+    Uniform,
+)
+from scenarios.load import campaigns, library, load, read, tree, validated
+from scenarios.nodes import Node, ScenarioError, assign, plain
+from scenarios.schema import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A campaign as read."""
+
+    campaign: Campaign
+    base: Scenario
+    """With `set` put in, and without its own expectations."""
+    columns: dict[str, tuple[Any, ...]]
+    """By varied field: the values of a file's column."""
+
+
+def load_campaign(path_or_name: str | Path) -> Study:
+    """Read a campaign from a file, or from the library by its bare name.
+
+    Raises:
+        ScenarioError: one line that says which file, line and field, what is wrong and the bound; also of the base.
+    """
+    text, source = read(path_or_name)
+    root = tree(text, source)
+    if isinstance(root.value, dict) and "campaign" not in root.value and "name" in root.value:
+        raise ScenarioError(f"{source}: is a scenario, a campaign begins with `campaign: its_name` and names its base")
+    campaign = validated(root, Campaign)
+    here = Path(source).parent
+    base = _base(campaign.base, here, source, root)
+    written = _section(root, "set")
+    resolved = as_node(base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}, source)
+    for name, node in written.items():
+        resolved = assign(resolved, name.split("."), _relined(node))
+    base = validated(resolved, Scenario)
+    columns: dict[str, tuple[Any, ...]] = {}
+    varied = _section(root, "vary")
+    for name, spread in campaign.vary.items():
+        if isinstance(spread, Column):
+            columns[name] = _column(spread, here, varied[name])
+    _check_lengths(campaign, columns, varied)
+    resolved = as_node(base.model_dump(mode="json", exclude_none=True), source)
+    for name, spread in campaign.vary.items():
+        for value in _extremes(spread, columns.get(name, ())):
+            node = as_node(value, varied[name].source, varied[name].line)
+            validated(assign(resolved, name.split("."), node), Scenario)
+    return Study(campaign, base, columns)
+
+
+def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """A scenario's plain sections with dotted fields changed; not validated.
+
+    Raises:
+        ScenarioError: a path that leads through a plain value or to an entry that is not there.
+    """
+    node = as_node(base)
+    for name, value in values.items():
+        node = assign(node, name.split("."), as_node(value))
+    made = plain(node)
+    assert isinstance(made, dict)  # noqa: S101
+    return made
+
+
+def as_node(value: Any, source: str = "vary", line: int = 0) -> Node:
+    """A plain value as nodes that all say they stand at one place."""
+    if isinstance(value, dict):
+        return Node({key: as_node(v, source, line) for key, v in value.items()}, source, line)
+    if isinstance(value, list | tuple):
+        return Node([as_node(v, source, line) for v in value], source, line)
+    return Node(value, source, line, text=f"{value:g}" if isinstance(value, float) else str(value))
+
+
+def _relined(node: Node) -> Node:
+    return as_node(plain(node), node.source, node.line)
+
+
+def _section(root: Node, name: str) -> dict[str, Node]:
+    node = root.value.get(name) if isinstance(root.value, dict) else None
+    return dict(node.value) if node is not None and isinstance(node.value, dict) else {}
+
+
+def _base(name: str, here: Path, source: str, root: Node) -> Scenario:
+    """From the library, or a file beside the campaign's."""
+    if name in campaigns():
+        raise ScenarioError(f"{source}: base: {name}, must be a scenario, it is a campaign itself")
+    return load(name if name in library() else here / name)
+
+
+def _extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
+    """The values that a spread can take, or its ends; of one without ends its middle alone."""
+    if isinstance(spread, Uniform | Triangular | Integers | Linspace):
+        yield from (spread.low, spread.high)
+    elif isinstance(spread, Choice | Grid):
+        yield from spread.values
+    elif isinstance(spread, Column):
+        yield from column
+    elif isinstance(spread, Normal):
+        yield from (end for end in (spread.low, spread.high) if end is not None)
+        if spread.low is None and spread.high is None:
+            yield spread.mean
+    else:
+        yield spread.median
+
+
+def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
+    path = here / spread.file
+    at = f"{node.where}: {path}"
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            if spread.column not in (rows.fieldnames or ()):
+                has = ", ".join(rows.fieldnames or ()) or "nothing"
+                raise ScenarioError(f"{at}: no column {spread.column}, it has {has}")
+            values = tuple(_number(row[spread.column] or "") for row in rows)
+    except FileNotFoundError:
+        raise ScenarioError(f"{at}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(f"{at}: cannot be read, {getattr(error, 'strerror', None) or error}") from None
+    if not values:
+        raise ScenarioError(f"{at}: column {spread.column} has no rows, must have at least one")
+    return values
+
+
+def _number(text: str) -> Any:
+    """A whole number, a number, or the text itself."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def _check_lengths(campaign: Campaign, columns: dict[str, tuple[Any, ...]], varied: dict[str, Node]) -> None:
+    first: dict[str, str] = {}
+    for name, values in columns.items():
+        spread = campaign.vary[name]
+        assert isinstance(spread, Column)  # noqa: S101
+        other = first.setdefault(spread.file, name)
+        if len(columns[other]) != len(values):
+            raise ScenarioError(f"{varied[name].where}: vary.{name}: {len(values)} rows, must be {len(columns[other])}")
