@@ -10,6 +10,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from scenarios.schema import Battery
+
 Array = npt.NDArray[np.float64]
 
 _SOC = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -124,3 +126,29 @@ _grid_soc = np.linspace(0.0, 1.0, 8 * STEPS + 1)
 _soc_by_energy = np.interp(np.linspace(0.0, 1.0, STEPS + 1), energy_fraction(_grid_soc), _grid_soc)
 SOC_TABLE: list[float] = [*_soc_by_energy.tolist(), 1.0]  # one more, so that a full pack needs no special case
 CELL_TABLE: list[float] = [*open_circuit_cell_v(_soc_by_energy).tolist(), _CELL_V[-1]]
+
+
+def terminal_voltage_v(time_s: Array, current_a: Array, pack: Battery, soc: float) -> Array:
+    """Voltage of a pack under a given current, V [K]: what a log's current says of a pack's data, or the other way.
+
+    The same cell as in `fleet.battery`, driven by current instead of power and counted in charge: open circuit by
+    charge, less the resistance's drop, less polarisation's (one RC element, exact for a current that holds from one
+    sample to the next). Ages with `pack.cycles`; temperature is left out.
+
+    Args:
+        time_s: [K] increasing.
+        current_a: [K] drawn from each time until the next.
+        pack: its data; capacity in Wh is that of a full pack at open circuit.
+        soc: at the first sample.
+    """
+    share, worse = ageing(pack.cycles, pack.life_cycles)
+    full_c = pack.capacity_wh * 3600.0 * share / (pack.cells * MEAN_CELL_V)
+    step_s = np.diff(time_s)
+    drawn_c = np.concatenate([[0.0], np.cumsum(current_a[:-1] * step_s)])
+    fades, towards_v = np.exp(-step_s / pack.polarisation_time_s), current_a * pack.polarisation_mohm / 1000.0 * worse
+    lag_v = np.zeros(len(time_s))
+    for k, fade in enumerate(fades.tolist()):
+        lag_v[k + 1] = towards_v[k] + (lag_v[k] - towards_v[k]) * fade
+    open_v = open_circuit_cell_v(np.clip(soc - drawn_c / full_c, 0.0, 1.0))
+    voltage: Array = pack.cells * (open_v - lag_v - current_a * pack.cell_resistance_mohm / 1000.0 * worse)
+    return voltage
