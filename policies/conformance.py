@@ -19,6 +19,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
+from policies.confine import Reached, confined
 from policies.contract import Directive, FleetView, Policy, PolicyError, check_directives
 from policies.views import draw_view, draw_views, smaller
 
@@ -150,6 +151,15 @@ def _same_in_same_out(policy: Policy, view: FleetView) -> str | None:
     return None if _spelt(_ask(policy, view)) == first else "differs after another view: it remembers"
 
 
+def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
+    usual = _spelt(_ask(policy, view))
+    try:
+        alone = _spelt(_ask(confined(policy), view))
+    except Reached as error:
+        return str(error)
+    return None if alone == usual else "decides otherwise where only its view is in reach"
+
+
 def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
     usual = _by_peer(_ask(policy, view))
     ids = list(view.descriptors)
@@ -241,6 +251,7 @@ RULES: dict[str, Rule] = {
     "says why": _says_why,
     "input unchanged": _leaves_its_input,
     "same in, same out": _same_in_same_out,
+    "reads only its view": _reads_only_its_view,
     "order of drones irrelevant": _order_is_irrelevant,
     "one drone and empty views": _alone_and_empty,
     "stale views": _stands_stale,

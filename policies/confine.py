@@ -1,0 +1,169 @@
+"""The same policy with nothing in reach but its view: no clock, no files, no network, no other room of the fleet.
+
+    confined(my_policy)(view)    # raises Reached where the policy looks at a clock, a file, another room
+
+A policy's functions are built anew over a namespace that holds pure mathematics, the plane's types and the policy's
+own helpers; every other name in it raises when it is touched. It shows an honest policy's slip in a test. It is no
+prison for a hostile one: C extensions and further methods of a policy's own classes are not looked into.
+"""
+
+from __future__ import annotations
+
+import builtins
+import functools
+import importlib
+import sys
+import types
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from policies.contract import Policy
+
+PURE = frozenset({
+    "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
+    "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions", "functools", "heapq", "itertools",
+    "math", "numbers", "numpy", "operator", "policies", "re", "statistics", "string", "types", "typing",
+})  # fmt: skip
+"""Packages that know nothing but what they are handed; a policy may use them."""
+KEYED_RANDOMNESS = "scenarios.streams"
+"""Draws that follow from their key alone, so that the same view is the same decision."""
+ROOMS = frozenset({"sim", "fleet", "radio", "perception", "scenarios", "torch", "simpy"})
+_ONLY = {"random": {"Random"}}
+"""Modules of which a policy may use so much: a generator with a seed of its own."""
+_BUT = {
+    "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
+}  # fmt: skip
+_NO_BUILTINS = {"breakpoint", "compile", "eval", "exec", "exit", "globals", "help", "input", "open", "print", "quit"}
+
+
+class Reached(BaseException):
+    """A policy reached for something that is not in its view; no ordinary `except` of its own swallows it."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"reaches for {what}, which is not in its view")
+
+
+class _Forbidden:
+    """Stands for what may not be touched."""
+
+    __slots__ = ("_name",)
+
+    def __init__(self, name: str) -> None:
+        object.__setattr__(self, "_name", name)
+
+    def _reached(self, *_: object, **__: object) -> NoReturn:
+        raise Reached(object.__getattribute__(self, "_name"))
+
+    __call__ = __getattr__ = __setattr__ = __iter__ = __len__ = __getitem__ = __bool__ = __eq__ = _reached
+    __hash__ = None  # type: ignore[assignment]
+
+
+class _Part:
+    """A module of which only a part is in reach."""
+
+    __slots__ = ("_module",)
+
+    def __init__(self, module: types.ModuleType) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        home = self._module.__name__
+        if name in _BUT.get(home, ()) or (home in _ONLY and name not in _ONLY[home]):
+            raise Reached(f"{home}.{name}")
+        return getattr(self._module, name)
+
+
+def confined(policy: Policy) -> Policy:
+    """The policy over a namespace of its own: where it keeps to its view it decides the same, elsewhere it raises.
+
+    Called, it raises `Reached`, naming what the policy reached for.
+    """
+    built: Policy = _Rebuilding().function(policy)
+    return built
+
+
+class _Rebuilding:
+    """One policy's functions and the names that they use, each built anew once."""
+
+    def __init__(self) -> None:
+        self._functions: dict[int, types.FunctionType] = {}
+        self._namespaces: dict[int, dict[str, Any]] = {}
+
+    def function(self, found: Any) -> Callable[..., Any]:
+        """A callable over confined globals."""
+        found = getattr(found, "__wrapped__", found)  # a cache holds nothing that its arguments do not
+        if isinstance(found, functools.partial):
+            return functools.partial(self.function(found.func), *found.args, **found.keywords)
+        if isinstance(found, types.MethodType):
+            return types.MethodType(self.function(found.__func__), found.__self__)
+        if isinstance(found, types.FunctionType):
+            return self._plain(found)
+        call = getattr(type(found), "__call__", None)  # noqa: B004 - an object whose method is the policy
+        if isinstance(call, types.FunctionType):
+            return types.MethodType(self._plain(call), found)
+        other: Callable[..., Any] = found
+        return other
+
+    def _plain(self, found: types.FunctionType) -> types.FunctionType:
+        if id(found) in self._functions:
+            return self._functions[id(found)]
+        module, code = found.__globals__, found.__code__
+        space = self._namespaces.setdefault(id(module), {"__builtins__": _builtins(), "__name__": module["__name__"]})
+        cells = found.__closure__ and tuple(types.CellType() for _ in found.__closure__)
+        built = types.FunctionType(code, space, found.__name__, found.__defaults__, cells)
+        built.__kwdefaults__ = found.__kwdefaults__
+        self._functions[id(found)] = built
+        for name in _names(code) & module.keys() - space.keys():
+            space[name] = None  # met: what it stands for may use the same name
+            space[name] = self._allowed(name, module[name])
+        for name, old, new in zip(code.co_freevars, found.__closure__ or (), cells or (), strict=True):
+            new.cell_contents = self._allowed(name, old.cell_contents)
+        return built
+
+    def _allowed(self, name: str, value: Any) -> Any:
+        """The value itself where it is harmless, built anew where it is the policy's own function, or forbidden."""
+        if isinstance(value, types.ModuleType):
+            return _module(value)
+        home: str = getattr(value, "__module__", None) or type(value).__module__
+        if home == KEYED_RANDOMNESS or (home in _ONLY and name in _ONLY[home]):
+            return value
+        if _far(home):
+            return _Forbidden(f"{home}.{name}")
+        own = home.split(".")[0] == "policies" or home.split(".")[0] not in PURE
+        if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
+            return self.function(value)
+        return value
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """Names that a function, or one inside it, may look up."""
+    inner = [_names(c) for c in code.co_consts if isinstance(c, types.CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _module(module: types.ModuleType) -> Any:
+    home = module.__name__
+    if home in _BUT or home in _ONLY:
+        return _Part(module)
+    return _Forbidden(home) if _far(home) else module
+
+
+def _far(home: str) -> bool:
+    """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
+    root = home.split(".")[0]
+    return root not in PURE and (root in ROOMS or root in sys.stdlib_module_names) and home != KEYED_RANDOMNESS
+
+
+def _import(name: str, *rest: Any) -> Any:
+    """What `import` inside a policy's function finds."""
+    if _far(name) and name not in _ONLY:
+        raise Reached(name)
+    importlib.import_module(name)
+    found = __import__(name, *rest)
+    return _module(found)
+
+
+@functools.cache
+def _builtins() -> dict[str, Any]:
+    kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
+    return kept | {"__import__": _import}

@@ -1,0 +1,265 @@
+"""The six rules of the plane, each tried to be broken; policies/README.md says where each is enforced."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import os
+import random
+import time
+from collections.abc import Callable
+from enum import Enum
+from time import perf_counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from policies_examples import fleet_of
+
+from fleet.auth import Dropped, Inbox, Sealer, open_datagram
+from fleet.gate import Gate
+from fleet.staleness import cap_by_age, health
+from fleet.wire import MAX_DESCRIPTOR_BYTES, encode_descriptor
+from policies.confine import Reached, confined
+from policies.conformance import RULES, raised_part
+from policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation, check_directives
+from policies.damping import LinkState, damp
+from policies.registry import POLICIES
+from policies.views import draw_view, draw_views
+from scenarios.load import ScenarioError, loads
+
+FLEET = fleet_of(5)
+MINE = FLEET.descriptors[0]
+FEATURE_CELLS = np.ones((64, 64, 80), np.float32)
+
+
+def share(view: FleetView, rate_hz: float = 10.0) -> list[Directive]:
+    return [Directive(view.ego, p, Representation.FEATURES, 0.5, None, rate_hz, reason="share") for p in view.peers]
+
+
+# --- 1: bounded size and rate --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("field", ["rho", "rate_hz", "deadline_s", "fusion_weight", "duty_percent", "representation"])
+@pytest.mark.parametrize("value", [-1e-9, 1e6, float("nan"), float("inf")])
+def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
+    directives = [d._replace(**{field: value}) for d in share(FLEET)]
+    with pytest.raises(PolicyError, match=rf"directive 0→1: {field} is {value!r}, must be in \["):
+        check_directives(directives, FLEET)
+
+
+@given(st.integers(0, 400), st.integers(0, 600))
+def test_no_descriptor_is_larger_than_a_kilobyte(peers: int, targets: int) -> None:
+    crowded = MINE._replace(peer_goodput_mbps=(1.0,) * peers, priority_target_ids=(1,) * targets)
+    try:
+        size = len(encode_descriptor(crowded))
+    except ValueError:
+        return
+    assert size <= MAX_DESCRIPTOR_BYTES
+
+
+def test_descriptors_come_at_most_ten_times_a_second() -> None:
+    with pytest.raises(ScenarioError, match="rate_hz"):
+        loads("name: fast\ncontext: {rate_hz: 10.1}")
+
+
+# --- 2: best effort; age only reduces ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", POLICIES)
+@given(st.integers(0, 10**6), st.data())
+def test_age_never_raises_what_the_plane_enforces(name: str, number: int, data: st.DataObject) -> None:
+    """Through the policy and the staleness rules together: for any view, whoever's descriptor ages, and however much."""
+    view = draw_view(11, number)
+    who = data.draw(st.sampled_from(sorted(view.age_s)))
+    older_s = data.draw(st.floats(0, 100) | st.sampled_from([0.1, 0.30001, 1.0, 1.00001]))
+    older = view._replace(age_s={**view.age_s, who: view.age_s[who] + older_s})
+
+    def enforced(v: FleetView) -> list[Directive]:
+        links = {p: health(v.age_s[p], v.period_s, 3.0, 10.0) for p in v.peers}
+        return [cap_by_age(d, links[d.destination], v.age_s[d.destination]) for d in POLICIES[name](v)]
+
+    assert raised_part(POLICIES[name](view), POLICIES[name](older)) is None
+    assert raised_part(enforced(view), enforced(older)) is None
+
+
+# --- 3: context only -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("field", Descriptor._fields)
+@pytest.mark.parametrize("payload", [FEATURE_CELLS, FEATURE_CELLS.tobytes(), FEATURE_CELLS.tolist()], ids=type)
+def test_a_payload_does_not_fit_into_any_field_of_a_descriptor(field: str, payload: object) -> None:
+    with pytest.raises((ValueError, TypeError, AttributeError)):
+        encode_descriptor(MINE._replace(**{field: payload}))
+
+
+def test_a_descriptor_has_no_room_beside_its_fields() -> None:
+    with pytest.raises(ValueError, match="unexpected field names"):
+        MINE._replace(features=FEATURE_CELLS)
+    with pytest.raises(AttributeError):
+        MINE.features = FEATURE_CELLS  # type: ignore[attr-defined]
+    received = encode_descriptor(MINE)
+    assert isinstance(open_datagram(received + FEATURE_CELLS.tobytes(), None), Dropped), "nor behind it on the wire"
+
+
+# --- 4: policies read only descriptors -----------------------------------------------------------
+
+PLAIN = (int, float, str, bytes, type(None), Enum)
+
+
+def parts(thing: object) -> list[object]:
+    """All that can be reached from an object, but for classes and what belongs to them."""
+    found, waiting = [], [thing]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, type) or any(one is f for f in found):
+            continue
+        found.append(one)
+        if not isinstance(one, PLAIN):
+            waiting += gc.get_referents(one)
+    return found
+
+
+def test_a_view_holds_descriptors_and_ages_and_nothing_else_can_be_reached_from_it() -> None:
+    kinds = {type(p) for p in parts(FLEET) if not isinstance(p, PLAIN)}
+    assert kinds <= {FleetView, Descriptor, dict, tuple}
+    leaky = FLEET._replace(descriptors={0: MINE._replace(coverage_grid=Gate())})
+    assert any(isinstance(p, Gate) for p in parts(leaky)), "the look itself is not blind"
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_policy_decides_the_same_where_only_its_view_is_in_reach(name: str) -> None:
+    alone = confined(POLICIES[name])
+    for view in draw_views(12, 60):
+        assert [tuple(d) for d in alone(view)] == [tuple(d) for d in POLICIES[name](view)]
+
+
+HEARD: list[int] = []
+
+
+def looks_at_the_clock(view: FleetView) -> list[Directive]:
+    return share(view, 1.0 if time.time() > 0 else 2.0)
+
+
+def counts_cpu(view: FleetView) -> list[Directive]:
+    return share(view, 1.0 if perf_counter() > 0 else 2.0)
+
+
+def opens_a_file(view: FleetView) -> list[Directive]:
+    with open("policy.txt") as file:
+        return share(view, float(len(file.read())))
+
+
+def asks_the_system(view: FleetView) -> list[Directive]:
+    return share(view, float(len(os.environ) % 2))
+
+
+def throws_dice(view: FleetView) -> list[Directive]:
+    return share(view, random.random())
+
+
+def throws_numpys_dice(view: FleetView) -> list[Directive]:
+    return share(view, float(np.random.default_rng().random()))
+
+
+def imports_the_fleet(view: FleetView) -> list[Directive]:
+    from fleet.gate import RAW_BYTES
+
+    return share(view, float(RAW_BYTES % 7))
+
+
+def hides_it(view: FleetView) -> list[Directive]:
+    try:
+        return looks_at_the_clock(view)
+    except Exception:
+        return share(view)
+
+
+def holds_the_fleet(gate: Gate) -> Policy:
+    def decide(view: FleetView) -> list[Directive]:
+        return share(view, float(gate.duty_percent % 7))
+
+    return decide
+
+
+@pytest.mark.parametrize(
+    ("policy", "what"),
+    [
+        (looks_at_the_clock, "time"),
+        (counts_cpu, "time.perf_counter"),
+        (opens_a_file, "open"),
+        (asks_the_system, "os"),
+        (throws_dice, "random.random"),
+        (throws_numpys_dice, "numpy.random"),
+        (imports_the_fleet, "fleet.gate"),
+        (hides_it, "time"),
+        (holds_the_fleet(Gate()), "fleet.gate.gate"),
+        (functools.partial(looks_at_the_clock), "time"),
+    ],
+    ids=lambda p: getattr(p, "__name__", ""),
+)
+def test_a_policy_that_reaches_elsewhere_is_caught(policy: Policy, what: str) -> None:
+    with pytest.raises(Reached, match=rf"^reaches for {what}, which is not in its view$"):
+        confined(policy)(FLEET)
+    assert RULES["reads only its view"](policy, FLEET) == f"reaches for {what}, which is not in its view"
+
+
+def remembers(view: FleetView) -> list[Directive]:
+    HEARD.append(1)
+    return share(view, float(len(HEARD) % 30))
+
+
+def test_memory_between_calls_is_caught() -> None:
+    assert RULES["same in, same out"](remembers, FLEET) is not None
+
+
+# --- 5: damping and idempotence ------------------------------------------------------------------
+
+
+def test_repeating_a_directive_restarts_no_timer_anywhere() -> None:
+    """The bug that the paper names: a repeated directive restarted the publisher's timer, which then never fired."""
+    gate, sent = Gate(), 0
+    state = LinkState(Directive(0, 1, Representation.FEATURES, 0.5, None, 2.0))
+    more = state.enforced._replace(rate_hz=5.0)
+    raised_s = None
+    for frame in range(100):
+        now_s = frame * 0.1
+        asked = more if frame >= 20 else state.enforced._replace()  # equal, and another object each time
+        state = damp(state, asked._replace(), now_s, dwell_s=1.0)
+        gate.enforce(state.enforced)  # every frame anew
+        sent += len(gate.due(now_s))
+        if raised_s is None and state.enforced.rate_hz == 5.0:
+            raised_s = now_s
+    assert raised_s == pytest.approx(3.0), (
+        "asked for at 2 s, repeated ten times, made at 3 s: no repeat restarts the dwell"
+    )
+    assert sent == 6 + 35, "2 Hz for 3 s, then 5 Hz for 7 s"
+
+
+# --- 6: authentication ---------------------------------------------------------------------------
+
+KEYS = {1: bytes(32)}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda data: data[:40] + bytes([data[40] ^ 1]) + data[41:], "forged"),
+        (lambda data: data[:-28], "truncated"),
+        (lambda data: Sealer(bytes(31) + b"x", 1).seal(data[:-28]), "forged"),
+        (lambda data: Sealer(bytes(32), 2).seal(data[:-28]), "unknown_key"),
+    ],
+    ids=["changed", "unsigned", "another key", "a key nobody has"],
+)
+def test_what_is_not_the_fleets_is_dropped(spoil: Callable[[bytes], bytes], reason: str) -> None:
+    opened = open_datagram(spoil(Sealer(KEYS[1], 1).seal(encode_descriptor(MINE))), KEYS)
+    assert isinstance(opened, Dropped)
+    assert opened.reason.value == reason
+
+
+def test_a_replayed_descriptor_is_refused() -> None:
+    datagram = Sealer(KEYS[1], 1).seal(encode_descriptor(MINE))
+    inbox = Inbox()
+    assert isinstance(inbox.accept(open_datagram(datagram, KEYS)), Descriptor)
+    assert inbox.accept(open_datagram(datagram, KEYS)) == "replayed"
