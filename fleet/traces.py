@@ -1,6 +1,6 @@
 """Context traces: what a real or a simulated drone did, flown again in place of the models.
 
-A trace is a CSV or Parquet table with one row a drone and time. Names, units and frames are those of the record's
+One row a drone and time, CSV or Parquet. Names, units and frames are those of the record's
 `states` table, so that any run's `states.parquet` is a trace:
 
     t_s                       seconds since the sortie's begin, increasing for each drone        must be there
@@ -13,8 +13,8 @@ A trace is a CSV or Parquet table with one row a drone and time. Names, units an
     voltage_v, current_a      at the terminals
     rssi_dbm                  what the drone's radio heard; kept for people, nothing reads it yet
 
-Between rows values run linearly (attitudes on the shorter arc), before the first and after the last they hold. A
-drone without a column's values keeps its model there. Empty cells are gaps: the row says nothing of that column.
+Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. A drone without
+a pose or a charge keeps its model there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +31,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from fleet.cell import energy_fraction
 from fleet.frames import yaw_rad
 from fleet.motion import Motion, body_rates
+from scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
 
@@ -41,8 +41,8 @@ VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 BATTERY = ("soc", "voltage_v", "current_a")
 COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm")
 BOUNDS: Mapping[str, tuple[float, float]] = {
-    "t_s": (0.0, 86_400.0),
-    "drone": (0, 254),
+    "t_s": TIME_S,
+    "drone": DRONE,
     **dict.fromkeys(POSITION, (-20_000.0, 20_000.0)),
     **dict.fromkeys(ATTITUDE, (-1.000001, 1.000001)),
     **dict.fromkeys(VELOCITY, (-200.0, 200.0)),
@@ -52,11 +52,6 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "current_a": (-1000.0, 2000.0),
     "rssi_dbm": (-200.0, 50.0),
 }
-MAX_ROWS = 5_000_000
-
-
-class TraceError(ValueError):
-    """A trace is not as it must be; the message names the file, the column, the row and the bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,23 +114,18 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
             increase, a charge that rises.
     """
     path = Path(path)
-    columns = _columns(path)
-    rows = len(columns["t_s"])
-    who = columns.get("drone", np.zeros(rows))
-    if np.isnan(who).any() or (who != np.round(who)).any():
-        raise TraceError(
-            f"{path}: drone in row {_first(np.isnan(who) | (who != np.round(who)))}, must be a whole number"
-        )
+    columns = read_columns(path, BOUNDS)
+    if 0 < sum(name in columns for name in POSITION) < 3:
+        raise TraceError(f"{path}: a pose needs all of {', '.join(POSITION)}")
+    who = columns.get("drone", np.zeros(len(columns["t_s"])))
+    check_whole(path, "drone", who)
     found = {}
     for drone in np.unique(who).astype(int).tolist():
         if drone >= drones:
             raise TraceError(f"{path}: drone {drone}, must be below fleet.drones = {drones}")
-        row = np.flatnonzero(who == drone)
-        own = {name: values[row] for name, values in columns.items()}
-        late = np.diff(own["t_s"]) <= 0
-        if late.any():
-            at = int(row[_first(late)])  # _first counts from 1: the later row of the pair
-            raise TraceError(f"{path}: t_s in row {at + 1} of drone {drone} is {columns['t_s'][at]:g}, must increase")
+        rows = np.flatnonzero(who == drone)
+        check_increasing(path, columns["t_s"], rows, f"drone {drone}")
+        own = {name: values[rows] for name, values in columns.items()}
         found[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
     return found
 
@@ -182,41 +172,6 @@ def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> 
 # --- reading -------------------------------------------------------------------------------------
 
 
-def _columns(path: Path) -> dict[str, Array]:
-    import pyarrow as pa
-    import pyarrow.csv
-    import pyarrow.parquet
-
-    if not path.is_file():
-        raise TraceError(f"{path}: no such trace")
-    try:
-        table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise TraceError(f"{path}: is not a {path.suffix or 'Parquet'} table: {str(error).splitlines()[0]}") from error
-    known = [name for name in table.column_names if name in COLUMNS]
-    if "t_s" not in known:
-        raise TraceError(f"{path}: no column t_s, a trace needs one and some of {', '.join(COLUMNS[1:])}")
-    if not 0 < table.num_rows <= MAX_ROWS:
-        raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
-    columns = {}
-    for name in known:
-        try:
-            values = table[name].cast(pa.float64()).to_numpy()
-        except pa.ArrowException:
-            raise TraceError(f"{path}: column {name} does not hold numbers") from None
-        low, high = BOUNDS[name]
-        wrong = ~((values >= low) & (values <= high) | np.isnan(values))
-        if name == "t_s":
-            wrong |= np.isnan(values)
-        if wrong.any():
-            at = _first(wrong)
-            raise TraceError(f"{path}: {name} in row {at} is {values[at - 1]:g}, must be within {low:g} … {high:g}")
-        columns[name] = values
-    if 0 < sum(name in columns for name in POSITION) < 3:
-        raise TraceError(f"{path}: a pose needs all of {', '.join(POSITION)}")
-    return columns
-
-
 def _pose(own: Mapping[str, Array]) -> PoseTrace | None:
     if "x_m" not in own:
         return None
@@ -254,7 +209,7 @@ def _battery(own: Mapping[str, Array], where: str) -> BatteryTrace | None:
     t_s, soc = own["t_s"][there], own["soc"][there]
     rises = np.diff(soc) > 0
     if rises.any():
-        at = int(_first(rises))
+        at = first_row(rises)
         raise TraceError(
             f"{where}: soc rises from {soc[at - 1]:g} to {soc[at]:g} at {t_s[at]:g} s, must not rise in flight"
         )
@@ -318,8 +273,3 @@ def _nearest(t_s: Array, known_s: Array) -> npt.NDArray[np.intp]:
 
 def _stack(own: Mapping[str, Array], names: Sequence[str]) -> Array:
     return np.stack([own[name] for name in names], axis=-1)
-
-
-def _first(wrong: Any) -> int:
-    """Row of the first true value, counted from 1."""
-    return int(np.argmax(wrong)) + 1

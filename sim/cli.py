@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import typer
 
 from fleet.motion import MotionError
-from fleet.traces import TraceError
 from fleet.wire import DescriptorTooLarge
 from perception.detectors import DETECTORS
 from perception.errors import InputError
@@ -20,6 +19,7 @@ from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
+from scenarios.traces import TraceError
 from sim import cli_bench, cli_calibrate, cli_paper, cli_recording, cli_study, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
