@@ -12,11 +12,11 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
+from policies.contract import COVERAGE_CELL_M as CELL_M
 from policies.contract import COVERAGE_CELLS, Coverage
 
 Array = npt.NDArray[np.float64]
 
-CELL_M = 12.8
 HALF_FIELD_OF_VIEW_DEG = 35.0
 """Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
 RANGE_M = 102.4

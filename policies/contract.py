@@ -10,6 +10,7 @@ makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
@@ -17,6 +18,8 @@ from typing import NamedTuple, Protocol
 
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
+COVERAGE_CELL_M = 12.8
+"""Side of a coverage cell; cells lie on the world's lattice of this pitch."""
 
 
 class Representation(IntEnum):
@@ -78,6 +81,13 @@ class Descriptor(NamedTuple):
     region: Disc | None
     """Region of responsibility; on the wire f32[4] x, y, radius, 1 (all zero: none)."""
     priority_target_ids: tuple[int, ...] = ()
+
+    @property
+    def coverage_corner(self) -> tuple[int, int]:
+        """Row and column, in the world's lattice, of the grid's south-west cell: where the grid lies."""
+        x_m, y_m, _ = self.position_m
+        half = COVERAGE_CELLS // 2
+        return math.floor(y_m / COVERAGE_CELL_M) - half, math.floor(x_m / COVERAGE_CELL_M) - half
 
     def goodput_to(self, peer: int) -> float:
         """Goodput to `peer`, Mb/s, as this drone measured it (0 if it is not on the roster)."""

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from policies import baselines
 from policies.contract import Directive, FleetView, Policy, PolicyError
+from policies.deputies import deputies
+from policies.prior import METHODS
 from policies.worked import worked
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
@@ -19,6 +21,8 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worst-2": baselines.worst_k,
     "random-2": baselines.random_k,
     "silence": baselines.silence,
+    "deputies": deputies,
+    **{name: method.policy for name, method in METHODS.items()},
 }
 """One line a policy. Keyword-only arguments are its parameters."""
 
@@ -37,6 +41,18 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
         if key not in known:
             raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
     return functools.partial(function, **params) if params else function
+
+
+def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
+    """What a drone under this policy sends to each peer and frame before any payload; 0 where it asks for nothing."""
+    method = METHODS.get(name)
+    return 0 if method is None else method.handshake_bytes(params or {})
+
+
+def own_fusion(name: str) -> str | None:
+    """The fusion that a prior method was published with, a value of `perception.fusion`; None where it has none."""
+    method = METHODS.get(name)
+    return None if method is None else method.fusion
 
 
 def parameters(function: Callable[..., object]) -> dict[str, object]:

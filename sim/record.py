@@ -53,9 +53,10 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         payload_bytes=I, wire_bytes=I, deadline_s=F, t_start_s=F, t_done_s=F, status=S, reason=S, fragments=I,
         fragments_lost=I, repairs=I, mcs=I, snr_db=F, airtime_s=F,
     ),
-    # one row a scored fusion: an ego, and the peers whose payloads it held
+    # one row a scored fusion: an ego, and the peers whose payloads it held; a weight is the directive's times trust
     "fusions": dict(
-        t_s=F, drone=I, peers=pa.list_(I), representations=pa.list_(S), ages_s=pa.list_(F), detections=I, truths=I,
+        t_s=F, drone=I, peers=pa.list_(I), representations=pa.list_(S), ages_s=pa.list_(F), weights=pa.list_(F),
+        detections=I, truths=I,
     ),
     # boxes detected by an ego and true boxes in its range, ENU
     "detections": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, score=F),

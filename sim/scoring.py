@@ -105,7 +105,7 @@ class Scorer:
             rows["fusions"].append(
                 (
                     now_s, ego.drone, [s.capture.drone for s in shares], [s.representation for s in shares],
-                    [now_s - s.capture.t_s for s in shares], len(boxes), len(truth),
+                    [now_s - s.capture.t_s for s in shares], [s.weight for s in shares], len(boxes), len(truth),
                 )
             )  # fmt: skip
 

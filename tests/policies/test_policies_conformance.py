@@ -21,7 +21,7 @@ def test_a_policy_keeps_the_contract(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", [n for n in POLICIES if n not in ("worked", "silence")])
+@pytest.mark.parametrize("name", ["all-4", "best-2", "worst-2", "random-2"])
 @pytest.mark.parametrize("rho", [0.02, 0.05, 0.1, 0.25, 1.0])
 def test_fixed_policies_spend_the_same_budget(name: str, rho: float) -> None:
     """Matched bytes: what a drone sends over all its links is ρ of full sharing, up to a full map a link."""

@@ -92,7 +92,7 @@ def with_sightings(record: SortieRecord) -> SortieRecord:
             ]
             made["truths"] += [(t_s, i, *b) for b in boxes]
             made["detections"] += [(t_s, i, *b) for b in found + false]
-            made["fusions"].append((t_s, i, [], [], [], len(found) + len(false), len(boxes)))
+            made["fusions"].append((t_s, i, [], [], [], [], len(found) + len(false), len(boxes)))
     tables = {
         name: pa.table(
             {c: pa.array(v, t) for (c, t), v in zip(TABLES[name].items(), zip(*r, strict=True), strict=True)}

@@ -1,0 +1,57 @@
+"""What coverage grids say, as sets of cells of the world's lattice, so that drones' grids can be compared."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import hypot
+
+from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc
+
+Cells = frozenset[tuple[int, int]]
+"""(row, column) in the world's lattice of 12.8 m."""
+
+_HALF_DIAGONAL_M = COVERAGE_CELL_M * 2**0.5 / 2
+
+
+def seen_well(d: Descriptor) -> Cells:
+    """Cells that a drone says it sees well, new ones among them."""
+    return _cells(d.coverage_grid, *d.coverage_corner)
+
+
+def centre_cell(d: Descriptor) -> Cells:
+    """The one cell below the middle of the grid."""
+    row, column = d.coverage_corner
+    return frozenset(((row + COVERAGE_CELLS // 2, column + COVERAGE_CELLS // 2),))
+
+
+@lru_cache(maxsize=4096)  # a grid stands for a second and is read by every drone
+def _cells(grid: bytes, row: int, column: int) -> Cells:
+    well = []
+    for i, byte in enumerate(grid):
+        for k in range(4):
+            if (byte >> (2 * k)) & 3 >= Coverage.WELL:
+                cell = 4 * i + k
+                well.append((row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS))
+    return frozenset(well)
+
+
+@lru_cache(maxsize=4096)
+def disc_around(cells: Cells) -> Disc:
+    """A disc that holds all of the cells, about the middle of their bounding box; ENU.
+
+    Raises:
+        ValueError: no cells.
+    """
+    if not cells:
+        raise ValueError("cells is empty, must hold at least one")
+    rows, columns = [r for r, _ in cells], [c for _, c in cells]
+    x = (min(columns) + max(columns) + 1) / 2
+    y = (min(rows) + max(rows) + 1) / 2
+    reach = max(hypot(c + 0.5 - x, r + 0.5 - y) for r, c in cells)
+    return Disc(x * COVERAGE_CELL_M, y * COVERAGE_CELL_M, reach * COVERAGE_CELL_M + _HALF_DIAGONAL_M)
+
+
+@lru_cache(maxsize=65536)
+def answered(key: Cells, known: Cells) -> float:
+    """Share of what one sees well that another does not, 0 … 1: how far a key answers a query."""
+    return len(key - known) / len(key) if key else 0.0

@@ -1,0 +1,12 @@
+"""What prior methods do where they decide nothing: full maps to every peer, every frame, fused at weight 1."""
+
+from __future__ import annotations
+
+from policies.contract import Directive, Representation
+
+RATE_HZ = 10.0
+
+
+def full_sharing(source: int, destination: int, rho: float, reason: str) -> Directive:
+    """One link of full sharing, thinned to `rho` of its cells."""
+    return Directive(source, destination, Representation.FEATURES, rho, None, RATE_HZ, reason=reason)
