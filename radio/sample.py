@@ -18,6 +18,7 @@ from radio.airtime import (
 )
 from radio.contention import contention
 from radio.medium import Job
+from radio.overrides import LinkNow
 from radio.rates import STANDARDS, rate_table, rescale
 from radio.transmission import Status, Transmission
 from scenarios.schema import Radio
@@ -146,7 +147,15 @@ class Service:
         self._demands: dict[tuple[int, int, bool], Exchanges] = {}
         self._qualities: dict[tuple[int, float], tuple[float, float, float]] = {}
 
-    def begin(self, s: Sample, now_s: float, known_snr_db: float, snr_db: float, receiver_gone: bool) -> None:
+    def begin(
+        self,
+        s: Sample,
+        now_s: float,
+        known_snr_db: float,
+        snr_db: float,
+        receiver_gone: bool,
+        given: LinkNow | None = None,
+    ) -> None:
         """Set what a sample at the head of its queue asks for, its progress up to now being booked.
 
         Args:
@@ -155,6 +164,7 @@ class Service:
             known_snr_db: mean SNR that its sender knows and picks the MCS by.
             snr_db: mean SNR as it is.
             receiver_gone: whether nobody is there to answer.
+            given: what stands beside the models or in their place; None is nothing.
         """
         fresh = s.t_start_s == now_s
         if isnan(s.t_first_s):
@@ -162,6 +172,8 @@ class Service:
         s.snr_db = snr_db
         table = self._table
         mcs = table.mcs[table.index(known_snr_db)]
+        if given is not None:
+            mcs = self._given_mcs(mcs, given)
         reason = "receiver_gone" if receiver_gone else "no_link" if mcs < 0 else ""
         if fresh or (-1 if reason else mcs) != s.mcs:
             s.mark_s, s.mark_bits = now_s, 0.0
@@ -180,7 +192,11 @@ class Service:
         payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
         if s.fragments == 1:
             per = rescale(per, frame_bytes(payload) / self._frame_bytes)
+        if given is not None:
+            per = 1.0 - (1.0 - per) * (1.0 - given.burst_loss) if isnan(given.loss) else given.loss
         mean_tries, s.loss_probability, s.full_mbps = self._quality(mcs, per)
+        if given is not None and not isnan(given.goodput_mbps):
+            mean_tries, s.full_mbps = self._full_mbps[mcs] / given.goodput_mbps, given.goodput_mbps
         key = (payload, mcs, s.reliable)
         demand = self._demands.get(key)
         if demand is None:
@@ -188,6 +204,15 @@ class Service:
                 self._demands.clear()
             demand = self._demands[key] = self._demand(payload, mcs, s.reliable)
         s.demand(demand, mean_tries)
+
+    def _given_mcs(self, mcs: int, given: LinkNow) -> int:
+        """The slowest MCS that carries a traced goodput (or the fastest); some MCS where a loss alone is traced."""
+        if isnan(given.goodput_mbps):
+            return mcs if isnan(given.loss) else max(mcs, 0)
+        if given.goodput_mbps <= 0.0:
+            return -1
+        fast = (i for i, mbps in enumerate(self._full_mbps) if mbps >= given.goodput_mbps)
+        return next(fast, len(self._full_mbps) - 1)
 
     def _quality(self, mcs: int, per: float) -> tuple[float, float, float]:
         """Mean tries, loss after all of them, and payload rate of full A-MPDUs, of frames that fail with `per`."""

@@ -227,6 +227,24 @@ class Mission(Section):
 # --- radio ---------------------------------------------------------------------------------------
 
 
+MIN_TILE_BYTES = 206
+"""A fragment that is usable alone: 44 B of header, and one cell of 160 B with its index (fleet/tiles.py)."""
+
+
+class Bursts(Section):
+    good_to_bad: float = Field(
+        0.0, ge=0, le=1, description="Probability that a good pair of drones turns bad, a step; 0: no bursts."
+    )
+    bad_to_good: float = Field(0.28, gt=0, le=1, description="Probability that a bad pair turns good again, a step.")
+    step_s: float = Field(
+        1.0, ge=0.01, le=60, description="Length of a step; flown links gave 0.05 and 0.28 over steps of 1 s."
+    )
+    loss_good: float = Field(
+        0.0, ge=0, le=1, description="Probability that a good pair loses a frame at a try, besides what SNR loses."
+    )
+    loss_bad: float = Field(1.0, ge=0, le=1, description="The same of a bad pair.")
+
+
 class Radio(Section):
     standard: Literal["n", "ac", "ax"] = Field(
         "ax", description="802.11 generation, one spatial stream: rates, preamble, aggregation."
@@ -263,6 +281,18 @@ class Radio(Section):
     retry_limit: int = Field(7, ge=0, le=32, description="MAC retries of a unicast frame.")
     max_ampdu_frames: int = Field(64, ge=1, le=256, description="Frames aggregated into one A-MPDU.")
     fragment_bytes: int = Field(1344, ge=64, le=65000, description="DDS fragment payload.")
+    framing: Literal["sample", "tiles"] = Field(
+        "sample",
+        description="Feature maps as one sample, which a lost fragment loses, or as tiles: fragments of whole cells, usable alone.",
+    )
+    relay_max_hops: int = Field(
+        1, ge=1, le=8, description="Most hops of a payload's route; 1 sends directly, whatever the link is worth."
+    )
+    bursts: Bursts = Bursts()
+    trace: str | None = Field(
+        None,
+        description="CSV or Parquet (radio/traces.py): links named in it take SNR, loss or goodput from it, not from the models.",
+    )
     heartbeat_s: float = Field(0.02, gt=0, le=10, description="Heartbeat period of the reliable writer.")
     nack_delay_s: float = Field(0.005, ge=0, le=10, description="The reader's delay before it asks for a repair.")
 
@@ -270,6 +300,13 @@ class Radio(Section):
     def _width_exists(self) -> Radio:
         if self.standard == "n" and self.bandwidth_mhz == 80:
             raise _inconsistent(("bandwidth_mhz",), "80", "20 or 40 where standard is n")
+        return self
+
+    @model_validator(mode="after")
+    def _a_tile_fits(self) -> Radio:
+        if self.framing == "tiles" and self.fragment_bytes < MIN_TILE_BYTES:
+            bound = f"at least {MIN_TILE_BYTES} where framing is tiles, for a header and one cell"
+            raise _inconsistent(("fragment_bytes",), f"{self.fragment_bytes}", bound)
         return self
 
 

@@ -36,6 +36,9 @@ FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radi
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
+BURSTS = "radio.bursts.good_to_bad=0.3"
+LINKS = str(Path(__file__).parent / "links.csv")
+
 # field: (new value, settings that both sorties get)
 TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "seed": ("2", ()),
@@ -110,6 +113,14 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "radio.retry_limit": ("1", (FAR,)),
     "radio.max_ampdu_frames": ("8", ()),
     "radio.fragment_bytes": ("8000", ()),
+    "radio.framing": ("tiles", ()),
+    "radio.relay_max_hops": ("3", (FAR, "fleet.formation.shape=line")),
+    "radio.bursts.good_to_bad": ("0.3", ()),
+    "radio.bursts.bad_to_good": ("0.9", (BURSTS,)),
+    "radio.bursts.step_s": ("0.2", (BURSTS,)),
+    "radio.bursts.loss_good": ("0.1", (BURSTS,)),
+    "radio.bursts.loss_bad": ("0.5", (BURSTS,)),
+    "radio.trace": (LINKS, ()),
     "radio.heartbeat_s": ("0.05", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
     "radio.nack_delay_s": ("0.02", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
     "context.rate_hz": ("5", ()),

@@ -1,0 +1,133 @@
+"""What stands in place of the link models, or on top of them: link traces and bursts of loss.
+
+Frames of a traced link go by the trace, those of any other by the models and, where the scenario has them, bursts.
+What happens to a unicast frame's tries is worked out where its sample is served (`radio.sample`); whom a group frame
+reaches is settled here, by a uniform number for each link and frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radio.bursts import PairNumbers, PairStates
+from radio.rates import group_mcs, rate_table, rescale
+from radio.traces import Given, LinkTrace
+from scenarios.schema import Radio
+
+FloatArray = NDArray[np.float64]
+_GOLDEN = 0.6180339887498949
+
+
+class LinkNow(NamedTuple):
+    """What holds for a link's unicast frames in this frame, NaN where the model does."""
+
+    burst_loss: float
+    """Probability that a try is lost besides the PER."""
+    loss: float
+    """Probability that a try is lost, in place of the PER."""
+    goodput_mbps: float
+    """Payload rate of the link alone on the channel."""
+
+
+class Overrides:
+    """Traces and bursts, frame by frame.
+
+    Args:
+        config: the scenario's radio section.
+        trace: None where there is none.
+        n: number of drones.
+        seed, replication: as in `scenarios.streams.stream`.
+        frame_s: time between two calls of `advance`.
+    """
+
+    def __init__(
+        self, config: Radio, trace: LinkTrace | None, n: int, *, seed: int, replication: int, frame_s: float
+    ) -> None:
+        self._n, self._frame_s, self._trace = n, frame_s, trace
+        bursts = config.bursts
+        self._states = None
+        if bursts.good_to_bad > 0.0 or bursts.loss_good > 0.0:
+            self._states = PairStates(bursts, n, seed, replication, frame_s)
+        self._numbers = PairNumbers(seed, replication, n, "override loss", ordered=True)
+        self._frame = -1
+        nothing = np.full((n, n), np.nan)
+        self._given = Given(nothing, nothing, nothing)
+        self._burst_loss: FloatArray = np.zeros((n, n))
+        self._luck: FloatArray = np.zeros((n, n))
+        # group frames go out in the primary 20 MHz with the whole power, so over less noise
+        self._group_gain_db = 10.0 * float(np.log10(config.bandwidth_mhz / 20.0))
+        self._group_mcs = group_mcs(config.group_rate_mbps)
+        self._group_table = rate_table(20, config.rician_k_db)
+        self._snr_rows: list[list[float]] | None = None
+        self._known_rows: list[list[float]] | None = None
+
+    @classmethod
+    def wanted(cls, config: Radio) -> bool:
+        """Whether the scenario has any."""
+        return config.trace is not None or config.bursts.good_to_bad > 0.0 or config.bursts.loss_good > 0.0
+
+    def advance(self, extra_loss_db: ArrayLike | None, noise_rise_db: ArrayLike | None = None) -> None:
+        """Move on by one frame.
+
+        Args:
+            extra_loss_db: [N, N], taken off a traced SNR; None is none.
+            noise_rise_db: [N], how far jammers lift each receiver's noise; None is not at all.
+        """
+        self._frame += 1
+        self._luck = self._numbers.row()
+        if self._states is not None:
+            self._burst_loss = self._states.advance()
+        if self._trace is not None:
+            self._given = given = self._trace.at(self._frame * self._frame_s, self._n)
+            snr_db = given.snr_db
+            if extra_loss_db is not None:
+                snr_db = snr_db - np.asarray(extra_loss_db, dtype=float)
+            if noise_rise_db is not None:
+                snr_db = snr_db - np.asarray(noise_rise_db, dtype=float)
+            self._given = given._replace(snr_db=snr_db)
+            self._known_rows, self._snr_rows = self._snr_rows, snr_db.tolist()
+
+    def snr_db(self, modelled_db: FloatArray) -> FloatArray:
+        """[N, N]: the trace's SNR in this frame where it has one, else the model's."""
+        return np.where(np.isnan(self._given.snr_db), modelled_db, self._given.snr_db)
+
+    def snr_of(self, sender: int, receiver: int, known_db: float, now_db: float) -> tuple[float, float]:
+        """The SNR of a link in the frame before and in this one, the model's being given."""
+        if self._snr_rows is None or isnan(now := self._snr_rows[sender][receiver]):
+            return known_db, now_db
+        return (now if self._known_rows is None else self._known_rows[sender][receiver]), now
+
+    def link(self, sender: int, receiver: int) -> LinkNow:
+        """What holds for unicast frames of a link."""
+        loss, mbps = float(self._given.loss[sender, receiver]), float(self._given.goodput_mbps[sender, receiver])
+        return LinkNow(float(self._burst_loss[sender, receiver]), loss, mbps)
+
+    def heard(self, sender: int, heard: Sequence[int], mpdu_bytes: int, times: int) -> list[int]:
+        """Whom a group frame reaches, ascending.
+
+        Args:
+            heard: whom it reaches by the models, ascending.
+            times: how many group frames the sender has sent in this frame before.
+        """
+        luck = (self._luck[sender] + times * _GOLDEN) % 1.0
+        on_top = self._burst_loss[sender]
+        if self._trace is None:
+            return [i for i in heard if luck[i] >= on_top[i]]
+        loss, snr_db = self._given.loss[sender], self._given.snr_db[sender]
+        traced = ~(np.isnan(loss) & np.isnan(snr_db))
+        reached = [i for i in heard if not traced[i] and luck[i] >= on_top[i]]
+        for i in np.flatnonzero(traced).tolist():
+            missed = float(loss[i])
+            if isnan(missed):
+                table = self._group_table
+                per = table.all_per[self._group_mcs][table.index(float(snr_db[i]) + self._group_gain_db)]
+                per = rescale(per, mpdu_bytes / table.frame_bytes)
+                missed = 1.0 - (1.0 - per) * (1.0 - float(on_top[i]))
+            if i != sender and luck[i] >= missed:
+                reached.append(i)
+        return sorted(reached)
