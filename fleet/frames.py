@@ -65,6 +65,12 @@ def yaw_rad(quaternion_xyzw: npt.ArrayLike) -> Array:
     return yaw
 
 
+def up_vector(quaternion_xyzw: npt.ArrayLike) -> Array:
+    """The body's z axis in the world, [..., 3], of unit quaternions [..., 4]: third column of the rotation matrix."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion_xyzw, dtype=np.float64), -1, 0)
+    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=-1)
+
+
 def compass_deg(yaw: npt.ArrayLike) -> Array:
     """Compass heading [...] (0 north, 90 east, clockwise, [0, 360)) of ENU yaws in radians."""
     heading = np.mod(90.0 - np.degrees(np.asarray(yaw, dtype=float)), 360.0)

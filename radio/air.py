@@ -24,7 +24,9 @@ from radio.channel import Channel, FloatArray, Jammer, SampleLuck
 from radio.counters import Counters
 from radio.goodput import Goodput
 from radio.medium import End, Medium
+from radio.overrides import Overrides
 from radio.sample import Sample, Service
+from radio.traces import read_links
 from radio.transmission import Status, Transmission, losses
 from scenarios.schema import Radio
 
@@ -44,6 +46,7 @@ class Air:
         publish_spread: the drones' clocks are not in step, so a drone's broadcasts reach its radio a fixed time
             after the call, drawn once per drone, uniform in [0, publish_spread · frame_s). 0 hands them over at
             once: then drones that call at the same instant contend, and collide in 1 of 16 pairings.
+        up: [T, N, 3], ENU: the unit vector along each airframe's z axis, for the antennas; None is level flight.
 
     `advance` must be called before the first `broadcast` or `send`.
     """
@@ -58,17 +61,22 @@ class Air:
         replication: int = 0,
         frame_s: float,
         publish_spread: float = 0.8,
+        up: ArrayLike | None = None,
     ) -> None:
         if not 0.0 <= publish_spread <= 1.0:
             raise ValueError(f"publish_spread is {publish_spread!r}, must be in [0, 1]")
         self._env = env
         self._config = config
-        self.channel = Channel(config, positions_m, seed, replication, frame_s)
+        self.channel = Channel(config, positions_m, seed, replication, frame_s, up)
         self._n = n_drones = self.channel.n
         self.counters = Counters()
         self._gone: set[int] = set()
+        self._overrides: Overrides | None = None
+        if Overrides.wanted(config):
+            trace = None if config.trace is None else read_links(config.trace, n_drones)
+            self._overrides = Overrides(config, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
         self._broadcasts = Broadcasts(
-            config, self.channel, self.counters, self._gone,
+            config, self.channel, self.counters, self._gone, self._overrides,
             seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
         )  # fmt: skip
         self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
@@ -76,8 +84,6 @@ class Air:
         self._luck = SampleLuck(seed, replication)
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
-        self._snr_rows: list[list[float]] = []
-        self._known_rows: list[list[float]] = []
         self._in_flight: dict[int, Sample] = {}
         self._latest: dict[tuple[int, int, str], Sample] = {}
         self._numbers = 0
@@ -86,16 +92,16 @@ class Air:
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move the links on by one frame (arguments as in `Channel.advance`); samples in service feel it at once."""
-        before = self._snr_rows
-        self._snr_rows = self.channel.advance(extra_loss_db, jammers).tolist()
-        self._known_rows = before or self._snr_rows
-        self._broadcasts.advance()
+        self.channel.advance(extra_loss_db, jammers)
+        if self._overrides is not None:
+            self._overrides.advance(extra_loss_db, self.channel.noise_rise_db(jammers) if jammers else None)
         self.medium.retune()
 
     @property
     def snr_db(self) -> FloatArray:
         """[N, N], sender by receiver: mean SNR in this frame, dB; NaN on the diagonal."""
-        return self.channel.snr_db
+        snr_db = self.channel.snr_db
+        return snr_db if self._overrides is None else self._overrides.snr_db(snr_db)
 
     # --- context ---------------------------------------------------------------------------------
 
@@ -168,7 +174,7 @@ class Air:
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
             *sample_wire(payload_bytes, self._config.fragment_bytes), self._luck.next(sender, receiver),
-            self._snr_rows[sender][receiver], self._drained(sender),
+            self._snr_of(sender, receiver)[1], self._drained(sender),
         )  # fmt: skip
         self._in_flight[number] = s
         self.counters.data_sent_bytes += payload_bytes
@@ -216,7 +222,15 @@ class Air:
         """A sample comes to the head of its queue, or its link has changed while it is there."""
         self._book(s)
         i, j = s.sender, s.receiver
-        self._service.begin(s, now_s, self._known_rows[i][j], self._snr_rows[i][j], j in self._gone)
+        given = None if self._overrides is None else self._overrides.link(i, j)
+        self._service.begin(s, now_s, *self._snr_of(i, j), j in self._gone, given)
+
+    def _snr_of(self, sender: int, receiver: int) -> tuple[float, float]:
+        """Mean SNR of a link as its sender knows it, from the frame before, and as it is."""
+        known_db, now_db = self.channel.before.rows_db[sender][receiver], self.channel.now.rows_db[sender][receiver]
+        if self._overrides is None:
+            return known_db, now_db
+        return self._overrides.snr_of(sender, receiver, known_db, now_db)
 
     def _end(self, s: Sample, how: End, now_s: float) -> None:
         """The medium is through with a sample's pass, or its deadline has passed."""

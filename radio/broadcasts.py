@@ -8,6 +8,7 @@ from radio.airtime import frame_bytes, group_frame_s
 from radio.channel import Channel
 from radio.counters import Counters
 from radio.medium import CW_CONTEXT, GroupFrame
+from radio.overrides import Overrides
 from scenarios.schema import Radio
 from scenarios.streams import stream
 
@@ -36,7 +37,8 @@ class Broadcast(GroupFrame):
 class Broadcasts:
     """The group-addressed half of the air; `Air` documents the arguments.
 
-    `gone` is the air's own set of silenced drones. `phase_s` is how long after the call each drone's frames reach
+    `gone` is the air's own set of silenced drones;
+    `overrides` None is none. `phase_s` is how long after the call each drone's frames reach
     its radio.
     """
 
@@ -46,6 +48,7 @@ class Broadcasts:
         channel: Channel,
         counters: Counters,
         gone: Set[int],
+        overrides: Overrides | None,
         *,
         seed: int,
         replication: int,
@@ -56,18 +59,14 @@ class Broadcasts:
         self._channel = channel
         self._counters = counters
         self._gone = gone
+        self._overrides = overrides
         self._n = n = channel.n
-        self._reach_bytes: list[list[float]] = []
         self._access_streams = [stream(seed, replication, i, "access") for i in range(n)]
         self._access: list[list[list[float]]] = [[] for _ in range(n)]
         self.phase_s = [
             float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
         ]
         self._heard_frame = [(-1, 0)] * n
-
-    def advance(self) -> None:
-        """The links have moved on by one frame."""
-        self._reach_bytes = self._channel.group_reach_bytes.tolist()
 
     def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
         """One more frame of a drone, its luck drawn; arguments and errors as for `Air.broadcast`."""
@@ -100,9 +99,9 @@ class Broadcasts:
         seen, times = self._heard_frame[sender]
         times = times + 1 if seen == index else 0
         self._heard_frame[sender] = (index, times)
-        row = self._reach_bytes[sender] if times == 0 else self._channel.reach_again(sender, times).tolist()
-        length = frame.mpdu_bytes
-        heard = [i for i, reach in enumerate(row) if reach >= length]
+        heard = self._channel.heard(sender, frame.mpdu_bytes, times)
+        if self._overrides is not None:
+            heard = self._overrides.heard(sender, heard, frame.mpdu_bytes, times)
         if gone:
             heard = [i for i in heard if i not in gone]
         counters.receptions += len(heard)

@@ -1,19 +1,25 @@
-"""Positions to signal-to-noise ratios: path loss, shadowing, fading, noise and jammers.
+"""Positions to signal-to-noise ratios: path loss, antennas, shadowing, fading, noise and jammers.
 
-Random numbers come from one stream per drone and purpose; the stream of drone h draws for its links
-to the drones of *lower* id, so that each link has numbers of its own and one more drone changes none
-of the others', with N streams and not N².
+Random numbers of the first `SQUARE` drones come from one stream per drone and purpose; the stream of drone h draws
+for its links to the drones of *lower* id, so that each link has numbers of its own and one more drone changes none
+of the others', with N streams and not N². Links of later drones take theirs by counter (`radio.draws`), which costs
+nothing for those that are out of earshot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import exp, log10, pi, sqrt
+from math import log10, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radio.antenna import antenna_loss_db
+from radio.draws import drone_keys, fade_table_db, levels, link_keys, normal_table, numbers, uniforms
+from radio.links import Links, all_links, links_in_range
+from radio.pathloss import path_loss_db, range_m
 from radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
+from radio.shadowing import ShadowField, gauss_markov, keep
 from scenarios.schema import Radio
 from scenarios.streams import stream
 
@@ -21,19 +27,14 @@ FloatArray = NDArray[np.float64]
 Jammer = tuple[Sequence[float], float]
 """Position ENU in metres and power in the channel in dBm."""
 
-_LIGHT_MPS = 299_792_458.0
+SQUARE = 64
+"""Fleets of up to so many drones work out every link; larger ones those within earshot."""
+EPOCH = 32
+"""Frames for which a large fleet's list of links stands."""
+OUT_OF_RANGE_DB = -100.0
+"""SNR that is told of a link out of earshot."""
+_EARSHOT_SIGMA = 4.0
 _BLOCK_NUMBERS = 1 << 18
-
-
-def free_space_loss_db(distance_m: ArrayLike, carrier_ghz: float) -> FloatArray:
-    """Friis: 20 log10(4π d f / c), dB."""
-    return np.asarray(20.0 * np.log10(4.0 * pi * np.asarray(distance_m, dtype=float) * carrier_ghz * 1e9 / _LIGHT_MPS))
-
-
-def path_loss_db(distance_m: ArrayLike, carrier_ghz: float, exponent: float) -> FloatArray:
-    """Log-distance loss: free space at 1 m, then 10 · exponent · log10(d); nearer than 1 m counts as 1 m."""
-    d = np.maximum(np.asarray(distance_m, dtype=float), 1.0)
-    return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) + 10.0 * exponent * np.log10(d))
 
 
 def noise_dbm(bandwidth_mhz: float, noise_figure_db: float) -> float:
@@ -48,17 +49,55 @@ def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
     return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
 
 
+def earshot_m(config: Radio) -> float:
+    """The distance beyond which no frame is heard.
+
+    There a link with 4 σ of shadowing and the highest of 65,536 fades is still 2 dB short of half the group frames,
+    which leaves less than one in 10^6 of them: a sum of rare cases that no sortie meets.
+    """
+    gain_db = _EARSHOT_SIGMA * config.shadowing_sigma_db + float(fade_table_db(config.rician_k_db)[-1])
+    needed_db = min(S50_DB[0], S50_DB[group_mcs(config.group_rate_mbps)] - 10.0 * log10(config.bandwidth_mhz / 20.0))
+    noise = noise_dbm(config.bandwidth_mhz, config.noise_figure_db)
+    return range_m(config, config.tx_power_dbm - noise + gain_db - needed_db + 2.0)
+
+
 def _reach_at_1(luck: FloatArray) -> FloatArray:
     """How long a frame may be, bytes, to arrive with this luck where −log s (see `Channel._reach`) is 1."""
     return np.asarray(-REFERENCE_BYTES * np.log1p(-luck))
 
 
+class FrameLinks:
+    """The mean SNR of the links in one frame; squares and rows are made when they are asked for."""
+
+    __slots__ = ("_rows", "_square", "links", "snr_db")
+
+    def __init__(self, links: Links, snr_db: FloatArray) -> None:
+        self.links, self.snr_db = links, snr_db
+        self._square: FloatArray | None = None
+        self._rows: list[list[float]] | None = None
+
+    @property
+    def square_db(self) -> FloatArray:
+        """[N, N], sender by receiver; NaN on the diagonal."""
+        if self._square is None:
+            self._square = self.links.square(self.snr_db, OUT_OF_RANGE_DB)
+        return self._square
+
+    @property
+    def rows_db(self) -> list[list[float]]:
+        """The same as lists."""
+        if self._rows is None:
+            self._rows = self.square_db.tolist()
+        return self._rows
+
+
 class Channel:
     """The SNR of every link, frame by frame.
 
-    `snr_db[i, j]` is the mean (over small-scale fading) SNR at receiver j of sender i in the whole channel,
-    NaN on the diagonal. `group_reach_bytes[i, j]` is the longest group-addressed frame of i that j receives
-    in this frame, its fade and its luck drawn; NaN on the diagonal, so that no drone hears itself.
+    `now` is the mean (over small-scale fading) SNR of the links in this frame, in the whole channel; `before` that of
+    the frame before (the first frame's own, in the first). `reach_bytes` is the longest group-addressed frame that
+    each link carries in this frame, its fade and its luck drawn. `snr_db`, `fade_db`, `shadow_db` and
+    `group_reach_bytes` show the same as squares [N, N], sender by receiver, NaN on the diagonal.
 
     What follows from the flight alone is worked out for a block of frames in one pass; a frame in which nothing
     else interferes is only looked up.
@@ -68,12 +107,21 @@ class Channel:
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
+        up: [T, N, 3], ENU: the unit vector along each airframe's z axis; None is level flight.
 
     Raises:
-        ValueError: if the shape is wrong or a position is not finite.
+        ValueError: if a shape is wrong or a number is not finite.
     """
 
-    def __init__(self, config: Radio, positions_m: ArrayLike, seed: int, replication: int, frame_s: float) -> None:
+    def __init__(
+        self,
+        config: Radio,
+        positions_m: ArrayLike,
+        seed: int,
+        replication: int,
+        frame_s: float,
+        up: ArrayLike | None = None,
+    ) -> None:
         self._positions_m = p = np.asarray(positions_m, dtype=float)
         if p.ndim != 3 or p.shape[1] < 1 or p.shape[2] != 3:
             raise ValueError(f"positions_m has shape {p.shape}, must be (frames, drones, 3)")
@@ -81,43 +129,53 @@ class Channel:
             raise ValueError("positions_m holds a value that is not finite")
         if not frame_s > 0:
             raise ValueError(f"frame_s is {frame_s!r}, must be > 0")
+        self._up = u = None if up is None else np.asarray(up, dtype=float)
+        if u is not None and u.shape != p.shape:
+            raise ValueError(f"up has shape {u.shape}, must be {p.shape}, as positions_m")
+        if u is not None and not np.isfinite(u).all():
+            raise ValueError("up holds a value that is not finite")
         self.config = config
         self.n = n_drones = p.shape[1]
         self.frame = -1
-        self.snr_db: FloatArray = np.full((n_drones, n_drones), np.nan)
-        self.fade_db: FloatArray = np.zeros((n_drones, n_drones))
-        self.group_reach_bytes: FloatArray = np.full((n_drones, n_drones), np.nan)
-        self.shadow_db: FloatArray = np.zeros((n_drones, n_drones))
         self.noise_dbm = noise_dbm(config.bandwidth_mhz, config.noise_figure_db)
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
         self._group_gain_db = 10.0 * log10(config.bandwidth_mhz / 20.0)
         mcs = group_mcs(config.group_rate_mbps)
         self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
-        self._loss_1m_db = float(free_space_loss_db(1.0, config.carrier_ghz))
-        self._keep = exp(-frame_s / config.shadowing_time_s)
-        self._renew = sqrt(1.0 - self._keep**2)
-        ids = range(n_drones)
-        self._shadow_streams = [stream(seed, replication, h, "shadowing") for h in ids]
-        self._fade_streams = [stream(seed, replication, h, "fading") for h in ids]
-        self._luck_streams = [stream(seed, replication, h, "group loss") for h in ids]
-        self._block = max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
-        # the block, [frames, N, N] each
+        self._frame_s = frame_s
+        self._keep = keep(frame_s, config.shadowing_time_s)
+        self._is_square = n_drones <= SQUARE
+        self._drawn = drawn = min(n_drones, SQUARE)
+        self._shadow_streams = [stream(seed, replication, h, "shadowing") for h in range(drawn)]
+        self._fade_streams = [stream(seed, replication, h, "fading") for h in range(drawn)]
+        self._luck_streams = [stream(seed, replication, h, "group loss") for h in range(drawn)]
+        self._block = max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones))) if self._is_square else EPOCH
+        self._drone_keys = drone_keys(seed, replication, 0 if self._is_square else n_drones)
+        self._earshot_m = earshot_m(config)
+        self._field: ShadowField | None = None
+        if config.shadowing_distance_m is not None:
+            self._field = ShadowField(
+                config.shadowing_sigma_db, config.shadowing_distance_m, config.shadowing_time_s, seed, replication
+            )
+        self.links = all_links(n_drones if self._is_square else 0)
+        self.now = self.before = FrameLinks(self.links, np.full(len(self.links.sender), np.nan))
+        # the block, [frames, L] each
         self._snr_db: FloatArray
-        self._shadow_db: FloatArray = np.zeros((1, n_drones, n_drones))
-        self._fades: FloatArray
+        self._fades_db: FloatArray
         self._luck: FloatArray
         self._reach_at_1: FloatArray
         self._reach_bytes: FloatArray
+        self._shadow_db: FloatArray
+        self._last_square_db: FloatArray | None = None  # where the shadowing of each pair stood at the block's end
+        self._last_keys: NDArray[np.int64] = np.empty(0, np.int64)
+        self._last_db: FloatArray = np.empty(0)
 
-    def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> FloatArray:
+    def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
 
         Args:
             extra_loss_db: [N, N], sender by receiver, added to the path loss; None is none.
             jammers: position (ENU, m) and power (dBm) of each; what a receiver gets of it adds to its noise.
-
-        Returns:
-            `snr_db`, [N, N].
 
         Raises:
             IndexError: the flight is over.
@@ -129,85 +187,167 @@ class Channel:
         row = self.frame % self._block
         if row == 0:
             self._refill()
-        self.shadow_db = self._shadow_db[row]
-        self.fade_db = self._fades[row]
-        self.snr_db, self.group_reach_bytes = self._snr_db[row], self._reach_bytes[row]
-        if extra_loss_db is None and not jammers:
-            return self.snr_db
-        snr: FloatArray = self.snr_db.copy()
-        if extra_loss_db is not None:
-            extra = np.asarray(extra_loss_db, dtype=float)
-            if extra.shape != snr.shape:
-                raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {snr.shape}")
-            snr -= extra
-        if jammers:
-            snr -= self._noise_rise_db(self._positions_m[self.frame], jammers)
-        faded_db = snr + self.fade_db
-        np.fill_diagonal(faded_db, 0.0)  # whose reach is not a number anyway
-        self.snr_db, self.group_reach_bytes = snr, self._reach(faded_db, self._reach_at_1[row])
-        return snr
+        links, snr = self.links, self._snr_db[row]
+        self.reach_bytes = self._reach_bytes[row]
+        if extra_loss_db is not None or jammers:
+            snr = snr.copy()
+            if extra_loss_db is not None:
+                extra = np.asarray(extra_loss_db, dtype=float)
+                if extra.shape != (self.n, self.n):
+                    raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {(self.n, self.n)}")
+                snr -= extra[links.sender, links.receiver]
+            if jammers:
+                snr -= self.noise_rise_db(jammers)[links.receiver]
+            self.reach_bytes = self._reach(snr + self._fades_db[row], self._reach_at_1[row])
+        self.before = self.now if self.frame else FrameLinks(links, snr)
+        self.now = FrameLinks(links, snr)
 
-    def reach_again(self, sender: int, times: int) -> FloatArray:
-        """`group_reach_bytes[sender]` for a further frame of the same sender within the frame: same fade, new luck.
+    @property
+    def snr_db(self) -> FloatArray:
+        """[N, N] of this frame; `OUT_OF_RANGE_DB` where a large fleet's link is out of earshot."""
+        return self.now.square_db
 
-        The luck is the frame's own shifted by multiples of the golden ratio, modulo 1.
+    @property
+    def fade_db(self) -> FloatArray:
+        """[N, N] of this frame."""
+        return self.links.square(self._fades_db[self.frame % self._block], np.nan)
+
+    @property
+    def shadow_db(self) -> FloatArray:
+        """[N, N] of this frame."""
+        return self.links.square(self._shadow_db[self.frame % self._block], np.nan)
+
+    @property
+    def group_reach_bytes(self) -> FloatArray:
+        """[N, N] of this frame."""
+        return self.links.square(self.reach_bytes, 0.0)
+
+    def heard(self, sender: int, length_bytes: int, times: int = 0) -> list[int]:
+        """Who receives a group-addressed frame, ascending.
+
+        Args:
+            sender: whose frame.
+            length_bytes: its length.
+            times: how many frames it has sent before in this frame of time: same fade, new luck. The luck is the
+                first frame's shifted by multiples of the golden ratio, modulo 1.
         """
-        luck = (self._luck[self.frame % self._block, sender] + times * 0.6180339887498949) % 1.0
-        faded_db = self.snr_db[sender] + self.fade_db[sender]
-        faded_db[sender] = 0.0
-        luck[sender] = np.nan
-        return self._reach(faded_db, _reach_at_1(luck))
+        a, b = self.links.begin[sender], self.links.begin[sender + 1]
+        reach = self.reach_bytes[a:b]
+        if times:
+            row = self.frame % self._block
+            luck = (self._luck[row, a:b] + times * 0.6180339887498949) % 1.0
+            reach = self._reach(self.now.snr_db[a:b] + self._fades_db[row, a:b], _reach_at_1(luck))
+        ids: list[int] = self.links.receiver[a:b][reach >= length_bytes].tolist()
+        return ids
 
     def _reach(self, faded_db: FloatArray, reach_at_1: FloatArray) -> FloatArray:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
         margin = faded_db + (self._group_gain_db - self._group_s50_db)
-        minus_log_s = np.logaddexp(0.0, -self._group_slope * margin)
+        minus_log_s = np.log1p(np.exp(np.minimum(-self._group_slope * margin, 700.0)))
         return np.asarray(reach_at_1 / np.maximum(minus_log_s, 1e-300))
 
-    def _noise_rise_db(self, positions_m: FloatArray, jammers: Sequence[Jammer]) -> FloatArray:
+    def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
-        c = self.config
+        p = self._positions_m[self.frame]
         total_mw = np.full(self.n, 10.0 ** (self.noise_dbm / 10.0))
-        for where, power_dbm in jammers:
-            d = np.sqrt(((positions_m - np.asarray(where, dtype=float)) ** 2).sum(axis=1))
-            total_mw += 10.0 ** ((power_dbm - path_loss_db(d, c.carrier_ghz, c.path_loss_exponent)) / 10.0)
+        for place, power_dbm in jammers:
+            where = np.asarray(place, dtype=float)
+            toward = p - where
+            d = np.sqrt((toward**2).sum(axis=1))
+            loss_db = path_loss_db(self.config, d, p[:, 2], np.full(self.n, where[2]))
+            if self.config.antenna != "isotropic":
+                up = np.array([0.0, 0.0, 1.0]) if self._up is None else self._up[self.frame]
+                cosine = (toward * up).sum(axis=1) / np.maximum(d, 1e-9)
+                loss_db = loss_db + antenna_loss_db(self.config.antenna, cosine)
+            total_mw += 10.0 ** ((power_dbm - loss_db) / 10.0)
         return np.asarray(10.0 * np.log10(total_mw) - self.noise_dbm)
 
+    # --- a block of frames ---------------------------------------------------------------------------
+
     def _refill(self) -> None:
-        b, n = self._block, self.n
-        shadow_z, x, y = (np.zeros((b, n, n)) for _ in range(3))
-        self._luck = np.zeros((b, n, n))
+        c, p = self.config, self._positions_m[self.frame : self.frame + self._block]
+        if not self._is_square:
+            self.links = links_in_range(p, self._earshot_m)
+        links = self.links
+        loss_db = self._loss_db(p)
+        self._draw(len(p))
+        self._reach_at_1 = _reach_at_1(self._luck)
+        if self._field is not None:
+            squares = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
+            self._shadow_db = np.stack(squares)[:, links.sender, links.receiver]
+        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
+        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._reach_at_1)
+
+    def _loss_db(self, p: FloatArray) -> FloatArray:
+        """[frames, L] of [frames, N, 3] positions: path and antennas."""
+        links, c = self.links, self.config
+        if self._is_square:
+            delta = p[:, :, None, :] - p[:, None, :, :]
+            distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
+        else:
+            delta = p[:, links.sender] - p[:, links.receiver]
+            distance = np.sqrt(np.einsum("tlk,tlk->tl", delta, delta))
+        heights = p[:, :, 2]
+        loss_db = path_loss_db(c, distance, heights[:, links.sender], heights[:, links.receiver])
+        if c.antenna != "isotropic":
+            along = delta.reshape(len(p), -1, 3) / np.maximum(distance, 1e-9)[..., None]
+            for end in (links.sender, links.receiver):
+                if self._up is None:
+                    cosine = along[..., 2]
+                else:
+                    up = self._up[self.frame : self.frame + self._block]
+                    cosine = np.einsum("tlk,tlk->tl", along, up[:, end])
+                loss_db = loss_db + antenna_loss_db(c.antenna, cosine)
+        return loss_db
+
+    def _draw(self, flown: int) -> None:
+        """Shadowing, fades and luck of the block, [flown, L]."""
+        b, n = self._block, self._drawn
+        shadow_z, x, y, luck = (np.zeros((b, n, n)) for _ in range(4))
         for h in range(1, n):
             z = self._shadow_streams[h].standard_normal((b, h))
             shadow_z[:, h, :h] = z
             shadow_z[:, :h, h] = z
             self._scatter(x, h, f := self._fade_streams[h].standard_normal((b, 2, 2, h)), 0)
             self._scatter(y, h, f, 1)
-            self._scatter(self._luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
-        self._luck[:, range(n), range(n)] = np.nan  # no drone hears itself
-        self._reach_at_1 = _reach_at_1(self._luck)
-        self._fades = 10.0 * np.log10(np.maximum(rician_gain(x, y, self.config.rician_k_db), 1e-12))
-        self._shadow_db = self._shadowing(shadow_z)
-        c, p = self.config, self._positions_m[self.frame : self.frame + b]
-        delta = p[:, :, None, :] - p[:, None, :, :]
-        distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta))
-        loss_db = self._loss_1m_db + 10.0 * c.path_loss_exponent * np.log10(np.maximum(distance, 1.0))
-        flown = len(p)
-        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db[:flown]
-        self._reach_bytes = self._reach(self._snr_db + self._fades[:flown], self._reach_at_1[:flown])
-        self._snr_db[:, range(n), range(n)] = np.nan
+            self._scatter(luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
+        luck[:, range(n), range(n)] = np.nan  # no drone hears itself
+        shadow_db = gauss_markov(shadow_z, self.config.shadowing_sigma_db, self._keep, self._last_square_db)
+        self._last_square_db = shadow_db[-1]
+        gain = rician_gain(x[:flown], y[:flown], self.config.rician_k_db)
+        if self._is_square:
+            self._luck = luck[:flown].reshape(flown, -1)
+            self._shadow_db = shadow_db[:flown].reshape(flown, -1)
+            self._fades_db = 10.0 * np.log10(np.maximum(gain.reshape(flown, -1), 1e-12))
+            return
+        self._count(flown)
+        early = np.flatnonzero((self.links.sender < n) & (self.links.receiver < n))
+        s, r = self.links.sender[early], self.links.receiver[early]
+        self._luck[:, early] = luck[:flown, s, r]
+        self._shadow_db[:, early] = shadow_db[:flown, s, r]
+        self._fades_db[:, early] = 10.0 * np.log10(np.maximum(gain[:, s, r], 1e-12))
 
-    def _shadowing(self, z: FloatArray) -> FloatArray:
-        """[frames, N, N] dB: the Gauss–Markov process goes on from the block before."""
-        sigma_db = self.config.shadowing_sigma_db
-        shadow_db, before = np.empty_like(z), self._shadow_db[-1]
-        for t, normals in enumerate(z):
-            if self.frame + t == 0:
-                before = sigma_db * normals
-            else:
-                before = self._keep * before + self._renew * sigma_db * normals
-            shadow_db[t] = before
-        return shadow_db
+    def _count(self, flown: int) -> None:
+        """The same for every link of a large fleet, by counter; those of the first drones are overwritten."""
+        links, keys = self.links, self._drone_keys
+        bits = numbers(link_keys(keys, links.sender, links.receiver, 1), self.frame, flown)
+        self._luck = uniforms(bits)
+        self._fades_db = fade_table_db(self.config.rician_k_db)[levels(bits)]
+        low = np.flatnonzero(links.sender < links.receiver)
+        s, r = links.sender[low], links.receiver[low]
+        z = normal_table()[levels(numbers(link_keys(keys, s, r, 2), self.frame, flown))]
+        pair = (r << 32) + s  # does not depend on how many drones there are
+        order = np.argsort(pair)
+        begin_db = np.full(len(pair), np.nan)  # a pair that has come into earshot begins anew
+        if len(self._last_keys):
+            at = np.minimum(np.searchsorted(self._last_keys, pair), len(self._last_keys) - 1)
+            known = self._last_keys[at] == pair
+            begin_db[known] = self._last_db[at[known]]
+        shadow_db = gauss_markov(z, self.config.shadowing_sigma_db, self._keep, begin_db)
+        self._last_keys, self._last_db = pair[order], shadow_db[-1, order]
+        self._shadow_db = np.empty((flown, len(links.sender)))
+        self._shadow_db[:, low] = shadow_db
+        self._shadow_db[:, links.back[low]] = shadow_db
 
     @staticmethod
     def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:

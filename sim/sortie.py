@@ -16,13 +16,14 @@ import simpy
 from fleet.agent import Agent, PlaneRules
 from fleet.auth import Sealer
 from fleet.battery import FleetBatteries
+from fleet.frames import up_vector
 from fleet.motion import fly
 from fleet.traces import follow, read_traces
 from perception.detectors import DetectsMany, make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
-from policies.registry import resolve
+from policies.registry import handshake_bytes, resolve
 from radio import Air
 from scenarios.schema import Scenario
 from scenarios.streams import stream
@@ -86,6 +87,7 @@ def run_sortie(
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
     name, decide = _policy(scenario, policy)
+    before_payloads = handshake_bytes(name, scenario.policy.params if name == scenario.policy.name else None)
     n, config = scenario.fleet.drones, scenario.perception
     env, recorder = simpy.Environment(), Recorder()
 
@@ -94,7 +96,15 @@ def run_sortie(
     motion = follow(motion, traces, scenario.frame_s)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
     batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n, charges)
-    air = Air(env, scenario.radio, motion.position_m, seed=seed, replication=replication, frame_s=scenario.frame_s)
+    air = Air(
+        env,
+        scenario.radio,
+        motion.position_m,
+        seed=seed,
+        replication=replication,
+        frame_s=scenario.frame_s,
+        up=up_vector(motion.orientation_xyzw),
+    )
     scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
     plan = MissionPlan(scenario.mission)
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
@@ -126,6 +136,7 @@ def run_sortie(
             log=notes,
             sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
             phase_s=PHASE_SHARE * scenario.frame_s * stream(seed, replication, i, "phase").random(),
+            handshake_bytes=before_payloads,
         )
         for i in range(n)
     ]

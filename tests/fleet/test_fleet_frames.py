@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fleet.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, to_xyzw, yaw_rad
+from fleet.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, to_xyzw, up_vector, yaw_rad
 
 HALF = np.sqrt(0.5)
 quaternions = (
@@ -52,6 +52,11 @@ def test_a_body_vector_lands_at_the_same_place_in_the_world(q: np.ndarray, v: np
     through_enu = swap_enu_ned(Rotation.from_quat(q).apply(v))
     through_frd = Rotation.from_quat(swap_attitude(q)).apply(swap_flu_frd(v))
     np.testing.assert_allclose(through_frd, through_enu, atol=1e-9)
+
+
+@given(quaternions)
+def test_up_is_where_the_bodys_z_axis_points(q: np.ndarray) -> None:
+    np.testing.assert_allclose(up_vector(q), Rotation.from_quat(q).apply([0, 0, 1]), atol=1e-9)
 
 
 @given(quaternions)

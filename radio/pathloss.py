@@ -1,0 +1,80 @@
+"""Path loss between two positions: free space, log-distance, and two rays over the ground."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scenarios.schema import Radio
+
+FloatArray = NDArray[np.float64]
+
+LIGHT_MPS = 299_792_458.0
+GROUND_PERMITTIVITY = 15.0
+"""Relative permittivity of medium dry ground near 5 GHz, losses left out (ITU-R P.527)."""
+
+
+def free_space_loss_db(distance_m: ArrayLike, carrier_ghz: float) -> FloatArray:
+    """Friis: 20 log10(4π d f / c), dB."""
+    return np.asarray(20.0 * np.log10(4.0 * pi * np.asarray(distance_m, dtype=float) * carrier_ghz * 1e9 / LIGHT_MPS))
+
+
+def log_distance_loss_db(distance_m: ArrayLike, carrier_ghz: float, exponent: float) -> FloatArray:
+    """Free space at 1 m, then 10 · exponent · log10(d), dB; nearer than 1 m counts as 1 m."""
+    d = np.maximum(np.asarray(distance_m, dtype=float), 1.0)
+    return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) + 10.0 * exponent * np.log10(d))
+
+
+def two_ray_loss_db(
+    distance_m: ArrayLike,
+    height_a_m: ArrayLike,
+    height_b_m: ArrayLike,
+    carrier_ghz: float,
+    roughness_m: float = 0.0,
+    permittivity: float = GROUND_PERMITTIVITY,
+) -> FloatArray:
+    """The direct ray and the one that flat ground reflects, added with their phases, dB.
+
+    The reflected ray is weakened by the Fresnel coefficient of vertical polarisation and by Ament's factor
+    exp(−2 (k s sin ψ)²) of ground whose height has the standard deviation s: seen steeply, rough ground scatters,
+    and free space is left; at grazing angles it is a mirror of coefficient −1, and beyond the break point
+    4 h_a h_b / λ the loss grows by 40 dB a decade. (Rappaport, Wireless Communications, §4.6; W. S. Ament,
+    Proc. IRE 41, 1953.)
+
+    Args:
+        distance_m: along the direct ray; nearer than 1 m counts as 1 m.
+        height_a_m, height_b_m: over the ground; below it counts as on it.
+        carrier_ghz: carrier frequency.
+        roughness_m: standard deviation s of the ground's height.
+        permittivity: relative, of the ground.
+    """
+    d = np.maximum(np.asarray(distance_m, dtype=float), 1.0)
+    a, b = (np.maximum(np.asarray(h, dtype=float), 0.0) for h in (height_a_m, height_b_m))
+    k = 2.0 * pi * carrier_ghz * 1e9 / LIGHT_MPS
+    reflected = np.sqrt(d**2 + 4.0 * a * b)
+    sine = np.minimum((a + b) / reflected, 1.0)
+    refracted = np.sqrt(permittivity - 1.0 + sine**2)
+    mirror = (permittivity * sine - refracted) / (permittivity * sine + refracted)
+    mirror = mirror * np.exp(-2.0 * (k * roughness_m * sine) ** 2)
+    # the difference of the two ways, written so that it keeps its digits at grazing angles
+    longer = 4.0 * a * b / (reflected + d)
+    power = (1.0 / d + mirror * np.cos(k * longer) / reflected) ** 2 + (mirror * np.sin(k * longer) / reflected) ** 2
+    return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) - 10.0 * np.log10(np.maximum(power, 1e-30)))
+
+
+def path_loss_db(config: Radio, distance_m: FloatArray, height_a_m: FloatArray, height_b_m: FloatArray) -> FloatArray:
+    """The path loss that a scenario asks for, dB; arguments as for `two_ray_loss_db`."""
+    if config.path_loss == "two_ray":
+        return two_ray_loss_db(distance_m, height_a_m, height_b_m, config.carrier_ghz, config.ground_roughness_m)
+    exponent = 2.0 if config.path_loss == "free_space" else config.path_loss_exponent
+    return log_distance_loss_db(distance_m, config.carrier_ghz, exponent)
+
+
+def range_m(config: Radio, loss_db: float) -> float:
+    """The distance beyond which the loss exceeds `loss_db` for certain (two rays can add up to 6 dB of gain)."""
+    exponent = config.path_loss_exponent if config.path_loss == "log_distance" else 2.0
+    gain_db = 6.1 if config.path_loss == "two_ray" else 0.0
+    beyond_1m_db = loss_db + gain_db - float(free_space_loss_db(1.0, config.carrier_ghz))
+    return float(10.0 ** (max(0.0, beyond_1m_db) / (10.0 * exponent)))
