@@ -59,7 +59,7 @@ class Playback:
         self._disc_t_s = np.concatenate([self._disc_t_s[-1:], mission["t_s"].to_numpy()])
         self._discs = np.concatenate([self._discs[-1:], discs])
         seen = list(sightings(new, self._disc_t_s, self._discs))
-        self._scene.add(new, seen)
+        self._scene.add(known_s, new, seen)
         self._charts.add(known_s, new, seen)
 
 

@@ -22,7 +22,7 @@ DRONE_COLOURS: tuple[Rgba, ...] = (
     (222, 206, 92, 255), (150, 190, 230, 255), (226, 142, 110, 255), (170, 210, 120, 255), (190, 170, 160, 255),
 )  # fmt: skip
 FOUND, MISSED, FALSE = (70, 220, 90, 255), (255, 200, 40, 255), (255, 60, 60, 255)
-IDLE, FALLEN = (150, 155, 165, 90), (120, 120, 120, 255)
+IDLE, FALLEN, BROKEN = (150, 155, 165, 90), (120, 120, 120, 255), (255, 40, 60, 255)
 WARNING = (255, 225, 90, 255)
 MISSION, TARGET = (255, 80, 220, 255), (255, 40, 60, 255)
 SENT: dict[str, Rgba] = {
@@ -30,6 +30,7 @@ SENT: dict[str, Rgba] = {
     "detections": (250, 180, 60, 255),
     "tracks": (120, 170, 255, 255),
     "raw": (230, 110, 230, 255),
+    "handshake": (200, 200, 140, 255),
     "nothing": (95, 98, 105, 255),
 }
 PHASES: dict[str, Rgba] = {
@@ -51,6 +52,18 @@ def goodput_colours(mbps: Floats) -> NDArray[np.uint8]:
     red, green = np.clip(2.0 - 2.0 * level, 0.0, 1.0), np.clip(2.0 * level, 0.0, 1.0)
     colour = np.stack([50 + 205 * red, 45 + 185 * green, np.full_like(red, 60), np.full_like(red, 255)], axis=-1)
     return colour.astype(np.uint8)
+
+
+def packed(rgba: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Colours [n, 4] as 0xRRGGBBAA [n], which columns partition without guessing."""
+    r, g, b, a = (rgba[:, k].astype(np.uint32) for k in range(4))
+    return np.asarray(r << 24 | g << 16 | b << 8 | a, np.uint32)
+
+
+def about_z(yaw_rad: Floats) -> Floats:
+    """Quaternions x, y, z, w [n, 4] of turns about the vertical."""
+    zero = np.zeros(len(yaw_rad))
+    return np.column_stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)])
 
 
 class Canvas:

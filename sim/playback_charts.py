@@ -23,6 +23,9 @@ from sim.playback_canvas import Canvas, Floats, line
 from sim.sightings import Sighting
 
 AP_WINDOW_S = 5.0
+MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")
+"""Plots in which phase changes and events are marked."""
+EVENT_LANE: c.Rgba = (150, 108, 20, 255)
 RUNGS = ("nothing", "tracks", "detections", "features", "raw")
 FATES: dict[str, c.Rgba] = {"expired": (255, 120, 60, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
@@ -43,6 +46,7 @@ class Charts:
         self._lanes: dict[int, str] = {}
         self._lane_colours: dict[int, dict[str, c.Rgba]] = defaultdict(dict)
         self._phase = ""
+        self._event_texts: list[str] = []
 
     def begin(self) -> None:
         """Name and colour every plot line that is known beforehand."""
@@ -57,6 +61,11 @@ class Charts:
         canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
         canvas.static("plots/age/p99_ms", line("descriptor age p99, ms", (190, 190, 200, 255)))
         canvas.static("plots/medium/busy_percent", line("channel busy, %", (240, 150, 80, 255)))
+        for folder in MARKED:
+            canvas.static(f"plots/{folder}/marks/event", _mark("event", c.WARNING, rr.components.MarkerShape.Up))
+            canvas.static(
+                f"plots/{folder}/marks/phase", _mark("phase change", c.MISSION, rr.components.MarkerShape.Diamond)
+            )
 
     def add(self, known_s: float, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
         """Plot new rows; everything before `known_s` is in by now."""
@@ -165,6 +174,8 @@ class Charts:
     def _phases(self, mission: pa.Table) -> None:
         for t_s, phase in zip(mission["t_s"].to_pylist(), mission["phase"].to_pylist(), strict=True):
             if phase != self._phase:
+                if self._phase:
+                    self._marks("phase", [t_s])
                 self._phase = phase
                 self._state("lanes/phase", t_s, phase)
 
@@ -203,14 +214,29 @@ class Charts:
         if rows:
             texts = [f"{'fleet' if r['drone'] < 0 else 'drone ' + str(r['drone'])}: {r['text']}" for r in rows]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[c.WARNING] * len(rows))
-            self._canvas.columns("log/events", np.array([r["t_s"] for r in rows]), columns)
+            t_s = [r["t_s"] for r in rows]
+            self._canvas.columns("log/events", np.array(t_s), columns)
+            self._marks("event", t_s)
+            self._event_texts += [text for text in dict.fromkeys(texts) if text not in self._event_texts]
+            colours = [EVENT_LANE] * len(self._event_texts)
+            self._canvas.static("lanes/events", rr.StateConfiguration(values=self._event_texts, colors=colours))
+            self._canvas.columns("lanes/events", np.array(t_s), rr.StateChange.columns(state=texts))
+
+    def _marks(self, kind: str, t_s: list[float]) -> None:
+        """Mark moments on the floor of the plots."""
+        for folder in MARKED:
+            self._canvas.scalars(f"plots/{folder}/marks/{kind}", np.array(t_s), np.zeros(len(t_s)))
 
 
 def in_words(change: dict[str, Any]) -> str:
-    """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz (goodput 3.1 < 5 Mb/s)`."""
+    """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz, because goodput 3.1 < 5 Mb/s`."""
     peers = ", ".join(str(p) for p in change["peers"])
-    why = f" ({change['reason']})" if change["reason"] else ""
+    why = f", because {change['reason']}" if change["reason"] else ""
     return f"drone {change['drone']} → {peers}: {change['to']}{why}"
+
+
+def _mark(name: str, colour: c.Rgba, shape: rr.components.MarkerShape) -> rr.SeriesPoints:
+    return rr.SeriesPoints(colors=[colour], markers=[shape], names=[name], marker_sizes=[4.0])
 
 
 def _level_colour(level: str) -> c.Rgba:

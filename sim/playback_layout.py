@@ -14,8 +14,9 @@ from scenarios.schema import Scenario
 from sim.playback_canvas import SIM_TIME, SPAN_M
 
 SEEN = """
-**Boxes**: what drone {ego} makes of the scene from its own view and what it was sent: green, a car found;
-yellow, missed; red, a false alarm; the darker, the less sure. The other drones' boxes can be switched on under `world/seen`.
+**Boxes**: what drone {ego} makes of the scene: green, a car found; yellow, missed; red, a false alarm; the darker,
+the less sure. **Hatching**: cells of feature maps that peers sent to drone {ego} in the last second, in the peer's
+colour; a thin **square**: a whole map. Other drones' are under `world/seen` and `world/received`.
 """
 
 EGO = 0
@@ -24,11 +25,12 @@ MAX_LANES = 8
 """Lanes of more drones than this would push the plots out."""
 
 LEGEND = """
-Each drone has one colour, here and in the plots; its label is its number and its charge, and the **ring** on the
-ground what its camera sees straight below. Drones are drawn {span:.0f} m wide.
+Each drone has one colour, here and in the plots; its label is its number and charge, the **ring** on the ground
+what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission disc.
 
 **Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
-red 1 or less; grey: nothing is sent. The **pink ring** is the mission disc around the target.
+red 1 or less; grey: nothing is sent; a **red cross**: all but gone. **Marks** on the plots' floors: yellow, something
+happened to the fleet; pink, the phase changed.
 {seen}
 """
 
@@ -40,7 +42,10 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     reach_m = float(np.abs(offsets).max()) + footprint_radius_m(altitude_m)
     accuracy = scenario.perception.detector != "none"
     hidden: dict[str | rr.encodings.EntityPath, Any] = {
-        f"world/seen/{i}": rrb.EntityBehavior(visible=False) for i in range(n) if i != EGO
+        f"world/{what}/{i}": rrb.EntityBehavior(visible=False)
+        for what in ("seen", "received")
+        for i in range(n)
+        if i != EGO
     }
     scene = rrb.Spatial3DView(
         name="the fleet over the town",
@@ -65,7 +70,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     )
     legend = rrb.TextDocumentView(name="how to read this", contents=["/about"])
     n_lanes = min(n, MAX_LANES)
-    lanes = ["/lanes/phase", *(f"/lanes/drone_{i}" for i in range(n_lanes))]
+    lanes = ["/lanes/events", "/lanes/phase", *(f"/lanes/drone_{i}" for i in range(n_lanes))]
     axis = rrb.TimeAxis(
         link="Independent",
         view_range=rrb.TimeRange(
@@ -86,7 +91,9 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         )
 
     plots: list[rrb.View | rrb.Container] = [
-        rrb.StateTimelineView(name="phase, and what each drone sends on its best link", contents=lanes, time_view=axis),
+        rrb.StateTimelineView(
+            name="events, phase, and what each drone sends on its best link", contents=lanes, time_view=axis
+        ),
         plot("battery, %", "battery", legend=False),
         plot("goodput, mean of a drone's links, Mb/s", "goodput", legend=False),
         plot("traffic by representation and fate, Mb/s", "traffic"),
@@ -99,9 +106,9 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     if accuracy:
         plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
         shares.insert(0, 1.2)
-    lanes_height = 0.05 + 0.042 * (n_lanes + 1)  # part of the window that shows every lane
+    lanes_height = 0.05 + 0.042 * (n_lanes + 2)  # part of the window that shows every lane
     shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
-    left = rrb.Vertical(scene, rrb.Horizontal(log, legend, column_shares=[3, 2]), row_shares=[3, 1])
+    left = rrb.Vertical(scene, rrb.Horizontal(log, legend, column_shares=[1, 1]), row_shares=[3, 1])
     return rrb.Blueprint(
         rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2]),
         rrb.BlueprintPanel(state="hidden"),

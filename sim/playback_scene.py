@@ -1,8 +1,9 @@
 """The 3-D scene of a playback: the town, its cars, the drones and their links, and what an ego saw.
 
 World frame ENU, metres; radii are metres where positive and widths on the screen where negative (Rerun's own sign). Everything takes tables, so that the whole record and one second of it are drawn alike;
-what a slice needs from before it (trails, goodput, recent bytes) is kept here. A row at time t shows what was
-known before t, which is why slices of whole seconds draw the same as the whole.
+what a slice needs from before it (trails, goodput, recent bytes) is kept. A row at time t shows what was
+known before t, which is why slices of whole seconds draw the same as the whole. Links are in `sim.playback_links`,
+the cells that peers sent in `sim.playback_received`.
 """
 
 from __future__ import annotations
@@ -23,14 +24,13 @@ from perception.types import Boxes
 from scenarios.schema import Scenario
 from sim import playback_canvas as c
 from sim.playback_canvas import SPAN_M, Canvas, Floats
+from sim.playback_links import Links
+from sim.playback_received import Received
 from sim.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
-RECENT_S = 1.0
 CARS_WITHIN_M = 160.0
 """Moving cars are drawn up to this far from the middle of the fleet."""
-MANY_DRONES = 8
-"""In fleets above this, links that carry nothing are left out."""
 GROUND_M = 1.0
 BOX_HEIGHT_M = 1.8
 CIRCLE = np.array([(np.cos(a), np.sin(a), 0.0) for a in np.linspace(0, 2 * np.pi, 49)])
@@ -43,13 +43,10 @@ class Drawing:
         self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
         self._rate_hz, self._has_target = scenario.context.rate_hz, scenario.mission.target is not None
         n = self._n
-        pairs = np.argwhere(~np.eye(n, dtype=bool))
-        self._senders, self._receivers = pairs[:, 0], pairs[:, 1]
+        self._links, self._received = Links(canvas, n, scenario.context.rate_hz), Received(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
         self._frames = 0
         self._resting: dict[int, Floats] = {}
-        self._goodput: Floats = np.zeros((n, n))
-        self._recent: Floats = np.zeros((0, 3))
         self._disc_shown = False
 
     # --- what holds at all times -----------------------------------------------------------------
@@ -67,6 +64,8 @@ class Drawing:
             canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
             for name, width in (("found", 2.0), ("missed", 1.5), ("false", 1.5)):
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
+        self._links.begin()
+        self._received.begin()
         canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
         disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
         canvas.static("world/mission/disc", disc)
@@ -116,8 +115,8 @@ class Drawing:
 
     # --- what changes ----------------------------------------------------------------------------
 
-    def add(self, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
-        """Draw new rows: `states`, `mission`, `descriptors`, `transmissions`, and the fusions seen."""
+    def add(self, known_s: float, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
+        """Draw new rows: `states`, `mission`, `descriptors`, `directives`, `transmissions`, and the fusions seen."""
         n = self._n
         column = {k: new["states"][k].to_numpy() for k in new["states"].column_names}
         t_s = column["t_s"][::n]
@@ -126,7 +125,8 @@ class Drawing:
         airborne = column["airborne"].reshape(-1, n)
         self._land(t_s, position, attitude, airborne)
         self._drones(t_s, position, attitude, column["soc"].reshape(-1, n), airborne)
-        self._links(t_s, position, airborne, new)
+        self._links.add(t_s, position, airborne, new)
+        self._received.add(known_s, t_s, position, attitude, new)
         self._cars(t_s, position)
         self._mission(new["mission"])
         self._seen(list(seen))
@@ -180,66 +180,6 @@ class Drawing:
         self._frames += len(t_s)
         self._history = track[-(step * beads + 1) :]
 
-    def _links(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], new: Mapping[str, pa.Table]) -> None:
-        """Links as arrows, their colour the sender's goodput, their width the traffic of the last second."""
-        if self._n < 2:
-            return
-        goodput = self._goodput_at(t_s, new["descriptors"])
-        mbps = self._recent_mbps(t_s, new["transmissions"])
-        i, j = self._senders, self._receivers
-        begin, end = position[:, i], position[:, j]
-        way = end - begin
-        length = np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
-        ahead = way / length
-        right = np.cross(ahead, (0.0, 0.0, 1.0))
-        # Both directions of a link side by side, as lanes, and clear of the drones.
-        begin = begin + 0.9 * right + np.minimum(SPAN_M * 0.7, 0.2 * length) * ahead
-        end = end + 0.9 * right - np.minimum(SPAN_M * 0.7, 0.2 * length) * ahead
-        busy = mbps[:, i, j] > 0
-        shown = airborne[:, i] & airborne[:, j]
-        if self._n > MANY_DRONES:
-            shown = shown & busy
-        colours = np.where(busy[..., None], c.goodput_colours(goodput[:, i, j]), np.array(c.IDLE, np.uint8))
-        width = np.where(busy, 1.5 + 1.0 * np.log2(1.0 + mbps[:, i, j]), 0.75)
-        links = rr.Arrows3D.columns(
-            origins=begin[shown], vectors=(end - begin)[shown], colors=_packed(colours[shown]), radii=-width[shown]
-        )
-        self._canvas.columns("world/links", t_s, links.partition(shown.sum(axis=1)))
-
-    def _goodput_at(self, t_s: Floats, descriptors: pa.Table) -> Floats:
-        """Goodput [frame, sender, receiver] in each sender's latest descriptor before the frame, Mb/s."""
-        n = self._n
-        out = np.zeros((len(t_s), n, n))
-        sent_s, sender = descriptors["t_s"].to_numpy(), descriptors["drone"].to_numpy()
-        values = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, n - 1))
-        for i in range(n):
-            mine = sender == i
-            peers = [k for k in range(n) if k != i]
-            known = np.concatenate([self._goodput[i, peers][None], values[mine]])
-            out[:, i, peers] = known[np.searchsorted(sent_s[mine], t_s, side="left")]
-            self._goodput[i, peers] = known[-1]
-        return out
-
-    def _recent_mbps(self, t_s: Floats, transmissions: pa.Table) -> Floats:
-        """Traffic [frame, sender, receiver] handed to the radio and settled in the second before the frame, Mb/s."""
-        n, window = self._n, max(1, round(RECENT_S * self._rate_hz))
-        names = ("t_done_s", "drone", "peer", "payload_bytes")
-        rows = np.column_stack([transmissions[k].to_numpy().astype(float) for k in names])
-        rows = rows[~np.isnan(rows[:, 0])]
-        rows = np.concatenate([self._recent.reshape(-1, 4), rows])
-        out = np.zeros((len(t_s), n, n))
-        if len(t_s) == 0:
-            self._recent = rows
-            return out
-        first = self._frames - len(t_s) - window
-        frame = np.floor(rows[:, 0] * self._rate_hz + 1e-6).astype(int) - first
-        bins = np.zeros((len(t_s) + window, n, n))
-        now = (frame >= 0) & (frame < len(bins))
-        np.add.at(bins, (frame[now], rows[now, 1].astype(int), rows[now, 2].astype(int)), rows[now, 3])
-        total = np.cumsum(np.concatenate([np.zeros((1, n, n)), bins]), axis=0)
-        self._recent = rows[frame >= len(t_s)]
-        return np.asarray((total[window:-1] - total[: len(t_s)]) * 8e-6 / RECENT_S)
-
     def _cars(self, t_s: Floats, position: Floats) -> None:
         near, lengths = [], []
         for t, (x, y) in zip(t_s.tolist(), position[..., :2].mean(axis=1).tolist(), strict=True):
@@ -291,7 +231,7 @@ class Drawing:
             boxes = Boxes.join(several)
             light = 0.25 + 0.75 * np.clip(boxes.score, 0.0, 1.0)[:, None]
             shades = np.column_stack([light * np.array(colour[:3]), np.full(len(boxes), 255)]).astype(np.uint8)
-            columns = rr.Boxes3D.columns(**_flat_boxes(boxes), colors=_packed(shades))
+            columns = rr.Boxes3D.columns(**_flat_boxes(boxes), colors=c.packed(shades))
             self._canvas.columns(f"world/seen/{drone}/{name}", t_s, columns.partition([len(b) for b in several]))
 
 
@@ -343,8 +283,8 @@ def _car_boxes(cars: Cars) -> dict[str, Any]:
     return {
         "centers": np.column_stack([cars.x_m, cars.y_m, half[:, 2]]),
         "half_sizes": half,
-        "quaternions": _about_z(cars.yaw_rad),
-        "colors": _packed(np.column_stack([cars.colour, np.full(len(cars), 255, np.uint8)])),
+        "quaternions": c.about_z(cars.yaw_rad),
+        "colors": c.packed(np.column_stack([cars.colour, np.full(len(cars), 255, np.uint8)])),
     }
 
 
@@ -353,19 +293,8 @@ def _flat_boxes(boxes: Boxes) -> dict[str, Any]:
     return {
         "centers": np.column_stack([boxes.xy_m, half[:, 2]]),
         "half_sizes": half,
-        "quaternions": _about_z(boxes.yaw_rad),
+        "quaternions": c.about_z(boxes.yaw_rad),
     }
-
-
-def _about_z(yaw_rad: np.ndarray) -> Floats:
-    zero = np.zeros(len(yaw_rad))
-    return np.column_stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)])
-
-
-def _packed(rgba: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Colours [n, 4] as 0xRRGGBBAA [n], which columns partition without guessing."""
-    r, g, b, a = (rgba[:, k].astype(np.uint32) for k in range(4))
-    return np.asarray(r << 24 | g << 16 | b << 8 | a, np.uint32)
 
 
 def _inside(xy: Floats, rect: tuple[float, float, float, float]) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 from sim_examples import example
 
+from perception.budget import CELL_M
 from scenarios.schema import Scenario
 from sim import playback
 from sim.folders import RunError
@@ -24,6 +25,7 @@ from sim.outcome import accuracy, matched, outcome, transitions
 from sim.playback import LiveViewer, open_viewer, save_rrd, scene_of, to_file
 from sim.playback_canvas import goodput_colours
 from sim.playback_charts import in_words
+from sim.playback_received import hatch
 from sim.record import TABLES, SortieRecord
 from sim.sortie import run_sortie
 
@@ -174,10 +176,10 @@ def test_every_entity_that_the_layout_shows_is_there(rows: Rows, record: SortieR
     expected |= {f"/world/seen/{i}/{kind}" for i in range(n) for kind in ("found", "missed", "false")}
     expected |= {f"/lanes/drone_{i}" for i in range(n)}
     expected |= {
-        "/about", "/lanes/phase", "/log/decisions", "/log/events", "/plots/age/p99_ms", "/plots/ap/full_scene",
+        "/about", "/lanes/events", "/lanes/phase", "/log/decisions", "/log/events", "/plots/age/p99_ms", "/plots/ap/full_scene",
         "/plots/ap/mission", "/plots/medium/busy_percent", "/plots/traffic/features_delivered", "/world/cars/moving",
         "/world/cars/parked", "/world/fleet", "/world/links", "/world/mission", "/world/mission/disc", "/world/target",
-        "/world/town/buildings", "/world/town/ground", "/world/town/trees",
+        "/world/broken", "/world/town/buildings", "/world/town/ground", "/world/town/trees",
     }  # fmt: skip
     assert expected <= set(rows)
 
@@ -253,6 +255,85 @@ def test_a_link_is_as_wide_as_its_traffic_and_as_green_as_its_goodput(rows: Rows
             assert colour == r << 24 | g << 16 | b << 8 | a
         else:
             assert radius == -0.75
+
+
+def test_a_link_that_is_all_but_gone_is_crossed_out(rows: Rows, record: SortieRecord) -> None:
+    n, descriptors = record.scenario.fleet.drones, record.tables["descriptors"].to_pylist()
+    drawn = {frame: strips for _, frame, strips in rows["/world/broken"]["LineStrips3D:strips"]}
+    assert min(drawn) > 40  # the links of drone 2 drop at 4 s
+    for frame in (45, 55, 70):
+        before = [d for d in descriptors if d["t_s"] < frame / 10.0]
+        expected = set()
+        for i, j in ((i, j) for i in range(n) for j in range(n) if i != j):
+            known = [d["goodput_mbps"][j - (j > i)] for d in before if d["drone"] == i]
+            if any(known) and known[-1] < 1.0 and not (frame > 60 and 3 in (i, j)):
+                expected.add(frozenset((i, j)))
+        assert expected, frame
+        assert len(drawn[frame]) == 4 * len(expected)  # four diagonals each
+        places = [s for s in record.tables["states"].to_pylist() if round(s["t_s"] * 10) == frame]
+        middles = {
+            tuple(np.round(np.mean([[places[k][c] for c in ("x_m", "y_m", "z_m")] for k in pair], axis=0), 3).tolist())
+            for pair in expected
+        }
+        assert {tuple(np.round(np.mean(strip, axis=0), 3).tolist()) for strip in drawn[frame]} == middles
+
+
+def test_what_peers_sent_is_hatched_cell_by_cell(rows: Rows, record: SortieRecord) -> None:
+    """As many cells as the payload carried, all of them in its region, in the sender's grid; wiped out a second later."""
+    sent = record.tables["transmissions"].to_pylist()
+    regions = record.tables["directives"].to_pylist()
+    checked = 0
+    for ego, peer in ((0, 1), (1, 0), (3, 4)):
+        drawn = rows[f"/world/received/{ego}/{peer}/cells"]
+        shapes = zip(*(drawn.get(f"Boxes3D:{k}", []) for k in ("centers", "half_sizes")), strict=True)
+        for (t_s, _, centres), (_, _, halves) in shapes:
+            came = [
+                t for t in sent
+                if (t["drone"], t["peer"], t["representation"], t["status"]) == (peer, ego, "features", "delivered")
+                and t_s - 1.0 <= t["t_done_s"] < t_s
+            ]  # fmt: skip
+            if not centres:
+                assert not came or max(came, key=lambda t: t["t_done_s"])["captured_s"] < 3.0
+                continue
+            last = max(came, key=lambda t: t["t_done_s"])
+            cells = sum(round(2 * half[1] / CELL_M) for half in halves)
+            assert abs(cells - last["cells"]) <= 12  # the sender reckoned with its own estimate of where it was
+            disc = [
+                d for d in regions if (d["drone"], d["peer"]) == (peer, ego) and d["t_s"] <= last["t_sent_s"]
+            ][-1]  # fmt: skip
+            away = [math.hypot(c[0] - disc["roi_x_m"], c[1] - disc["roi_y_m"]) for c in centres]
+            assert max(away) <= disc["roi_radius_m"] + CELL_M
+            checked += 1
+    assert checked >= 5
+    whole = rows["/world/received/0/1/whole_map"]["LineStrips3D:strips"]
+    assert whole
+    assert {len(v) for _, _, v in whole} <= {0, 1}
+
+
+def test_a_hatch_covers_exactly_the_cells_of_the_region() -> None:
+    """Against every cell's centre, turned and moved by hand; a turned sender's runs lie along its own left."""
+    pose, region = (10.0, -20.0, 0.7), (25.0, -10.0, 32.0)
+    runs = hatch(region, pose, 1)
+    centres = (np.arange(64) - 31.5) * CELL_M
+    forward, left = np.meshgrid(centres, centres, indexing="ij")
+    x = pose[0] + math.cos(0.7) * forward - math.sin(0.7) * left
+    y = pose[1] + math.sin(0.7) * forward + math.cos(0.7) * left
+    inside = np.hypot(x - region[0], y - region[1]) <= 32.0
+    assert runs[:, 4].sum() == inside.sum() == pytest.approx(math.pi * 32.0**2 / CELL_M**2, rel=0.03)
+    assert (runs[:, 2] * 2 / CELL_M).tolist() == pytest.approx(inside.sum(axis=1)[inside.any(axis=1)].tolist())
+    middle = [float(np.mean(left[i][inside[i]])) for i in np.flatnonzero(inside.any(axis=1))]
+    own = -math.sin(0.7) * (runs[:, 0] - pose[0]) + math.cos(0.7) * (runs[:, 1] - pose[1])
+    assert own.tolist() == pytest.approx(middle, abs=1e-9)
+
+
+def test_events_and_phase_changes_are_marked_on_the_plots(rows: Rows) -> None:
+    for plot in ("ap", "battery", "goodput", "traffic", "age", "medium"):
+        assert series(rows, f"/plots/{plot}/marks/event") == [(4.0, 0.0), (6.0, 0.0)]
+        assert series(rows, f"/plots/{plot}/marks/phase") == [(3.0, 0.0)]
+    assert [(t_s, v) for t_s, _, v in rows["/lanes/events"]["StateChange:state"]] == [
+        (4.0, ["drone 2: links of 2 lose 60 dB"]),
+        (6.0, ["drone 3: fell silent"]),
+    ]
 
 
 def test_links_of_a_lost_drone_are_gone(rows: Rows) -> None:
@@ -350,7 +431,7 @@ def test_the_log_has_one_line_a_transition_in_words(rows: Rows, record: SortieRe
 
 def test_a_transition_in_words() -> None:
     change = {"drone": 2, "peers": [1, 4], "to": "detections at 2 Hz", "reason": "goodput 3.1 < 5 Mb/s"}
-    assert in_words(change) == "drone 2 → 1, 4: detections at 2 Hz (goodput 3.1 < 5 Mb/s)"
+    assert in_words(change) == "drone 2 → 1, 4: detections at 2 Hz, because goodput 3.1 < 5 Mb/s"
     assert in_words({**change, "peers": [1], "to": "nothing", "reason": ""}) == "drone 2 → 1: nothing"
 
 
@@ -431,7 +512,7 @@ def test_saving_changes_nothing_and_says_nothing(
 def test_small_and_large_fleets_are_drawn(drones: int, tmp_path: Path) -> None:
     save_rrd(run_sortie(example("duration_s=2.5", f"fleet.drones={drones}")), tmp_path / "sortie.rrd")
     drawn = read(tmp_path / "sortie.rrd")
-    assert sum(e.startswith("/plots/battery/") for e in drawn) == drones
+    assert sum(e.startswith("/plots/battery/") and "marks" not in e for e in drawn) == drones
     if drones == 1:
         assert "/world/links" not in drawn
     else:  # idle links of a large fleet are left out
