@@ -75,6 +75,7 @@ class Modem(Protocol):
 
     def broadcast(self, datagram: bytes) -> None: ...
     def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None: ...
+    def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None: ...
     def goodput_mbps(self) -> tuple[float, ...]: ...
 
 
@@ -111,8 +112,12 @@ class Agent:
         log: AgentLog,
         sealer: Sealer | None,
         phase_s: float,
+        handshake_bytes: int = 0,
     ) -> None:
-        """Args: `phase_s` is when in each frame this drone acts; `sealer` None publishes unauthenticated."""
+        """Args: `phase_s` is when in each frame this drone acts; `sealer` None publishes unauthenticated.
+
+        `handshake_bytes` is what its sharing method puts on every link and frame before payloads.
+        """
         self.env = env
         self.drone = drone
         self.policy = policy  # may be replaced while the sortie flies
@@ -133,6 +138,7 @@ class Agent:
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, _Link] = {}
         self.gate = Gate()
+        self.handshake_bytes = handshake_bytes  # goes with the policy
 
     def start(self) -> None:
         """Begin the drone's process; call once."""
@@ -267,8 +273,17 @@ class Agent:
         if not self.airborne:
             return
         capture = cast(Capture, computed.value)
+        if self.handshake_bytes:
+            self._shake_hands(capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
         for directive in self.gate.due(self.env.now):
             payload = make_payload(directive, *pose, count_boxes)
             if payload is not None:
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)
+
+    def _shake_hands(self, capture: Capture) -> None:
+        """What the method asks and answers before payloads, to every peer that is not detached."""
+        limit_s = self._rules.period_s * self._rules.detached_after_periods
+        for peer, age_s in self._ages_s().items():
+            if peer != self.drone and age_s <= limit_s:
+                self._modem.handshake(peer, self.handshake_bytes, capture, self._rules.period_s)

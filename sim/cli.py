@@ -17,6 +17,7 @@ from perception.detectors import DETECTORS
 from perception.errors import InputError
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
+from policies.registry import own_fusion as own_fusion_of
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
 from scenarios.traces import TraceError
@@ -111,10 +112,15 @@ def compare(
     policies: Annotated[str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence.")],
     seed: SeedOption = None,
     set_: SetOption = None,
+    own_fusion: Annotated[
+        bool, typer.Option("--own-fusion", help="Prior methods fly with the fusion they were published with.")
+    ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
 ) -> None:
     """Fly a scenario under several policies, same seed and draws, and print them side by side."""
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
+    if own_fusion:
+        flown = [(p, _with_own_fusion(s)) for p, s in flown]
     with bars() as bar:
         each = {label: bar(label, s.duration_s) for label, s in flown}
         rows = compare_policies(flown, seed, progress=lambda label, t_s: each[label](t_s))
@@ -216,6 +222,14 @@ def _load(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario
         overrides.append("policy.params={}")
     overrides += [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
     return load(scenario, overrides)
+
+
+def _with_own_fusion(scenario: Scenario) -> Scenario:
+    fusion = own_fusion_of(scenario.policy.name)
+    if fusion is None:
+        return scenario
+    perception = scenario.perception.model_copy(update={"fusion": fusion})
+    return scenario.model_copy(update={"perception": perception})
 
 
 def _split_policies(text: str) -> list[str]:

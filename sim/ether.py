@@ -14,8 +14,9 @@ from fleet.agent import Agent, Received
 from fleet.auth import Dropped, Opened, open_datagram
 from fleet.gate import Payload
 from perception.types import Capture
+from policies.contract import Representation
 from radio import Air, Status, Transmission
-from sim.record import REPRESENTATIONS, Recorder
+from sim.record import HANDSHAKE, REPRESENTATIONS, Recorder
 
 
 class Ether:
@@ -68,6 +69,13 @@ class Ether:
         )
         self._pending[number] = (payload, capture)
 
+    def handshake(self, drone: int, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
+        """Hand a method's request or answer to the radio; it takes airtime, and nothing waits for it."""
+        number = self.air.send(
+            drone, peer, size_bytes, kind=HANDSHAKE, reliable=False, deadline_s=deadline_s, on_done=self._done
+        )  # fmt: skip
+        self._pending[number] = (Payload(Representation.NONE, 0.0, None, 0.0, 0, 0, 0, size_bytes), capture)
+
     def finish(self) -> None:
         """Write down what is still in flight."""
         for transmission in self.air.finish():
@@ -76,7 +84,7 @@ class Ether:
     def _done(self, transmission: Transmission) -> None:
         payload, capture = self._pending.pop(transmission.number)
         self._write(transmission, payload, capture)
-        if transmission.status is Status.DELIVERED:
+        if transmission.status is Status.DELIVERED and transmission.kind != HANDSHAKE:
             self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s))
 
     def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
@@ -103,4 +111,5 @@ class _Modem:
     def __init__(self, ether: Ether, drone: int) -> None:
         self.broadcast = partial(ether.publish, drone)
         self.send = partial(ether.send, drone)
+        self.handshake = partial(ether.handshake, drone)
         self.goodput_mbps = partial(ether.air.goodput_mbps, drone)

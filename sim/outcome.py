@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from perception.ap import Matched, average_precision, match
 from perception.types import Boxes
-from sim.record import SortieRecord
+from sim.record import HANDSHAKE, SortieRecord
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 
@@ -52,6 +52,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "context_descriptors": int(totals["context_descriptor_bytes"]),
             "context_directives": int(totals["context_directive_bytes"]),
             "data_sent": data_sent,
+            "handshakes_sent": _sum(sent.filter(pc.equal(sent["representation"], HANDSHAKE))["payload_bytes"]),
             **{f"data_{status}": count for status, count in by_status.items()},
         },
         "context_share": _ratio(context_bytes, context_bytes + data_sent),

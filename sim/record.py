@@ -23,6 +23,8 @@ from scenarios.schema import Scenario
 NAN = float("nan")
 REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
 """Names as the tables have them."""
+HANDSHAKE = "handshake"
+"""The `representation` of transmissions that carry a method's requests and answers, and no payload."""
 _PHASES = {phase: phase.name.lower() for phase in TaskPhase}
 _LINKS = {link: link.name.lower() for link in LinkHealth}
 _NO_DISC = (NAN, NAN, NAN)

@@ -124,6 +124,7 @@ def comparison_table(rows: Sequence[Compared]) -> Table:
         "  gain ": lambda r: _gain(r.gain["mission"]),
         "data sent": lambda r: size(r.outcome["bytes"]["data_sent"]),
         "data delivered": lambda r: size(r.outcome["bytes"]["data_delivered"]),
+        "  handshakes": lambda r: size(r.outcome["bytes"]["handshakes_sent"]),
         "deadlines missed": lambda r: _percent(r.outcome["deadline_miss_rate"]),
         "medium busy": lambda r: _percent(r.outcome["medium_busy_fraction"]),
         "context sent": lambda r: size(r.outcome["bytes"]["context_sent"]),

@@ -1,0 +1,71 @@
+"""Prior methods in flight: each flies in a comparison, and what it asks first takes airtime and is counted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+from sim_examples import example
+from typer.testing import CliRunner
+
+from policies.prior import METHODS
+from sim.cli import app
+from sim.compare import compare
+from sim.outcome import outcome
+from sim.sortie import run_sortie
+
+
+def test_every_method_flies_in_a_comparison() -> None:
+    rows = compare([(name, example(f"policy.name={name}", "policy.params={}", "duration_s=3")) for name in METHODS])
+    sent = {r.policy: r.outcome["bytes"]["data_sent"] for r in rows}
+    assert all(sent.values())
+    assert sent["fixed-compression"] < sent["where2comm"] < sent["v2vnet"] == sent["disconet"]
+    assert sent["who2com"] < sent["disconet"]
+
+
+def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
+    plain, asking = (
+        run_sortie(example("policy.name=where2comm", f"policy.params={{rho: 0.02, rounds: {rounds}}}"))
+        for rounds in (1, 2)
+    )
+    sent = asking.tables["transmissions"]
+    asked = sent.filter(pc.equal(sent["representation"], "handshake"))
+    assert set(asked["payload_bytes"].to_pylist()) == {8192}
+    assert pc.sum(asked["airtime_s"]).as_py() > 0.0
+    first, second = outcome(plain), outcome(asking)
+    assert first["bytes"]["handshakes_sent"] == 0
+    assert second["bytes"]["handshakes_sent"] == asked.num_rows * 8192
+    assert second["bytes"]["data_sent"] == pc.sum(sent["payload_bytes"]).as_py()
+    assert second["medium_busy_fraction"] > first["medium_busy_fraction"]
+    # every drone asks every peer it has heard, once a frame: 20 links, the first frames apart
+    assert asked.num_rows == pytest.approx(20 * 60, rel=0.05)
+
+
+def test_a_handshake_is_no_payload() -> None:
+    """Who2com serves each drone by one other: whatever is asked of the rest, only its maps are fused."""
+    record = run_sortie(
+        example("policy.name=who2com", "policy.params={rho: 0.05}", "perception.detector=surrogate", "duration_s=3")
+    )
+    kinds = {k for ks in record.tables["fusions"]["representations"].to_pylist() for k in ks}
+    assert kinds == {"features"}
+    assert set(record.tables["transmissions"]["representation"].to_pylist()) == {"features", "handshake"}
+
+
+@pytest.mark.slow
+def test_own_fusion_flies_the_methods_own_network(tmp_path: Path) -> None:
+    """V2VNet and DiscoNet send alike; with their own fusions they see otherwise."""
+
+    def seen(*more: str) -> dict[str, float]:
+        path = tmp_path / "outcomes.json"
+        settings = ["duration_s=1.5", "perception.detector=torch", "mission.phases=[{at_s: 0, phase: search}]"]
+        flags = [arg for s in settings for arg in ("--set", s)]
+        command = ["compare", "track_target", "--policies", "v2vnet(rho=0.02),disconet(rho=0.02)"]
+        done = CliRunner().invoke(app, [*command, *flags, "--out", str(path), *more])
+        assert done.exit_code == 0, done.output
+        return {name: o["ap50"]["full_scene"] for name, o in json.loads(path.read_text()).items()}
+
+    one, own = seen(), seen("--own-fusion")
+    assert one["v2vnet(rho=0.02)"] == one["disconet(rho=0.02)"] == own["disconet(rho=0.02)"]
+    assert own["v2vnet(rho=0.02)"] != one["v2vnet(rho=0.02)"]
