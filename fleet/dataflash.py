@@ -22,6 +22,8 @@ _BINARY = {
     "n": "S4", "N": "S16", "Z": "S64", "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4", "M": "u1",
     "q": "<i8", "Q": "<u8", "g": "<f2",
 }  # fmt: skip
+_Kinds = dict[int, tuple[str, int, str, tuple[str, ...]]]
+"""Type → name, length with its header, format, fields."""
 _SCALE = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
 
 
@@ -52,7 +54,7 @@ def read_dataflash(data: bytes) -> RawLog:
     A message counts where its length leads to the next message or to the end; anything else is skipped up to the
     next begin that holds.
     """
-    described = {_FMT_TYPE: ("FMT", _FMT_BYTES, "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
+    described: _Kinds = {_FMT_TYPE: ("FMT", _FMT_BYTES, "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))}
     begins: dict[int, list[int]] = {}
     skipped_bytes, stretches, unknown = 0, 0, 0
     at, end, lost = 0, len(data), False
@@ -85,7 +87,7 @@ def read_dataflash(data: bytes) -> RawLog:
     return RawLog(_tables(data, described, begins), tuple(problems))
 
 
-def _describe(body: bytes, described: dict[int, tuple[str, int, str, tuple[str, ...]]]) -> None:
+def _describe(body: bytes, described: _Kinds) -> None:
     """Take up an FMT message; one that contradicts itself is left out, and its messages are then unknown."""
     kind, length = body[0], body[1]
     name, form, columns = (
@@ -98,9 +100,7 @@ def _describe(body: bytes, described: dict[int, tuple[str, int, str, tuple[str, 
             described[kind] = (name, length, form, fields)
 
 
-def _tables(
-    data: bytes, described: Mapping[int, tuple[str, int, str, tuple[str, ...]]], begins: Mapping[int, list[int]]
-) -> dict[str, dict[str, Column]]:
+def _tables(data: bytes, described: _Kinds, begins: Mapping[int, list[int]]) -> dict[str, dict[str, Column]]:
     """Every kind's messages as columns, decoded at once."""
     octets = np.frombuffer(data, np.uint8)
     tables: dict[str, dict[str, Column]] = {}

@@ -39,6 +39,8 @@ POSITION = ("x_m", "y_m", "z_m")
 ATTITUDE = ("qx", "qy", "qz", "qw")
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 BATTERY = ("soc", "voltage_v", "current_a")
+ROUNDING = 1e-5
+"""A charge that rises by less is rounding, and held."""
 COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm")
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "t_s": TIME_S,
@@ -207,12 +209,14 @@ def _battery(own: Mapping[str, Array], where: str) -> BatteryTrace | None:
     if not there.any():
         return None
     t_s, soc = own["t_s"][there], own["soc"][there]
-    rises = np.diff(soc) > 0
+    rises = np.diff(soc) > ROUNDING
     if rises.any():
         at = first_row(rises)
         raise TraceError(
             f"{where}: soc rises from {soc[at - 1]:g} to {soc[at]:g} at {t_s[at]:g} s, must not rise in flight"
         )
+
+    soc = np.minimum.accumulate(soc)
 
     def some(name: str) -> tuple[list[float], list[float]]:
         values = own.get(name, np.full(len(there), np.nan))

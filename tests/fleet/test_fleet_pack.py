@@ -1,0 +1,252 @@
+"""What polarisation, temperature, age, cut-off and lost cells do to a pack; the ledger with all of them on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.battery import CAUSES, RECORDED, FleetBatteries
+from fleet.cell import (
+    MEAN_CELL_V,
+    ageing,
+    energy_fraction,
+    heat_capacity_jpk,
+    open_circuit_cell_v,
+    resistance_factor,
+    terminal_voltage_v,
+)
+from fleet.traces import BatteryTrace
+from scenarios.schema import Battery, DroneOverride
+
+HOVER_W = 168.48
+ELECTRIC_W = HOVER_W / 0.8 + 8 + 25 + 2.4  # of steady()
+
+
+def steady(batteries: FleetBatteries, seconds: float, rotor_w: float = HOVER_W, dt_s: float = 0.1) -> None:
+    n = len(batteries.soc)
+    for _ in range(round(seconds / dt_s)):
+        batteries.step(dt_s, [rotor_w] * n, [0.5] * n, [0.1] * n)
+
+
+# --- one effect at a time ------------------------------------------------------------------------
+
+
+def test_polarisation_builds_up_with_its_time_constant() -> None:
+    plain = FleetBatteries(Battery(), (), 1)
+    slow = FleetBatteries(Battery(polarisation_mohm=5, polarisation_time_s=10), (), 1)
+    for b in (plain, slow):
+        steady(b, 10.0, dt_s=0.01)
+    lag_v = 4 * float(open_circuit_cell_v(slow.soc[0])) - slow.voltage_v[0] - slow.current_a[0] * 0.052
+    assert lag_v == pytest.approx(slow.current_a[0] * 0.020 * (1 - math.exp(-1)), rel=0.01)
+    assert slow.voltage_v[0] < plain.voltage_v[0]
+    assert slow.energy_j["ohmic"][0] > plain.energy_j["ohmic"][0]
+
+
+def test_cold_raises_resistance_and_the_pack_warms_itself() -> None:
+    """Arrhenius by hand; the temperature against dT/dt = (P − (T − Ta)·C/τ)/C in small steps."""
+    assert resistance_factor(25.0) == 1.0
+    assert resistance_factor(0.0) == pytest.approx(math.exp(20_000 / 8.314462618 * (1 / 273.15 - 1 / 298.15)))
+    b = FleetBatteries(Battery(ambient_c=-10), (), 1)
+    at_rest = b.voltage_v[0]
+    steady(b, 0.1)
+    sag_ohm = (at_rest - b.voltage_v[0]) / b.current_a[0]
+    assert sag_ohm == pytest.approx(0.052 * resistance_factor(-10.0), rel=1e-3)
+    temperature_c, heat = -10.0, heat_capacity_jpk(130.0)
+    for _ in range(6000):
+        lost_w = b.current_a[0] ** 2 * 0.052 * resistance_factor(b.temperature_c[0])
+        temperature_c += 0.1 * (lost_w - (temperature_c + 10) * heat / 900.0) / heat
+        steady(b, 0.1)
+    assert b.temperature_c[0] == pytest.approx(temperature_c, abs=0.1)
+    assert b.temperature_c[0] > 0
+
+
+def test_without_a_temperature_packs_stay_at_25_degrees() -> None:
+    b = FleetBatteries(Battery(), (), 1)
+    steady(b, 60.0)
+    assert b.temperature_c == [25.0]
+
+
+def test_age_takes_capacity_and_adds_resistance() -> None:
+    assert ageing(0, 300) == (1.0, 1.0)
+    assert ageing(300, 300) == (pytest.approx(0.8), pytest.approx(2.0))
+    old = FleetBatteries(Battery(cycles=300), (), 1)
+    new = FleetBatteries(Battery(), (), 1)
+    assert old.energy_left_j[0] == pytest.approx(0.8 * new.energy_left_j[0])
+    steady(old, 0.1)
+    assert (old.energy_j["ohmic"][0] / 0.1) == pytest.approx(old.current_a[0] ** 2 * 0.104, rel=1e-6)
+
+
+def test_one_old_pack_among_new_ones() -> None:
+    b = FleetBatteries(Battery(), (DroneOverride(drone=1, cycles=200),), 3)
+    steady(b, 120.0)
+    assert b.soc[0] == b.soc[2] > b.soc[1]
+
+
+def test_it_lands_when_its_cells_fall_below_the_cut_off() -> None:
+    b = FleetBatteries(Battery(cutoff_cell_v=3.6, capacity_wh=20), (), 1)
+    volts = []
+    while not b.landed[0]:
+        steady(b, 0.1)
+        volts.append(b.voltage_v[0])
+    assert b.soc[0] > 0.1
+    assert min(volts[:-1]) >= 4 * 3.6
+    assert 4 * float(open_circuit_cell_v(b.soc[0])) == pytest.approx(b.voltage_v[0], abs=1e-4)  # at rest again
+    spent = sum(b.energy_j[c][0] for c in CAUSES)
+    steady(b, 10.0)
+    assert sum(b.energy_j[c][0] for c in CAUSES) == spent
+
+
+def test_cold_and_age_bring_the_cut_off_forward() -> None:
+    def endurance(**changes: float) -> float:
+        b = FleetBatteries(Battery(cutoff_cell_v=3.5, **changes), (), 1)
+        while not b.landed[0]:
+            steady(b, 1.0, dt_s=1.0)
+        return b._now_s
+
+    new = endurance(ambient_c=25)
+    assert endurance(ambient_c=-15) < new
+    assert endurance(ambient_c=25, cycles=300) < 0.8 * new
+
+
+# --- a cell drops out ----------------------------------------------------------------------------
+
+
+def test_a_lost_cell_takes_its_voltage_and_energy_and_the_rest_work_harder() -> None:
+    b = FleetBatteries(Battery(), (), 2)
+    steady(b, 10.0)
+    before_j, soc, current = b.energy_left_j[0], b.soc[0], b.current_a[0]
+    b.drop_cell(0)
+    assert b.cells == [3, 4]
+    assert b.energy_j["fault"] == [pytest.approx(before_j / 4), 0.0]
+    assert b.energy_left_j[0] == pytest.approx(before_j * 3 / 4)
+    assert b.soc[0] == pytest.approx(soc, abs=1e-6)  # the others keep their charge
+    steady(b, 0.1)
+    assert b.voltage_v[0] == pytest.approx(3 / 4 * b.voltage_v[1], rel=0.02)
+    assert b.current_a[0] == pytest.approx(4 / 3 * current, rel=0.03)
+    assert b.landed == [False, False]
+
+
+def test_losing_a_cell_under_a_cut_off_by_the_cell_goes_on_and_the_last_cell_lands() -> None:
+    b = FleetBatteries(Battery(cells=2, cutoff_cell_v=3.0), (), 1)
+    b.drop_cell(0)
+    steady(b, 1.0)
+    assert not b.landed[0]
+    b.drop_cell(0)
+    assert b.landed[0]
+    assert b.energy_left_j[0] == 0.0
+
+
+def test_charge_falls_faster_on_fewer_cells() -> None:
+    b = FleetBatteries(Battery(), (), 2)
+    b.drop_cell(0)
+    steady(b, 60.0)
+    assert 0.95 - b.soc[0] == pytest.approx(4 / 3 * (0.95 - b.soc[1]), rel=0.05)
+
+
+# --- a trace in place of the model ---------------------------------------------------------------
+
+
+def trace(time_s: list[float], soc: list[float], volts: list[float] | None = None) -> BatteryTrace:
+    volts = volts or []
+    return BatteryTrace(time_s, soc, energy_fraction(soc).tolist(), time_s[: len(volts)], volts, [], [])
+
+
+def test_a_traced_drone_follows_its_trace_and_the_others_their_model() -> None:
+    plain = FleetBatteries(Battery(), (), 3)
+    b = FleetBatteries(Battery(), (), 3, {1: trace([0, 10], [0.9, 0.4], [16.0, 15.0])})
+    for each in (plain, b):
+        steady(each, 5.0)
+    assert b.voltage_v[1] == pytest.approx(15.5, abs=1e-6)
+    assert float(energy_fraction(b.soc[1])) == pytest.approx(
+        float(energy_fraction(0.9) + energy_fraction(0.4)) / 2, abs=1e-6
+    )
+    for i in (0, 2):
+        assert [b.energy_j[c][i] for c in CAUSES] == [plain.energy_j[c][i] for c in CAUSES]
+    assert [b.energy_j[c][1] for c in CAUSES] == [0.0] * len(CAUSES)
+    steady(b, 20.0)
+    assert b.soc[1] == pytest.approx(0.4, abs=1e-6)  # held after the end
+    assert RECORDED not in plain.energy_j
+
+
+def test_a_traced_drone_lands_at_landing_soc_too() -> None:
+    b = FleetBatteries(Battery(landing_soc=0.5), (), 1, {0: trace([0, 10], [0.9, 0.4])})
+    steady(b, 10.0)
+    assert b.landed == [True]
+    assert 0.48 < b.soc[0] <= 0.5
+
+
+# --- the ledger, everything on -------------------------------------------------------------------
+
+packs = st.builds(
+    Battery,
+    capacity_wh=st.floats(0.05, 200),
+    cells=st.integers(1, 8),
+    initial_soc=st.floats(0.01, 1),
+    cell_resistance_mohm=st.floats(0, 60),
+    polarisation_mohm=st.floats(0, 40),
+    polarisation_time_s=st.floats(0.1, 100),
+    ambient_c=st.none() | st.floats(-30, 50),
+    cycles=st.floats(0, 500),
+    cutoff_cell_v=st.floats(0, 3.6),
+    landing_soc=st.floats(0, 0.5),
+)
+happenings = st.none() | st.just("cell") | st.floats(0, 0.9)
+flights = st.lists(
+    st.tuples(st.floats(0.01, 2), st.floats(0, 600), st.floats(0, 1), st.floats(0, 1), happenings), max_size=40
+)
+charges = st.lists(st.floats(0.001, 1), min_size=2, max_size=5).map(lambda soc: sorted(soc, reverse=True))
+
+
+@settings(max_examples=300)
+@given(packs, flights, charges)
+def test_the_ledger_holds_with_every_effect_on(
+    config: Battery, flight: list[tuple[float, float, float, float, str | float | None]], soc: list[float]
+) -> None:
+    traced = trace([10.0 * k for k in range(len(soc))], soc)
+    b = FleetBatteries(config, (), 3, {2: traced})
+    before_j, charge = list(b.energy_left_j), list(b.soc)
+    for dt_s, rotor_w, duty, airtime, happens in flight:
+        for i in (0, 2):
+            if happens == "cell":
+                b.drop_cell(i)
+            elif isinstance(happens, float):
+                b.fault(i, happens)
+        b.step(dt_s, [rotor_w, 0.0, rotor_w], [duty, 0.0, duty], [airtime, 0.0, airtime])
+        for i in range(3):
+            assert 0 <= b.soc[i] <= charge[i] + 2e-6  # never rises; the look-up is good to 1e-6
+            assert b.energy_left_j[i] >= 0
+            assert b.voltage_v[i] > 0
+            assert b.current_a[i] >= 0
+            assert b.landed[i] or b.soc[i] > config.landing_soc
+            assert math.isfinite(b.temperature_c[i])
+            left = before_j[i] - sum(b.energy_j[cause][i] for cause in b.energy_j)
+            assert b.energy_left_j[i] == pytest.approx(left, rel=1e-9, abs=1e-9 * before_j[i])
+        charge = list(b.soc)
+
+
+# --- the same cell, driven by current ------------------------------------------------------------
+
+
+def test_a_packs_voltage_under_its_own_current_is_the_fleets() -> None:
+    """The current that the fleet's model drew, put through the one that counts charge, gives its voltage back."""
+    config = Battery(capacity_wh=60, polarisation_mohm=6, polarisation_time_s=15, cycles=100)
+    b = FleetBatteries(config, (), 1)
+    rng = np.random.default_rng(1)
+    current, volts = [], []
+    for load_w in rng.uniform(50, 250, 120).repeat(20):
+        b.step(0.05, [load_w], [0.0], [0.0])
+        current.append(b.current_a[0])
+        volts.append(b.voltage_v[0])
+    time_s = 0.05 * np.arange(len(volts))
+    np.testing.assert_allclose(terminal_voltage_v(time_s, np.array(current), config, 0.95), volts, rtol=2e-4)
+
+
+def test_capacity_in_charge_and_energy_belong_together() -> None:
+    """5.2 Ah at the mean open-circuit voltage: after 2.6 Ah half the charge is left."""
+    config = Battery(capacity_wh=5.2 * 4 * MEAN_CELL_V, cells=4, cell_resistance_mohm=0)
+    volts = terminal_voltage_v(np.array([0.0, 360.0]), np.array([26.0, 0.0]), config, 1.0)
+    np.testing.assert_allclose(volts, 4 * open_circuit_cell_v([1.0, 0.5]))
