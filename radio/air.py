@@ -5,30 +5,35 @@ allows (the sender knows the SNR of the frame before, so a sudden drop costs it 
 
 Transport. *Best effort*: a sample with one lost fragment is lost. *Reliable, keep-last-1*: the writer's
 heartbeat and the reader's NACK bring lost fragments back, `heartbeat_s + nack_delay_s` after the pass in
-which they were lost, until all are through or the deadline passes. In both, a newer sample of the same
+which they were lost, until all are through or the deadline passes. A sample of *pieces* is of use in part: what of it
+came, also by a deadline that cut it short, is `partial`. In all, a newer sample of the same
 sender, receiver and kind replaces an older one that is not through (history depth 1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
 from math import nan
 from typing import cast
 
 import simpy
 from numpy.typing import ArrayLike
 
-from radio.airtime import frame_bytes, repair_wire_bytes, sample_wire
+from radio.airtime import repair_wire_bytes, sample_wire
 from radio.broadcasts import Broadcast, Broadcasts, OnHeard
 from radio.channel import Channel, FloatArray, Jammer, SampleLuck
 from radio.counters import Counters
 from radio.goodput import Goodput
 from radio.medium import End, Medium
 from radio.overrides import Overrides
-from radio.sample import Sample, Service
+from radio.relay import Routes
+from radio.sample import IntArray, Sample, Service
 from radio.traces import read_links
-from radio.transmission import Status, Transmission, losses
+from radio.transmission import Status, Transmission
 from scenarios.schema import Radio
+from scenarios.streams import stream
 
 _WINDOW_S = 1e-3
 """A goodput measurement that is still going on counts once it is this old."""
@@ -85,7 +90,9 @@ class Air:
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._in_flight: dict[int, Sample] = {}
-        self._latest: dict[tuple[int, int, str], Sample] = {}
+        self._latest: dict[tuple[int, int, int, str], Sample] = {}
+        self._routes = Routes(config.relay_max_hops) if config.relay_max_hops > 1 else None
+        self._seed = (seed, replication)
         self._numbers = 0
 
     # --- once a frame ----------------------------------------------------------------------------
@@ -95,7 +102,24 @@ class Air:
         self.channel.advance(extra_loss_db, jammers)
         if self._overrides is not None:
             self._overrides.advance(extra_loss_db, self.channel.noise_rise_db(jammers) if jammers else None)
+        if self._routes is not None:
+            self._routes.renew(self.link_mbps())
         self.medium.retune()
+
+    def link_mbps(self) -> FloatArray:
+        """[N, N]: payload rate of each link alone on the channel as senders know it, from the frame before; 0: no link.
+
+        Silenced drones have none: their neighbours hear that they are gone.
+        """
+        known_db = self.channel.before.square_db
+        if self._overrides is not None:
+            known_db = self._overrides.known_snr_db(known_db)
+        mbps = self._service.link_mbps(known_db)
+        if self._overrides is not None:
+            mbps = self._overrides.mbps(mbps)
+        gone = sorted(self._gone)
+        mbps[gone], mbps[:, gone] = 0.0, 0.0
+        return mbps
 
     @property
     def snr_db(self) -> FloatArray:
@@ -143,6 +167,7 @@ class Air:
         reliable: bool,
         deadline_s: float,
         on_done: Callable[[Transmission], None],
+        piece_bytes: int | None = None,
     ) -> int:
         """Write one unicast sample.
 
@@ -155,6 +180,8 @@ class Air:
             on_done: called once with the sample's fate, always from the clock's loop, except that a replaced
                 sample's is called from within the `send` of its successor, and that of a silenced drone's
                 samples from within `silence`. Not called for what is in flight at the end.
+            piece_bytes: the sample is made of pieces of so many bytes (the last may be shorter), most important first,
+                each a fragment of its own and of use without the others; None: it is of use as a whole only.
 
         Returns:
             The sample's number.
@@ -168,34 +195,42 @@ class Air:
             raise ValueError(f"payload_bytes is {payload_bytes}, must be at least 1")
         if not deadline_s >= 0.0:
             raise ValueError(f"deadline_s is {deadline_s!r}, must be at least 0")
+        if piece_bytes is not None and piece_bytes < 1:
+            raise ValueError(f"piece_bytes is {piece_bytes}, must be at least 1")
         now = self._env.now
         number = self._numbers
         self._numbers = number + 1
+        hop = receiver if self._routes is None else self._routes.next_hop(sender, receiver, self._routes.max_hops)
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            *sample_wire(payload_bytes, self._config.fragment_bytes), self._luck.next(sender, receiver),
-            self._snr_of(sender, receiver)[1], self._drained(sender),
+            *sample_wire(payload_bytes, piece_bytes or self._config.fragment_bytes, piece_bytes is not None),
+            self._luck.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
         )  # fmt: skip
+        s.receiver = hop
         self._in_flight[number] = s
         self.counters.data_sent_bytes += payload_bytes
         if sender in self._gone:
             s.live = False
             self._env.timeout(0.0, s).callbacks.append(self._refuse)
             return number
-        key = (sender, receiver, kind)
+        self._queue(s)
+        return number
+
+    def _queue(self, s: Sample) -> None:
+        """Hand a sample to its sender's queue; there the newest of its kind stands for an older one."""
+        key = (s.sender, s.origin, s.target, s.kind)
         old = self._latest.get(key)
         self._latest[key] = s
         if old is None:
             self.medium.submit(s)
         elif old.live:
-            served = self.medium.in_service(sender) is old
+            served = self.medium.in_service(s.sender) is old
             self.medium.replace(old, s)
-            self._measure(old, served, now)
+            self._measure(old, served, self._env.now)
             self._close(old, Status.EXPIRED, "replaced")
         else:  # it waits for its repair, outside the medium
             self.medium.submit(s)
             self._close(old, Status.EXPIRED, "replaced")
-        return number
 
     def silence(self, drone: int) -> None:
         """A drone is lost or has landed: its queue is dropped, and nothing reaches it from now on.
@@ -246,17 +281,38 @@ class Air:
             return
         if s.reliable:
             s.wire_bytes += repair_wire_bytes(s.left)
-        lost = losses(s.round_luck(), s.left, s.loss_share)
-        s.lost += lost
-        if lost == 0:
-            self._close(s, Status.DELIVERED, "")
-        elif not s.reliable:
-            self._close(s, Status.LOST, "fragment_lost")
-        else:
+        lost = s.lose(partial(self._order, s))
+        if lost and s.reliable:
             s.left = lost
             wait_s = self._config.heartbeat_s + self._config.nack_delay_s
             wait_s = max(0.0, min(wait_s, s.deadline_s - now_s))
             self._env.timeout(wait_s, s).callbacks.append(self._repair)
+        elif s.receiver != s.target and (lost == 0 or any(map(len, s.arrived))):
+            self._forward(s, now_s)
+        elif lost == 0 and s.is_whole():
+            self._close(s, Status.DELIVERED, "")
+        else:
+            self._close(s, Status.LOST, "fragment_lost")
+
+    def _order(self, s: Sample, count: int) -> IntArray:
+        """A random order of so many pieces, of the luck of the sample's present pass."""
+        entity = (s.sender, s.receiver, int(s.round_luck() * 2.0**53))
+        return stream(*self._seed, entity, "lost pieces").permutation(count)
+
+    def _forward(self, s: Sample, now_s: float) -> None:
+        """A relay has it: on to the next hop, as the links are now."""
+        assert self._routes is not None  # noqa: S101 (nothing else sends it to another than its target)
+        self._forget(s)
+        here = s.receiver
+        hop = self._routes.next_hop(here, s.target, self._routes.max_hops - s.hops)
+        s.forward(here, hop, now_s, self._luck.next(here, hop), self._drained(here))
+        s.pass_bytes = self._service.wire_bytes(s)
+        self._queue(s)
+
+    def _forget(self, s: Sample) -> None:
+        key = (s.sender, s.origin, s.target, s.kind)
+        if self._latest.get(key) is s:
+            del self._latest[key]
 
     def _repair(self, event: simpy.Event) -> None:
         s = cast(Sample, event.value)
@@ -266,24 +322,27 @@ class Air:
             self._close(s, Status.EXPIRED, "deadline_in_service")
             return
         s.repairs += 1
+        s.passes += 1
         s.restart()
-        s.pass_bytes = self._service.repair_payload(s) + s.left * frame_bytes(0, fragmented=s.fragments > 1)
+        s.pass_bytes = self._service.wire_bytes(s)
         s.live = True
         self.medium.submit(s)
 
     def _close(self, s: Sample, status: Status, reason: str) -> None:
         del self._in_flight[s.number]
-        key = (s.sender, s.receiver, s.kind)
-        if self._latest.get(key) is s:
-            del self._latest[key]
+        self._forget(s)
+        if s.pieces is not None and s.remaining < 1.0:  # cut short: its first pieces are there
+            self._book(s)
+            s.lose(partial(self._order, s))
         row = s.row(status, reason, self._env.now)
         c = self.counters
         c.data_wire_bytes += row.wire_bytes
-        if status is Status.DELIVERED:
-            c.data_delivered_bytes += s.payload_bytes
+        c.data_delivered_bytes += row.arrived_bytes
+        if row.status is Status.PARTIAL:
+            c.data_lost_bytes += s.payload_bytes - row.arrived_bytes
         elif status is Status.LOST:
             c.data_lost_bytes += s.payload_bytes
-        else:
+        elif status is Status.EXPIRED:
             c.data_expired_bytes += s.payload_bytes
         s.on_done(row)
 
@@ -292,8 +351,22 @@ class Air:
     def goodput_mbps(self, sender: int) -> tuple[float, ...]:
         """Goodput to every other drone, ascending by id, as the sender measured it; see `radio.goodput`.
 
-        Samples that are still in service or queued lower it already by how little has got through so far.
+        Samples that are still in service or queued lower it already by how little has got through so far. Where a
+        payload would go over others, it is what their hops' goodputs come to one after the other.
         """
+        known = self._known_mbps(sender)
+        if self._routes is not None:
+            rows: dict[int, list[float]] = {sender: known.copy()}
+            for target in range(self._n):
+                path = self._routes.path(sender, target) if target != sender else [sender]
+                if len(path) > 2:
+                    hops = [rows.setdefault(a, self._known_mbps(a))[b] for a, b in pairwise(path)]
+                    known[target] = 1.0 / sum(1.0 / mbps for mbps in hops) if min(hops) > 0.0 else 0.0
+        del known[sender]
+        return tuple(known)
+
+    def _known_mbps(self, sender: int) -> list[float]:
+        """Goodput to every drone over the direct link, 0 to itself."""
         known = self._goodput.read(sender)
         head = self.medium.in_service(sender)
         if head is not None:
@@ -302,11 +375,10 @@ class Air:
                 if s is head and now - s.mark_s >= _WINDOW_S:
                     since, bits = s.mark_s, s.mark_bits
                 else:
-                    since, bits = s.t_sent_s, drained - s.drained_bits
+                    since, bits = s.t_queued_s, drained - s.drained_bits
                 if now - since >= _WINDOW_S:
                     known[s.receiver] = min(known[s.receiver], bits / (now - since) * 1e-6)
-        del known[sender]
-        return tuple(known)
+        return known
 
     def _book(self, s: Sample) -> None:
         """Count what was acknowledged since the last time."""
@@ -329,7 +401,7 @@ class Air:
             if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.t_start_s):
                 self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6)
         else:
-            waited = now_s - s.t_sent_s
+            waited = now_s - s.t_queued_s
             if s.repairs == 0 and waited >= _WINDOW_S:
                 rate = (self._drained(s.sender) - s.drained_bits) / waited * 1e-6
                 self._goodput.bounded(s.sender, s.receiver, rate)

@@ -47,10 +47,13 @@ def frame_bytes(payload_bytes: int, *, fragmented: bool = False, unicast: bool =
 
 
 @lru_cache(maxsize=4096)
-def sample_wire(payload_bytes: int, fragment_bytes: int) -> tuple[int, int]:
-    """A unicast sample's fragments, and every byte of its frames, each counted once."""
+def sample_wire(payload_bytes: int, fragment_bytes: int, alone: bool = False) -> tuple[int, int]:
+    """A unicast sample's fragments, and every byte of its frames, each counted once.
+
+    Args: `alone`: each fragment is a sample of its own to DDS, usable without the others.
+    """
     k = fragments(payload_bytes, fragment_bytes)
-    return k, payload_bytes + k * frame_bytes(0, fragmented=k > 1)
+    return k, payload_bytes + k * frame_bytes(0, fragmented=k > 1 and not alone)
 
 
 @lru_cache(maxsize=4096)
@@ -144,12 +147,17 @@ def frames_exchanges(
 
 
 def sample_exchanges(
-    payload_bytes: int, fragment_bytes: int, rate_mbps: float, max_frames: int, standard: Standard = AX
+    payload_bytes: int,
+    fragment_bytes: int,
+    rate_mbps: float,
+    max_frames: int,
+    standard: Standard = AX,
+    alone: bool = False,
 ) -> Exchanges:
-    """Exchanges of a whole unicast sample."""
+    """Exchanges of a whole unicast sample; `alone` as for `sample_wire`."""
     k = fragments(payload_bytes, fragment_bytes)
-    last = frame_bytes(payload_bytes - (k - 1) * fragment_bytes, fragmented=k > 1)
-    full = frame_bytes(fragment_bytes, fragmented=True)
+    last = frame_bytes(payload_bytes - (k - 1) * fragment_bytes, fragmented=k > 1 and not alone)
+    full = frame_bytes(fragment_bytes, fragmented=not alone)
     return frames_exchanges(k, full, last, rate_mbps, max_frames, standard=standard)
 
 

@@ -96,6 +96,17 @@ class Overrides:
         """[N, N]: the trace's SNR in this frame where it has one, else the model's."""
         return np.where(np.isnan(self._given.snr_db), modelled_db, self._given.snr_db)
 
+    def known_snr_db(self, modelled_db: FloatArray) -> FloatArray:
+        """[N, N]: the same of the frame before."""
+        if self._known_rows is None:
+            return self.snr_db(modelled_db)
+        known = np.array(self._known_rows)
+        return np.where(np.isnan(known), modelled_db, known)
+
+    def mbps(self, modelled: FloatArray) -> FloatArray:
+        """[N, N]: the trace's goodput where it has one, else the model's."""
+        return np.where(np.isnan(self._given.goodput_mbps), modelled, self._given.goodput_mbps)
+
     def snr_of(self, sender: int, receiver: int, known_db: float, now_db: float) -> tuple[float, float]:
         """The SNR of a link in the frame before and in this one, the model's being given."""
         if self._snr_rows is None or isnan(now := self._snr_rows[sender][receiver]):

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import isnan, nan
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radio.airtime import (
     ACK_S,
     Exchanges,
@@ -20,9 +23,11 @@ from radio.contention import contention
 from radio.medium import Job
 from radio.overrides import LinkNow
 from radio.rates import STANDARDS, rate_table, rescale
-from radio.transmission import Status, Transmission
+from radio.transmission import Status, Transmission, losses
 from scenarios.schema import Radio
 
+IntArray = NDArray[np.intp]
+FloatArray = NDArray[np.float64]
 _GOLDEN = 0.6180339887498949
 _MAX_DEMANDS = 20_000
 
@@ -31,9 +36,11 @@ class Sample(Job):
     """A sample, its current pass through the medium, and the goodput measurement that it carries."""
 
     __slots__ = (
+        "arrived",
         "drained_bits",
         "fragments",
         "full_mbps",
+        "hops",
         "kind",
         "left",
         "loss_probability",
@@ -45,14 +52,20 @@ class Sample(Job):
         "mark_s",
         "mcs",
         "on_done",
+        "origin",
         "pass_bytes",
+        "passes",
         "payload_bytes",
+        "piece_bytes",
+        "pieces",
         "receiver",
         "reliable",
         "repairs",
         "snr_db",
         "t_first_s",
+        "t_queued_s",
         "t_sent_s",
+        "target",
         "unreachable",
         "wire_bytes",
     )
@@ -73,23 +86,30 @@ class Sample(Job):
         luck: list[float],
         snr_db: float,
         drained_bits: float,
+        piece_bytes: int = 0,
     ) -> None:
         """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
         the sender had got through when this was written; the rest as in `Air.send`."""
         super().__init__(number, sender, deadline_s)
-        self.receiver = receiver
+        self.receiver = receiver  # of this hop, as `sender`
+        self.origin, self.target = sender, receiver
+        self.hops = 1
         self.kind = kind
         self.payload_bytes = payload_bytes
         self.reliable = reliable
         self.on_done = on_done
-        self.t_sent_s = t_sent_s
+        self.t_sent_s = self.t_queued_s = t_sent_s
         self.t_first_s = nan
         self.fragments = fragments
         self.left = fragments  # fragments of this pass
         self.pass_bytes = wire_bytes  # on the wire in this pass
         self.lost = 0
         self.repairs = 0
+        self.passes = 0  # through the medium, on this hop and before this one
         self.luck = luck
+        self.piece_bytes = piece_bytes  # 0: it is of use as a whole only
+        self.pieces: IntArray | None = np.arange(fragments) if piece_bytes else None  # of this pass, in their order
+        self.arrived: list[IntArray] = []  # pieces at the end of this hop
         self.mcs = -1
         self.snr_db = snr_db
         self.loss_probability = 1.0  # of a fragment, after all MAC retries
@@ -119,15 +139,64 @@ class Sample(Job):
 
     def round_luck(self) -> float:
         """The uniform number of the present pass; beyond those it was given, the last one shifted by golden ratios."""
-        extra = self.repairs - len(self.luck) + 1
-        return self.luck[self.repairs] if extra <= 0 else (self.luck[-1] + extra * _GOLDEN) % 1.0
+        extra = self.passes - len(self.luck) + 1
+        return self.luck[self.passes] if extra <= 0 else (self.luck[-1] + extra * _GOLDEN) % 1.0
+
+    def lose(self, draw: Callable[[int], IntArray]) -> int:
+        """What of this pass did not get through, its progress being booked; returns how many fragments.
+
+        Pieces go in their order, so that a pass that was cut short has brought the first of them.
+
+        Args:
+            draw: a random order of so many, for which of the pieces are lost.
+        """
+        done = 1.0 - self.remaining
+        sent = self.left if done >= 1.0 else int(done * self.left + 1e-9)
+        if self.unreachable or sent == 0:
+            return self.left
+        lost = losses(self.round_luck(), sent, min(1.0, self.loss_share / done))
+        if self.pieces is not None:
+            which = np.sort(draw(sent)[:lost]) if lost else np.arange(0)
+            self.arrived.append(np.delete(self.pieces[:sent], which))
+            self.pieces = np.concatenate([self.pieces[which], self.pieces[sent:]])
+        self.lost += lost
+        self.restart()  # told; a second call finds nothing sent
+        return lost + self.left - sent
+
+    def forward(self, sender: int, receiver: int, now_s: float, luck: list[float], drained_bits: float) -> None:
+        """Begin the next hop with what the last one brought."""
+        self.sender, self.receiver = sender, receiver
+        self.hops += 1
+        self.luck, self.passes = luck, 0
+        self.t_queued_s, self.drained_bits = now_s, drained_bits
+        if self.pieces is not None:
+            self.pieces = np.sort(np.concatenate(self.arrived))
+            self.arrived = []
+        self.left = self.fragments if self.pieces is None else len(self.pieces)
+        self.restart()
+        self.live = True
+
+    def is_whole(self) -> bool:
+        """Whether all that has come is all there is."""
+        return self.pieces is None or sum(map(len, self.arrived)) == self.fragments
+
+    def bytes_of(self, pieces: IntArray) -> int:
+        """Payload of some of its pieces."""
+        short = self.fragments * self.piece_bytes - self.payload_bytes  # by which the last one is shorter
+        return len(pieces) * self.piece_bytes - (short if self.fragments - 1 in pieces else 0)
 
     def row(self, status: Status, reason: str, t_done_s: float) -> Transmission:
-        """Its row of the record."""
+        """Its row of the record; one that would be lost or expired while pieces of it have come is partial."""
+        arrived, missing = self.payload_bytes if status is Status.DELIVERED else 0, tuple[int, ...]()
+        if self.arrived and self.receiver == self.target and status in (Status.LOST, Status.EXPIRED):
+            here = np.concatenate(self.arrived)
+            if len(here):
+                status, arrived = Status.PARTIAL, self.bytes_of(here)
+                missing = tuple(np.setdiff1d(np.arange(self.fragments), here).tolist())
         return Transmission(
-            self.number, self.sender, self.receiver, self.kind, self.payload_bytes, round(self.wire_bytes),
+            self.number, self.origin, self.target, self.kind, self.payload_bytes, round(self.wire_bytes),
             self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost,
-            self.repairs, self.mcs, self.snr_db, self.granted_s,
+            self.repairs, self.mcs, self.snr_db, self.granted_s, self.hops, arrived, missing,
         )  # fmt: skip
 
 
@@ -143,8 +212,9 @@ class Service:
         self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
         probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S, self._standard)
         self._probe = probe.scaled(config.retry_limit + 1.0)
+        self._mbps_at: FloatArray | None = None
         # both are the same again and again: links are looked up on a grid of SNR, payloads come in few sizes
-        self._demands: dict[tuple[int, int, bool], Exchanges] = {}
+        self._demands: dict[tuple[int, int, bool, int], Exchanges] = {}
         self._qualities: dict[tuple[int, float], tuple[float, float, float]] = {}
 
     def begin(
@@ -192,17 +262,19 @@ class Service:
         payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
         if s.fragments == 1:
             per = rescale(per, frame_bytes(payload) / self._frame_bytes)
+        elif s.piece_bytes:
+            per = rescale(per, frame_bytes(s.piece_bytes) / self._frame_bytes)
         if given is not None:
             per = 1.0 - (1.0 - per) * (1.0 - given.burst_loss) if isnan(given.loss) else given.loss
         mean_tries, s.loss_probability, s.full_mbps = self._quality(mcs, per)
         if given is not None and not isnan(given.goodput_mbps):
             mean_tries, s.full_mbps = self._full_mbps[mcs] / given.goodput_mbps, given.goodput_mbps
-        key = (payload, mcs, s.reliable)
+        key = (payload, mcs, s.reliable, s.piece_bytes)
         demand = self._demands.get(key)
         if demand is None:
             if len(self._demands) > _MAX_DEMANDS:
                 self._demands.clear()
-            demand = self._demands[key] = self._demand(payload, mcs, s.reliable)
+            demand = self._demands[key] = self._demand(*key)
         s.demand(demand, mean_tries)
 
     def _given_mcs(self, mcs: int, given: LinkNow) -> int:
@@ -228,11 +300,32 @@ class Service:
 
     def repair_payload(self, s: Sample) -> int:
         """Payload bytes of the fragments that are left."""
-        return min(s.payload_bytes, s.left * self._config.fragment_bytes)
+        return min(s.payload_bytes, s.left * (s.piece_bytes or self._config.fragment_bytes))
 
-    def _demand(self, payload_bytes: int, mcs: int, reliable: bool) -> Exchanges:
+    def wire_bytes(self, s: Sample) -> int:
+        """Bytes of the frames of the fragments that are left."""
+        payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
+        return payload + s.left * frame_bytes(0, fragmented=s.fragments > 1 and not s.piece_bytes)
+
+    def link_mbps(self, snr_db: FloatArray) -> FloatArray:
+        """Payload rate of full A-MPDUs alone on the channel at a mean SNR, losses paid; 0 where there is no link or NaN."""
+        if self._mbps_at is None:
+            table = self._table
+            self._mbps_at = np.array(
+                [
+                    self._quality(mcs, per[i])[2] if mcs >= 0 else 0.0
+                    for i, mcs in enumerate(table.mcs)
+                    for per in [table.all_per[mcs]]
+                ]
+            )
+        at = np.array([self._table.index(snr) for snr in np.nan_to_num(snr_db, nan=-1e9).ravel().tolist()], np.intp)
+        return np.asarray(self._mbps_at[at].reshape(snr_db.shape))
+
+    def _demand(self, payload_bytes: int, mcs: int, reliable: bool, piece_bytes: int) -> Exchanges:
         c, rate = self._config, self._rates[mcs]
-        demand = sample_exchanges(payload_bytes, c.fragment_bytes, rate, c.max_ampdu_frames, self._standard)
+        demand = sample_exchanges(
+            payload_bytes, piece_bytes or c.fragment_bytes, rate, c.max_ampdu_frames, self._standard, piece_bytes > 0
+        )
         if reliable:  # heartbeat and ACKNACK, each an exchange of its own
             length = repair_wire_bytes(1) // 2
             demand = demand + frames_exchanges(1, length, length, rate, 1, ACK_S, self._standard).scaled(2.0)

@@ -16,6 +16,8 @@ class Status(StrEnum):
     DELIVERED = "delivered"
     LOST = "lost"
     EXPIRED = "expired"
+    PARTIAL = "partial"
+    """Pieces of it arrived, not all."""
     IN_FLIGHT = "in_flight"
 
 
@@ -25,17 +27,21 @@ class Transmission(NamedTuple):
     | field | meaning |
     |---|---|
     | number | running number of `Air.send` |
+    | sender, receiver | who wrote it and for whom, also where it went over others |
     | kind | the caller's word for what it is; samples of one sender, receiver and kind replace one another |
     | payload_bytes | what was handed over |
     | wire_bytes | bytes of the 802.11 frames put on the air, MAC retries not counted, repairs counted |
     | t_sent_s, deadline_s | when it was written and by when it must be through, on the clock |
     | t_start_s | when it first came to be served; NaN if never |
     | t_done_s | when its fate was settled; NaN while in flight |
-    | reason | '' if delivered or in flight; else fragment_lost, no_link, sender_gone, receiver_gone (lost); deadline_queued, deadline_in_service, replaced (expired) |
+    | reason | '' if delivered or in flight; else why it, or its rest, did not come: fragment_lost, no_link, sender_gone, receiver_gone (lost); deadline_queued, deadline_in_service, replaced (expired) |
     | fragments, fragments_lost | DDS fragments, and how often one was lost in all passes |
     | repairs | repair rounds |
     | mcs, snr_db | of its latest service, or −1 and the mean SNR at its sending |
-    | airtime_s | channel time it was given, contention and retries included |
+    | airtime_s | channel time it was given, contention and retries included, on all hops |
+    | hops | links it went over, or the one it was on |
+    | arrived_bytes | payload at the receiver: all, none, or that of the pieces that came |
+    | missing | pieces that did not come, ascending, where it arrived in part |
     """
 
     number: int
@@ -56,6 +62,9 @@ class Transmission(NamedTuple):
     mcs: int
     snr_db: float
     airtime_s: float
+    hops: int = 1
+    arrived_bytes: int = 0
+    missing: tuple[int, ...] = ()
 
 
 def losses(u: float, count: int, q: float) -> int:
