@@ -21,7 +21,7 @@ from policies.registry import own_fusion as own_fusion_of
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
 from scenarios.traces import TraceError
-from sim import cli_bench, cli_calibrate, cli_paper, cli_recording, cli_study, cli_train, rundir, tables
+from sim import cli_bench, cli_calibrate, cli_campaign, cli_paper, cli_recording, cli_study, cli_train, rundir, tables
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
 from sim.expect import check as check_expectations
@@ -37,6 +37,7 @@ app = typer.Typer(
 )
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_recording.app, name="recording")
+app.add_typer(cli_campaign.app, name="campaign")
 
 USER_ERRORS = (ScenarioError, PolicyError, MotionError, TraceError, DescriptorTooLarge, InputError, RunError)
 """What a user can mend: one line and exit code 2, no traceback."""

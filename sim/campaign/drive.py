@@ -1,0 +1,137 @@
+"""Drive a campaign: hand out what is missing, keep what comes back, stop when enough is known."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from sim.campaign.engine import Engine
+from sim.campaign.plan import Plan
+from sim.campaign.statistics import Mean, t_interval
+from sim.campaign.store import Store
+from sim.campaign.work import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a campaign is."""
+
+    finished: int
+    """Runs whose rows are on disk, those of earlier drivers too."""
+    of: int
+    failed: int
+    """Of those that this driver got."""
+    flown: int
+    """By this driver."""
+    seconds: float
+    """Since this driver began."""
+
+    @property
+    def per_second(self) -> float:
+        return self.flown / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def left_s(self) -> float:
+        return (self.of - self.finished) / self.per_second if self.flown else math.inf
+
+
+def run_campaign(
+    plan: Plan,
+    folder: Path,
+    engine: Engine,
+    *,
+    resume_only: bool = False,
+    progress: Callable[[Progress], None] = lambda p: None,
+) -> Progress:
+    """Fly what is missing of a campaign into its folder.
+
+    Rows are on disk before `progress` counts them; whenever this ends early, the next call goes on.
+
+    Raises:
+        RunError: a folder that cannot be used, a cluster that is not there, a disk that is full.
+    """
+    store = Store(folder, plan, resume_only=resume_only)
+    try:
+        return _drive(plan, store, engine, progress)
+    finally:
+        store.close()
+
+
+def _drive(plan: Plan, store: Store, engine: Engine, progress: Callable[[Progress], None]) -> Progress:
+    stop = Stop(plan)
+    frontier = 0
+    begin_s, flown, failed = time.perf_counter(), 0, 0
+
+    def enough() -> bool:
+        """Look at finished parts in their order, so that it is the same whoever finished first."""
+        nonlocal frontier
+        while frontier < store.shards and store.is_done(frontier):
+            frontier += 1
+            if plan.campaign.stop_when is not None and stop.enough(store.rows(frontier - 1)):
+                store.drop_after(frontier - 1)
+                return True
+        return False
+
+    def state(of: int) -> Progress:
+        return Progress(min(store.finished, of), of, failed, flown, time.perf_counter() - begin_s)
+
+    def tasks() -> Iterator[Task]:
+        for run in store.missing():
+            yield run, plan.task(run)
+
+    if enough():
+        return state(store.runs_of(frontier - 1).stop)
+    progress(state(plan.runs))
+    for results in engine.results(plan.code, tasks()):
+        store.add(results)
+        flown += len(results)
+        failed += sum(r.status == "failed" for r in results)
+        if enough():
+            return state(store.runs_of(frontier - 1).stop)
+        progress(state(plan.runs))
+    return state(plan.runs)
+
+
+class Stop:
+    """Whether the intervals that `stop_when` names are narrow enough; asked part by part, in their order.
+
+    Units are what is averaged over (draws, or replications where nothing is drawn), so that replications of one draw
+    do not count as independent. Intervals are Student's. Stopping at a narrow interval favours samples that look
+    less spread than they are: with `at_least` 30 the coverage of a 95 % interval loses about a point.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan, self._asked = plan, plan.campaign.stop_when
+        self._means = [Mean() for _ in plan.policies]
+        self._open: list[list[float]] = [[] for _ in plan.policies]
+        self._unit = 0
+
+    def enough(self, rows: pa.Table) -> bool:
+        """Take a part's rows in; whether enough is known."""
+        asked = self._asked
+        assert asked is not None  # noqa: S101
+        units, policies = rows["unit"].to_pylist(), rows["policy"].to_pylist()
+        for unit, label, value in zip(units, policies, rows[asked.metric].to_pylist(), strict=True):
+            if unit != self._unit:
+                self._close()
+                self._unit = unit
+            if value is not None:
+                self._open[self._plan.policies.index(label)].append(value)
+        if rows["run"][-1].as_py() + 1 == self._plan.runs:
+            self._close()
+        compared = self._means[1:] if asked.difference else self._means
+        return all(m.count >= asked.at_least and t_interval(m, asked.confidence) <= asked.half_width for m in compared)
+
+    def _close(self) -> None:
+        means = [float(np.mean(v)) if v else math.nan for v in self._open]
+        for kept, value in zip(self._means, means, strict=True):
+            value -= means[0] if self._asked is not None and self._asked.difference else 0.0
+            if not math.isnan(value):
+                kept.add(value)
+        self._open = [[] for _ in self._open]

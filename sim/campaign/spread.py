@@ -1,0 +1,121 @@
+"""Draws of varied fields: a design in the unit cube, mapped through each field's distribution. Pure functions."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.campaign import (
+    SAMPLED,
+    Campaign,
+    Choice,
+    Column,
+    Grid,
+    Integers,
+    Linspace,
+    LogNormal,
+    Normal,
+    Sample,
+    Spread,
+    Triangular,
+    Uniform,
+)
+from scenarios.streams import stream
+
+Floats = NDArray[np.float64]
+MORRIS_LEVELS = 4
+TAIL = 0.005
+"""Morris' levels reach 0 and 1, where a distribution without ends has none: there it is cut at these quantiles."""
+
+
+def drawn_fields(campaign: Campaign) -> list[str]:
+    """The varied fields that are drawn, in the file's order."""
+    return [name for name, spread in campaign.vary.items() if isinstance(spread, SAMPLED)]
+
+
+def design(sample: Sample, fields: int, seed: int) -> Floats:
+    """Points of the unit cube [draws, fields], in the order in which they are flown.
+
+    Random, Latin hypercube and scrambled Sobol' points come from `scipy.stats.qmc`, Morris' trajectories and Saltelli's
+    blocks (without second order) from SALib; their order carries meaning and is kept.
+
+    Raises:
+        ImportError: SALib is missing where a method needs it.
+    """
+    if fields == 0:
+        return np.zeros((1, 0))
+    rng = stream(seed, 0, (), "campaign.design")
+    if sample.method == "random":
+        return rng.random((sample.count, fields))
+    if sample.method in ("morris", "saltelli"):
+        problem = unit_problem(fields)
+        number = int(rng.integers(2**32))
+        if sample.method == "morris":
+            from SALib.sample import morris
+
+            return np.asarray(morris.sample(problem, sample.count, num_levels=MORRIS_LEVELS, seed=number))
+        from SALib.sample import sobol
+
+        return np.asarray(sobol.sample(problem, sample.count, calc_second_order=False, seed=number))
+    from scipy.stats import qmc  # here: it takes most of a second to import
+
+    if sample.method == "sobol":
+        return np.asarray(qmc.Sobol(fields, rng=rng).random(sample.count))
+    return np.asarray(qmc.LatinHypercube(fields, rng=rng).random(sample.count))
+
+
+def unit_problem(fields: int, names: Sequence[str] = ()) -> dict[str, Any]:
+    """SALib's description of the unit cube: distributions are ours, so that every method has them all."""
+    return {"num_vars": fields, "names": list(names) or [f"x{i}" for i in range(fields)], "bounds": [[0, 1]] * fields}
+
+
+def quantile(spread: Spread, u: float, *, tail: float = 0.0) -> Any:
+    """The value of a drawn field at quantile u in [0, 1]."""
+    from scipy.special import ndtr, ndtri  # here, as elsewhere in campaigns: light commands do without scipy
+
+    if isinstance(spread, Uniform):
+        return spread.low + u * (spread.high - spread.low)
+    if isinstance(spread, Integers):
+        return min(spread.high, spread.low + int(u * (spread.high - spread.low + 1)))
+    if isinstance(spread, Triangular):
+        width, rise = spread.high - spread.low, spread.mode - spread.low
+        if u * width < rise:
+            return spread.low + float(np.sqrt(u * width * rise))
+        return spread.high - float(np.sqrt((1 - u) * width * (spread.high - spread.mode)))
+    if isinstance(spread, Choice):
+        weights = np.ones(len(spread.values)) if spread.weights is None else np.asarray(spread.weights)
+        upto = np.cumsum(weights) / weights.sum()
+        likely = np.flatnonzero(weights > 0)
+        return spread.values[min(int(np.searchsorted(upto, u, side="right")), int(likely[-1]))]
+    if isinstance(spread, Normal):
+        low = -np.inf if spread.low is None else spread.low
+        high = np.inf if spread.high is None else spread.high
+        below, above = (float(ndtr((end - spread.mean) / spread.sd)) for end in (low, high))
+        cut = np.clip(u, tail if spread.low is None else 0.0, 1.0 - (tail if spread.high is None else 0.0))
+        return float(np.clip(spread.mean + spread.sd * ndtri(below + cut * (above - below)), low, high))
+    assert isinstance(spread, LogNormal)  # noqa: S101
+    return spread.median * float(np.exp(spread.sigma * ndtri(np.clip(u, tail, 1.0 - tail))))
+
+
+def grid(campaign: Campaign, columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Every combination of the grid fields, the last field fastest; columns of one file go together."""
+    axes: dict[str, list[dict[str, Any]]] = {}
+    for name, spread in campaign.vary.items():
+        if isinstance(spread, Column):
+            rows = axes.setdefault(f"file {spread.file}", [{} for _ in columns[name]])
+            for row, value in zip(rows, columns[name], strict=True):
+                row[name] = value
+        elif isinstance(spread, Linspace):
+            axes[name] = [{name: whole(v)} for v in np.linspace(spread.low, spread.high, spread.count).tolist()]
+        elif isinstance(spread, Grid):
+            axes[name] = [{name: v} for v in spread.values]
+    return [{k: v for part in parts for k, v in part.items()} for parts in itertools.product(*axes.values())]
+
+
+def whole(value: float) -> float | int:
+    """A whole number as one, so that it does where the schema asks for one (it does for a number as well)."""
+    return int(value) if value == int(value) else value

@@ -1,0 +1,145 @@
+"""What a worker does: flies runs from their tasks alone. The same function on every engine.
+
+A task is the JSON text of {scenario, seed, replication, metrics, files}; nothing else reaches a run, so that its key,
+a hash over the task and the code, says everything that its row depends on.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from scenarios.schema import Scenario
+from sim.campaign.code import code_version, file_digest
+from sim.expect import metric
+from sim.folders import RunError
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+Task = tuple[int, str]
+"""A run's number and its task."""
+OPEN = ("phases", "payload_fates", "descriptor_drops", "battery", "drones", "events", "transitions", "energy_j")
+"""Parts of an outcome whose fields depend on what happened: one that is not there has no value."""
+WALL = ("wall_s", "realtime_factor", "policy_eval_us")
+MAX_ERROR = 300
+
+
+class Result(NamedTuple):
+    """A run's row, but for what the plan knows of it."""
+
+    run: int
+    key: str
+    status: str
+    """`done` or `failed`."""
+    error: str
+    fingerprint: str
+    values: tuple[float | None, ...]
+    """Of the campaign's metrics."""
+
+
+class OtherCodeError(RunError):
+    """The worker runs other code, or sees other files, than the campaign was begun with."""
+
+
+def task_key(task: str, code: str) -> str:
+    """The key of a run: 32 hex digits of SHA-256 over what the worker receives and the code version."""
+    return hashlib.sha256(f"{code}\n{task}".encode()).hexdigest()[:32]
+
+
+def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[Result], float]:
+    """Fly some runs one after the other; a run that fails gives a row that says so.
+
+    Returns:
+        The results, and the seconds that they took.
+
+    Raises:
+        OtherCodeError: results would not be those of the campaign.
+    """
+    begin_s = time.perf_counter()
+    if code_version() != code:
+        raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
+    _one_thread()
+    return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
+
+
+def fly_task(task: str) -> SortieRecord:
+    """One run's record.
+
+    Raises:
+        ValidationError, PolicyError, ...: whatever a sortie raises.
+    """
+    asked = json.loads(task)
+    scenario = Scenario.model_validate_json(json.dumps(asked["scenario"]), strict=True)
+    return run_sortie(scenario, None, asked["seed"], replication=asked["replication"])
+
+
+def _fly(run: int, task: str, code: str) -> Result:
+    asked, key = json.loads(task), task_key(task, code)
+    for path, digest in asked["files"].items():
+        _check_file(path, digest)
+    try:
+        record = fly_task(task)
+        result = outcome(record)
+        values = tuple(number(result, name) for name in asked["metrics"])
+    except Exception as error:  # whatever it is, the other runs go on
+        return Result(run, key, "failed", _in_one_line(error), "", (None,) * len(asked["metrics"]))
+    return Result(run, key, "done", "", record.fingerprint[:16], values)
+
+
+def number(result: dict[str, Any], name: str) -> float | None:
+    """A metric's number; None where there is none.
+
+    Raises:
+        ValueError: there never is one: no such field, wall clock, or no number.
+    """
+    top = name.partition(".")[0]
+    if top in WALL:
+        raise ValueError(f"{name}: is wall clock, a metric must follow from the run alone")
+    try:
+        value = metric(result, name)
+    except KeyError as error:
+        if top in OPEN and top in result:
+            return None
+        raise ValueError(error.args[0]) from None
+    if value is None:
+        return None
+    if not isinstance(value, bool | int | float):
+        kind = "a section" if isinstance(value, dict) else "a list" if isinstance(value, list) else "text"
+        raise ValueError(f"{name}: is {kind}, a metric must be a number")
+    return float(value) if math.isfinite(value) else None
+
+
+def _in_one_line(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False)[0]
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    else:
+        text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}"[:MAX_ERROR]
+
+
+@functools.cache
+def _check_file(path: str, digest: str) -> None:
+    try:
+        same = file_digest(Path(path)) == digest
+    except OSError as error:
+        raise OtherCodeError(f"{path}: cannot be read by this worker: {error.strerror}") from None
+    if not same:
+        raise OtherCodeError(f"{path}: is not the file that the campaign was begun with")
+
+
+@functools.cache
+def _one_thread() -> None:
+    """Sums in one order: a matrix product on two threads may round differently than on one."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)

@@ -1,0 +1,116 @@
+"""`sortie campaign`: fly thousands of sorties, go on where it stopped, report what they came to."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+from rich.progress import Progress as Bar
+from typer.core import TyperGroup
+
+from sim.console import err, out, user_errors
+
+if TYPE_CHECKING:
+    from sim.campaign.drive import Progress
+
+
+class _RunIsMeant(TyperGroup):
+    """`sortie campaign FILE` is `sortie campaign run FILE`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in {*self.commands, "--help"}:
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_RunIsMeant, no_args_is_help=True, help="Monte Carlo: `sortie campaign FILE` flies it, `report DIR` tells it."
+)
+
+
+@app.command("run")
+def run(
+    campaign: Annotated[str, typer.Argument(help="A campaign file, or a library campaign's name.")],
+    workers: Annotated[
+        int | None, typer.Option(help="Worker processes; 0 flies in this one; left out, one a core.", min=0)
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Join a running dask cluster: tcp://host:8786.")] = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="The campaign's folder; left out, runs/campaign-NAME.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Only go on; an error if there is nothing.")] = False,
+    report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
+) -> None:
+    """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
+    from scenarios.load_campaign import load_campaign
+    from sim.campaign.drive import run_campaign
+    from sim.campaign.engine import open_engine
+    from sim.campaign.plan import make_plan
+    from sim.folders import RunError
+
+    if scheduler is not None and workers is not None:
+        raise RunError("--workers and --scheduler: name one of them")
+    study = load_campaign(campaign)
+    folder = out_dir or Path("runs") / f"campaign-{study.campaign.campaign}"
+    with user_errors():
+        plan = make_plan(study)
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    _ensure_usable(folder, plan)
+    try:
+        with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
+            done = run_campaign(plan, folder, engine, resume_only=resume, progress=show)
+    except KeyboardInterrupt:
+        err.print(f"interrupted; what is finished is kept in {folder}, the same command goes on")
+        raise typer.Exit(130) from None
+    out.print(_in_words(done), soft_wrap=True)
+    if report_:
+        report(folder)
+    else:
+        out.print(f"kept in [bold]{folder}[/bold]")
+
+
+@app.command("report")
+def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
+    """Write report.md and its figures from what is finished."""
+    with user_errors():
+        from sim.campaign.report import write_report
+
+        path = write_report(folder)
+    out.print(f"told in [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
+
+
+def _ensure_usable(folder: Path, plan: Any) -> None:
+    """Before a cluster is started for nothing."""
+    from sim.campaign.store import MANIFEST, check_same
+    from sim.folders import ensure_folder
+
+    ensure_folder(folder, MANIFEST, "campaign")
+    check_same(folder, plan)
+
+
+def _in_words(done: Progress) -> str:
+    failed = f", [red]{done.failed} failed[/red]" if done.failed else ""
+    speed = f"; {done.flown} of them now, {60 * done.per_second:.1f} a minute" if done.flown else ", none of them now"
+    return f"{done.finished} runs finished{failed}{speed}"
+
+
+@contextmanager
+def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
+    """A bar with throughput and time left; silent without a terminal."""
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+    with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def show(p: Progress) -> None:
+            left = "" if math.isinf(p.left_s) else f", {p.left_s / 60:.0f} min left"
+            failed = f", {p.failed} failed" if p.failed else ""
+            text = f"{60 * p.per_second:.0f} a minute{left}{failed}"
+            bar.update(task, completed=p.finished, total=p.of, description=text)
+
+        yield show
