@@ -58,3 +58,21 @@ def contention(senders: int) -> Contention:
     some = 1.0 - (1.0 - t) ** senders
     one = senders * t * (1.0 - t) ** (senders - 1)
     return Contention(senders, t, p, SLOT_S * (1.0 - some) / one, (some - one) / one)
+
+
+def saturation_mbps(
+    senders: int, payload_bits: float, ppdu_s: float, ack_s: float, *, goes_on_at_once: bool = False
+) -> float:
+    """Bianchi's throughput of all `senders` together, always backlogged, in Mb/s.
+
+    Args:
+        senders: ≥ 1.
+        payload_bits: of one frame or A-MPDU.
+        ppdu_s, ack_s: time of it and of its answer.
+        goes_on_at_once: whoever has succeeded draws a backoff of 0 once in `CW_MIN` + 1 times and then sends again
+            unopposed (ns-3's reference for 802.11a counts this, that for 802.11ax does not; nor does the medium).
+    """
+    among = contention(senders)
+    in_a_row = 1.0 / (1.0 - 1.0 / (CW_MIN + 1)) if goes_on_at_once else 1.0
+    success_s = (ppdu_s + SIFS_S + ack_s + DIFS_S) * in_a_row + SLOT_S
+    return in_a_row * payload_bits * 1e-6 / (success_s + among.idle_s + among.collisions * (ppdu_s + DIFS_S))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from radio import airtime
-from radio.airtime import Exchanges, frames_exchanges, legacy_ppdu_s
-from radio.contention import DIFS_S, SIFS_S, SLOT_S, contention
+from radio.airtime import frames_exchanges, legacy_ppdu_s
+from radio.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
+from radio.rates import STANDARDS, Standard
 
 
 def test_a_descriptor_on_the_wire() -> None:
@@ -100,11 +101,37 @@ def test_he_throughput_with_aggregation(rate_mbps: float, frames: int, expected:
 
 def test_11a_throughput_is_ns3s_once_the_winner_may_go_on() -> None:
     """Its 11a reference lets the winner draw a zero backoff again (probability 1/16), its HE one does not."""
-    again = 1 / 16
-    ppdu = 20e-6 + 8 * 1538 / 54e6
-    success = Exchanges(1, ppdu, (ppdu + SIFS_S + airtime.ACK_S + DIFS_S) / (1 - again) + SLOT_S)
-    ours = [12e-3 / (1 - again) / success.channel_s(contention(n)) for n in (5, 10, 20, 50)]
+    ppdu_s = 20e-6 + 8 * 1538 / 54e6  # the reference does not round up to whole symbols
+    ours = [saturation_mbps(n, 12e3, ppdu_s, airtime.ACK_S, goes_on_at_once=True) for n in (5, 10, 20, 50)]
     assert ours == pytest.approx([29.832, 28.152, 26.293, 23.562], rel=1e-3)
-    plain = Exchanges(1, p := legacy_ppdu_s(1538, 54.0), p + SIFS_S + airtime.ACK_S + DIFS_S + SLOT_S)
     for n, reference in ((5, 29.832), (50, 23.562)):  # what the medium uses is lower by 2 to 4 %
-        assert -0.04 < 12e-3 / plain.channel_s(contention(n)) / reference - 1 < -0.02
+        plain = saturation_mbps(n, 12e3, legacy_ppdu_s(1538, 54.0), airtime.ACK_S)
+        assert -0.04 < plain / reference - 1 < -0.02
+
+
+@pytest.mark.parametrize("n", [1, 5, 50])
+def test_throughput_is_payload_over_the_channel_time_of_an_exchange(n: int) -> None:
+    one = frames_exchanges(16, 1538, 1538, 86.0, 16)
+    whole = saturation_mbps(n, 16 * 12e3, one.ppdu_s, airtime.BLOCK_ACK_S)
+    assert whole == pytest.approx(16 * 12e-3 / one.channel_s(contention(n)))
+
+
+@pytest.mark.parametrize("standard", STANDARDS.values(), ids=STANDARDS)
+def test_rates_follow_from_subcarriers_modulation_code_and_symbol(standard: Standard) -> None:
+    """Data subcarriers × bits × code rate / symbol time (IEEE 802.11-2020 §19.5, §21.5; 802.11ax §27.5), to 0.05 Mb/s."""
+    subcarriers = {"n": {20: 52, 40: 108}, "ac": {20: 52, 40: 108, 80: 234}, "ax": {20: 234, 40: 468, 80: 980}}
+    bits = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3)
+    assert set(standard.rates_mbps) == set(subcarriers[standard.name])
+    for width, rates in standard.rates_mbps.items():
+        exact = [subcarriers[standard.name][width] * b / standard.symbol_s * 1e-6 for b in bits[: len(rates)]]
+        assert rates == pytest.approx(exact, abs=0.051)
+
+
+def test_generations_differ_in_preamble_symbol_and_aggregation() -> None:
+    n, ac, ax = (STANDARDS[name] for name in ("n", "ac", "ax"))
+    assert airtime.ppdu_s(1538, 65.0, n) == pytest.approx(36e-6 + 48 * 4e-6)
+    assert airtime.ppdu_s(1538, 65.0, ac) == pytest.approx(40e-6 + 48 * 4e-6)
+    assert airtime.ppdu_s(1538, 86.0, ax) == pytest.approx(44e-6 + 11 * 13.6e-6)
+    assert airtime.ampdu_frames(1494, 135.0, 256, n) == 65_535 // 1498
+    assert airtime.ampdu_frames(1494, 390.0, 256, ac) == 64
+    assert airtime.ampdu_frames(1494, 600.5, 256, ax) == 256
