@@ -6,9 +6,12 @@ import pytest
 from perception.ap import Matched, match
 from perception.bench.difficulty import Difficulty
 from perception.bench.scenes import draw_captures, draw_scene
+from perception.checkpoint import read_facts
 from perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
 from perception.harness.statistics import compare
 from perception.scene import SceneModel
+from perception.study.plan import read_plan
+from perception.study.run import SHIPPED
 from perception.types import Share
 from scenarios.schema import Perception
 
@@ -46,3 +49,10 @@ def test_the_weights_are_small_and_have_a_card() -> None:
     card = SHIPPED_WEIGHTS.with_suffix(".md").read_text()
     assert "sortie train" in card
     assert "95 % interval" in card
+
+
+def test_the_default_is_the_seed_with_the_best_validation_ap_under_full_sharing() -> None:
+    plan = read_plan()
+    seeds = [SHIPPED / f"{plan.variants[0].job(seed)}.safetensors" for seed in plan.variants[0].seeds]
+    best = max(seeds, key=lambda path: read_facts(path)["validation"][0]["gain"]["ap_b"])
+    assert SHIPPED_WEIGHTS.read_bytes() == best.read_bytes(), f"must be {best.name}"

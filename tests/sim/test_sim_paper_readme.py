@@ -1,0 +1,22 @@
+"""The committed report and the README's results section are what the committed table renders to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from perception.harness import report, rows
+from perception.harness.sensitivity import Varied
+from sim import paper
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_repositorys_readme_is_what_its_committed_table_renders_to() -> None:
+    table, facts = rows.read(ROOT / "docs" / "paper" / paper.TABLE)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert report.put_into(readme, report.short(table, facts, "docs/paper/README.md")) == readme
+    text = (ROOT / "docs" / "paper" / paper.REPORT).read_text(encoding="utf-8")
+    varied = [Varied(**row) for row in pq.read_table(ROOT / "docs" / "paper" / paper.VARIED).to_pylist()]
+    assert text == report.report(table, facts, list(paper.FIGURES.items()), varied)
