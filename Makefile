@@ -21,8 +21,8 @@ $(STAMP): pyproject.toml constraints.txt
 sortie: $(STAMP) ## fly the main scenario and print its outcome (SCENARIO=... for another)
 	$(BIN)/sortie fly $(SCENARIO)
 
-test: $(STAMP) ## run the whole test suite
-	$(BIN)/python -m pytest
+test: $(STAMP) ## run the whole test suite, a worker a core
+	$(BIN)/python -m pytest -n auto
 
 quick: $(STAMP) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' -x
