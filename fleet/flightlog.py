@@ -320,18 +320,17 @@ def _stacked(t_s: Array, *columns: Column) -> tuple[Array, Array]:
 def _from_quaternion(wxyz: Column) -> Array:
     """w, x, y, z of FRD in NED to x, y, z, w of FLU in ENU; NaN where it is no rotation."""
     wxyz = np.asarray(wxyz, dtype=np.float64)
-    norm = np.linalg.norm(wxyz, axis=-1)
-    sound = np.asarray(norm > 0.5)
-    unit = np.where(sound[:, None], wxyz, [1.0, 0.0, 0.0, 0.0])
-    return np.where(sound[:, None], swap_attitude(to_xyzw(unit)), np.nan)
+    sound = np.linalg.norm(wxyz, axis=-1, keepdims=True) > 0.5
+    unit = np.where(sound, wxyz, [1.0, 0.0, 0.0, 0.0])
+    return np.where(sound, swap_attitude(to_xyzw(unit)), np.nan)
 
 
 def _from_euler(roll: Column, pitch: Column, yaw: Column, degrees: bool = False) -> Array:
     """Roll, pitch, yaw of FRD in NED to x, y, z, w of FLU in ENU."""
     angles = np.stack([yaw, pitch, roll], axis=-1).astype(np.float64)
-    sound = np.isfinite(angles).all(axis=-1)
-    turned = Rotation.from_euler("ZYX", np.where(sound[:, None], angles, 0.0), degrees=degrees)
-    return np.where(sound[:, None], swap_attitude(turned.as_quat()), np.nan)
+    sound = np.isfinite(angles.sum(axis=-1, keepdims=True))
+    turned = Rotation.from_euler("ZYX", np.where(sound, angles, 0.0), degrees=degrees)
+    return np.where(sound, swap_attitude(turned.as_quat()), np.nan)
 
 
 def _sik_dbm(units: Column) -> Array:
