@@ -60,7 +60,7 @@ class Dask:
         from distributed import KilledWorker, as_completed
 
         flying: dict[Any, list[Task]] = {}
-        done = as_completed()
+        done = as_completed(loop=self._client.loop)
 
         def submit(batch: list[Task]) -> None:
             name = f"sortie-{batch[0][0]}-{uuid.uuid4().hex[:12]}"
