@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
+from importlib.resources import files
 from math import isfinite
 
 from fleet.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
@@ -26,38 +27,11 @@ MAX_DESCRIPTOR_BYTES = 1024
 COVERAGE_BYTES = 64
 MAX_AGENT_ID = 254
 
-DESCRIPTOR_NAME = "sortie_msgs/msg/Descriptor"
-DESCRIPTOR_MSG = """\
-# One drone's context, published best effort at 10 Hz at most. ENU, FLU, SI units, quaternion x y z w.
-builtin_interfaces/Time stamp
-uint8 agent_id
-float32[3] position
-float32[4] orientation
-float32[3] velocity
-float32 footprint_radius
-float32 battery
-float32 cpu_headroom
-float32 gpu_headroom
-float32[] peer_goodput          # Mb/s to every other drone, ascending id, 0 where unmeasured
-uint8[64] coverage_grid         # 16 x 16 cells of two bits, south-west first, lowest bits first
-uint8 novelty_flags
-uint8 task_phase                # 0 transit, 1 search, 2 track, 3 return, 4 landing
-float32[4] region               # x, y, radius, 1; all zero for none
-uint16[] priority_target_ids
-"""
-DIRECTIVE_NAME = "sortie_msgs/msg/Directive"
-DIRECTIVE_MSG = """\
-# One policy decision for one outgoing link.
-uint8 source
-uint8 destination
-uint8 representation            # 0 none, 1 tracks, 2 detections, 3 features, 4 raw
-uint8 duty_percent
-float32[3] roi                  # x, y, radius; radius 0 for everywhere
-float32 rho
-float32 rate
-float32 deadline
-float32 fusion_weight
-"""
+_MSGS = files("fleet") / "sortie_msgs" / "msg"
+DESCRIPTOR_NAME, DIRECTIVE_NAME = "sortie_msgs/msg/ContextDescriptor", "sortie_msgs/msg/DataPlaneDirective"
+DESCRIPTOR_MSG = (_MSGS / "ContextDescriptor.msg").read_text("utf-8")
+"""The fields as ROS 2 defines them; `fleet/sortie_msgs` builds as a ROS 2 package."""
+DIRECTIVE_MSG = (_MSGS / "DataPlaneDirective.msg").read_text("utf-8")
 
 _TIME = [("i", 1), ("I", 1)]
 _FRONT = [*_TIME, ("B", 1), ("f", 3), ("f", 4), ("f", 3), ("f", 1), ("f", 3)]

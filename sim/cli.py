@@ -21,7 +21,18 @@ from policies.registry import own_fusion as own_fusion_of
 from scenarios.load import ScenarioError, library, load
 from scenarios.schema import Scenario, json_schema
 from scenarios.traces import TraceError
-from sim import cli_bench, cli_calibrate, cli_campaign, cli_paper, cli_recording, cli_study, cli_train, rundir, tables
+from sim import (
+    cli_bench,
+    cli_calibrate,
+    cli_campaign,
+    cli_export,
+    cli_paper,
+    cli_recording,
+    cli_study,
+    cli_train,
+    rundir,
+    tables,
+)
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
 from sim.expect import check as check_expectations
@@ -196,6 +207,7 @@ app.command()(cli_train.train)
 app.command()(cli_calibrate.calibrate)
 app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
+app.command()(cli_export.export)
 
 
 @app.callback(invoke_without_command=True)

@@ -9,7 +9,6 @@ import math
 import re
 from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +20,7 @@ from sim import playback_canvas as c
 from sim.outcome import transitions
 from sim.playback_canvas import Canvas, Floats, line
 from sim.sightings import Sighting
+from sim.words import decision_in_words, event_in_words
 
 AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")
@@ -187,7 +187,7 @@ class Charts:
             self._lane(change["t_s"], change["drone"])
         if changes:
             columns = rr.TextLog.columns(
-                text=[in_words(x) for x in changes],
+                text=[decision_in_words(x) for x in changes],
                 level=["INFO"] * len(changes),
                 color=[c.drone_colour(x["drone"]) for x in changes],
             )
@@ -212,7 +212,7 @@ class Charts:
     def _events(self, events: pa.Table) -> None:
         rows = events.to_pylist()
         if rows:
-            texts = [f"{'fleet' if r['drone'] < 0 else 'drone ' + str(r['drone'])}: {r['text']}" for r in rows]
+            texts = [event_in_words(r) for r in rows]
             columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[c.WARNING] * len(rows))
             t_s = [r["t_s"] for r in rows]
             self._canvas.columns("log/events", np.array(t_s), columns)
@@ -226,13 +226,6 @@ class Charts:
         """Mark moments on the floor of the plots."""
         for folder in MARKED:
             self._canvas.scalars(f"plots/{folder}/marks/{kind}", np.array(t_s), np.zeros(len(t_s)))
-
-
-def in_words(change: dict[str, Any]) -> str:
-    """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz, because goodput 3.1 < 5 Mb/s`."""
-    peers = ", ".join(str(p) for p in change["peers"])
-    why = f", because {change['reason']}" if change["reason"] else ""
-    return f"drone {change['drone']} → {peers}: {change['to']}{why}"
 
 
 def _mark(name: str, colour: c.Rgba, shape: rr.components.MarkerShape) -> rr.SeriesPoints:

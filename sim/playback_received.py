@@ -135,7 +135,7 @@ class Received:
         )
         self._canvas.columns(f"{path}/cells", t_s, boxes.partition(counts))
         t_s, strips, counts = self._news(f"{path}/whole_map", steps, squares)
-        self._canvas.columns(f"{path}/whole_map", t_s, rr.LineStrips3D.columns(strips=strips).partition(counts))
+        self._canvas.columns(f"{path}/whole_map", t_s, rr.LineStrips3D.columns(strips=list(strips)).partition(counts))
 
     def _news(self, path: str, steps: list[float], shapes: list[Floats]) -> tuple[Floats, Floats, list[int]]:
         """The steps at which there is something to show or something to wipe out, all shapes, and how many each has."""

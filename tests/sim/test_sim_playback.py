@@ -24,10 +24,10 @@ from sim.folders import RunError
 from sim.outcome import accuracy, matched, outcome, transitions
 from sim.playback import LiveViewer, open_viewer, save_rrd, scene_of, to_file
 from sim.playback_canvas import goodput_colours
-from sim.playback_charts import in_words
 from sim.playback_received import hatch
 from sim.record import TABLES, SortieRecord
 from sim.sortie import run_sortie
+from sim.words import decision_in_words
 
 DURATION_S = 8.0
 Rows = dict[str, dict[str, list[tuple[float, int, Any]]]]
@@ -425,14 +425,14 @@ def test_the_log_has_one_line_a_transition_in_words(rows: Rows, record: SortieRe
     expected = outcome(record)["transitions"]
     lines = rows["/log/decisions"]["TextLog:text"]
     assert len(lines) == len(expected) > 5
-    assert [line for _, _, (line,) in lines] == [in_words(t) for t in expected]
+    assert [line for _, _, (line,) in lines] == [decision_in_words(t) for t in expected]
     assert any("drone 2 → 0" in line and "goodput" in line and t_s > 4.0 for t_s, _, (line,) in lines)
 
 
 def test_a_transition_in_words() -> None:
     change = {"drone": 2, "peers": [1, 4], "to": "detections at 2 Hz", "reason": "goodput 3.1 < 5 Mb/s"}
-    assert in_words(change) == "drone 2 → 1, 4: detections at 2 Hz, because goodput 3.1 < 5 Mb/s"
-    assert in_words({**change, "peers": [1], "to": "nothing", "reason": ""}) == "drone 2 → 1: nothing"
+    assert decision_in_words(change) == "drone 2 → 1, 4: detections at 2 Hz, because goodput 3.1 < 5 Mb/s"
+    assert decision_in_words({**change, "peers": [1], "to": "nothing", "reason": ""}) == "drone 2 → 1: nothing"
 
 
 def test_transitions_in_slices_are_those_of_the_whole(record: SortieRecord) -> None:

@@ -1,0 +1,54 @@
+"""`sortie export`: a run in the formats of other tools."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim import rundir
+from sim.console import out
+from sim.folders import RunError, ensure_folder
+
+BAG = "bag"
+BEGIN = "2026-01-01T00:00:00"
+"""When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="A ROS 2 bag: a folder with metadata.yaml and one .mcap.")
+    ] = False,
+    out_path: Annotated[Path | None, typer.Option("--out", help="Where to; left out, in the run's folder.")] = None,
+    begin: Annotated[str, typer.Option(help="When the sortie began, ISO 8601, UTC unless it says otherwise.")] = BEGIN,
+) -> None:
+    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove."""
+    if not mcap:
+        raise typer.BadParameter("name a format: --mcap")
+    began = moment(begin)
+    path = out_path or run / BAG
+    ensure_folder(path, "metadata.yaml", "bag")
+    record = rundir.load(run)
+    try:
+        from sim.bag import write_bag
+
+        counts = write_bag(record, path, int(began.timestamp()) * 1_000_000_000)
+    except ImportError as error:
+        raise RunError("rosbags is missing: pip install 'sortie-sim[ros2]'") from error
+    out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)
+
+
+def moment(text: str) -> datetime:
+    """A time as ISO 8601; UTC where it names no zone.
+
+    Raises:
+        RunError: it is none, naming it.
+    """
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        raise RunError(f"begin is {text!r}, must be a time as in {BEGIN}") from None
+    return when if when.tzinfo is not None else when.replace(tzinfo=UTC)
