@@ -51,6 +51,8 @@ class PlaneRules:
     detached_after_periods: float
     dwell_s: float
     compute_delay_s: float
+    tile_limit_bytes: int | None = None
+    """Features go as tiles of at most so many bytes; None: as one sample."""
 
 
 class Received(NamedTuple):
@@ -59,6 +61,8 @@ class Received(NamedTuple):
     capture: Capture
     payload: Payload
     t_done_s: float
+    missing: tuple[int, ...] = ()
+    """Ranks (0 the best) of its feature cells that did not come, ascending."""
 
 
 class Senses(Protocol):
@@ -277,7 +281,7 @@ class Agent:
             self._shake_hands(capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
         for directive in self.gate.due(self.env.now):
-            payload = make_payload(directive, *pose, count_boxes)
+            payload = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
             if payload is not None:
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)
 

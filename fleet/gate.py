@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
+from fleet import tiles
 from fleet.wire import DIRECTIVE_BYTES
 from perception import budget
 from policies.contract import Directive, Disc, Representation
@@ -38,6 +39,10 @@ class Payload(NamedTuple):
     boxes: int
     index_bytes: int
     size_bytes: int
+    tile_cells: int = 0
+    """Cells of a tile, 0 where the payload is one sample."""
+    tile_bytes: int | None = None
+    """Bytes of a tile, None where the payload is one sample."""
 
     @property
     def reliable(self) -> bool:
@@ -46,9 +51,17 @@ class Payload(NamedTuple):
 
 
 def make_payload(
-    directive: Directive, est_x_m: float, est_y_m: float, est_yaw_rad: float, count_boxes: CountBoxes
+    directive: Directive,
+    est_x_m: float,
+    est_y_m: float,
+    est_yaw_rad: float,
+    count_boxes: CountBoxes,
+    tile_limit_bytes: int | None = None,
 ) -> Payload | None:
-    """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent."""
+    """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
+
+    Args: `tile_limit_bytes`: features go as tiles of at most so many bytes (fleet.tiles); None: as one sample.
+    """
     rung, rho, roi = directive.representation, directive.rho, directive.roi
     cells = boxes = index_bytes = 0
     if rung == Representation.NONE:
@@ -57,6 +70,20 @@ def make_payload(
         cells = budget.cells_sent(rho, roi, est_x_m, est_y_m, est_yaw_rad)
         if cells == 0:
             return None
+        if tile_limit_bytes is not None:
+            t = tiles.cut(cells, tile_limit_bytes)
+            return Payload(
+                rung,
+                rho,
+                roi,
+                directive.fusion_weight,
+                cells,
+                0,
+                t.index_bytes,
+                t.size_bytes,
+                t.cells_each,
+                t.tile_bytes,
+            )
         content, index_bytes = _feature_bytes(cells)
     elif rung == Representation.RAW:
         content = RAW_BYTES

@@ -8,6 +8,7 @@ pose and directive alone, so traffic is exact without running the detector.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -84,13 +85,20 @@ def _span(centre_m: float, radius_m: float) -> slice:
 
 
 def select(
-    rank: np.ndarray, rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float
+    rank: np.ndarray,
+    rho: float,
+    roi: tuple[float, float, float] | None,
+    x_m: float,
+    y_m: float,
+    yaw_rad: float,
+    missing: Sequence[int] = (),
 ) -> np.ndarray:
-    """[64, 64] bool: the cells that are sent, exactly `cells_sent` of them.
+    """[64, 64] bool: the cells that are sent, exactly `cells_sent` of them, less those that are missing.
 
     Args:
         rank: [64, 64] what ranks the cells (confidence or norm), higher first; ties go to the lower index.
         rho, roi, x_m, y_m, yaw_rad: as for `cells_sent`.
+        missing: which of those sent, counted from the best, did not arrive.
     """
     allowed = roi_mask(roi, x_m, y_m, yaw_rad).ravel()
     count = cells_sent(rho, roi, x_m, y_m, yaw_rad)
@@ -98,6 +106,7 @@ def select(
     if count:
         order = np.argsort(np.where(allowed, -rank.ravel().astype(np.float64), np.inf), kind="stable")
         out[order[:count]] = True
+        out[order[list(missing)]] = False
     return out.reshape(GRID, GRID)
 
 

@@ -85,7 +85,7 @@ class _Encoded:
     features: Tensor
     out: Tensor | None = None
     boxes: Boxes | None = None
-    in_part: dict[tuple[float, Disc | None], Tensor] = field(default_factory=dict)
+    in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Tensor] = field(default_factory=dict)
     """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
 
 
@@ -142,7 +142,8 @@ class TorchDetector:
         self._each(lambda c: self._look_alone(c) if c in look else self._head_alone(c), dict.fromkeys([*look, *rank]))
         if self._fusion.shares == "boxes":
             self._each(
-                self._head_in_part, {(s.capture, s.rho, s.roi): s for s in shared if s.representation in MAPS}.values()
+                self._head_in_part,
+                {(s.capture, s.rho, s.roi, s.missing): s for s in shared if s.representation in MAPS}.values(),
             )
         now = {ego.drone: ego for ego, _ in jobs}
         return self._each(lambda job: self._find(job[0], job[1], now), jobs)
@@ -202,7 +203,7 @@ class TorchDetector:
         """Whether the sender's own head is needed to say which cells it sent."""
         if share.representation != "features" or self._config.cells_by != "confidence":
             return False
-        return budget.must_choose(share.rho, share.roi, *share.capture.est_pose)
+        return _is_ranked(share)
 
     def _head_alone(self, capture: Capture) -> Tensor:
         """The head's output [7, 128, 128] without peers, worked out once."""
@@ -232,13 +233,13 @@ class TorchDetector:
         if share.representation == "raw":
             return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
         kept = self._kept[share.capture]
-        if not budget.must_choose(share.rho, share.roi, *share.capture.est_pose):
+        if not _is_ranked(share):
             rank = np.zeros((CELLS, CELLS))
         elif self._config.cells_by == "norm":
             rank = kept.features.norm(dim=0).numpy()
         else:
             rank = F.max_pool2d(self._head_alone(share.capture)[:1], 2)[0].numpy()
-        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose))[None]
+        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
         return self._fusion.shares == "features" and share.representation in MAPS
@@ -288,10 +289,15 @@ class TorchDetector:
 
     def _head_in_part(self, share: Share) -> Tensor:
         """The head's output [7, 128, 128] from what was sent of a map, worked out once for a capture and a budget."""
-        kept, key = self._kept[share.capture], (share.rho, share.roi)
+        kept, key = self._kept[share.capture], (share.rho, share.roi, share.missing)
         sent = self._sent(share)
         if bool(sent.all()):
             return self._head_alone(share.capture)
         if key not in kept.in_part:
             kept.in_part[key] = self._net.head((kept.features * sent)[None])[0]
         return kept.in_part[key]
+
+
+def _is_ranked(share: Share) -> bool:
+    """Whether cells stand in an order: some did not fit the budget, or some did not arrive (the best are sent first)."""
+    return bool(share.missing) or budget.must_choose(share.rho, share.roi, *share.capture.est_pose)

@@ -49,6 +49,8 @@ class Share:
     """x_m, y_m, radius_m, ENU."""
     weight: float
     """Fusion weight from the directive, 0 … 1."""
+    missing: tuple[int, ...] = ()
+    """Ranks (0 the best) of the cells that were sent and did not arrive."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,22 +24,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
+
 FloatArray = NDArray[np.float64]
 QUALITIES = ("snr_db", "loss", "goodput_mbps")
-COLUMNS = ("t_s", "sender", "receiver", *QUALITIES)
 BOUNDS = {
-    "t_s": (0.0, 86_400.0),
-    "sender": (0.0, 254.0),
-    "receiver": (0.0, 254.0),
+    "t_s": TIME_S,
+    "sender": DRONE,
+    "receiver": DRONE,
     "snr_db": (-200.0, 200.0),
     "loss": (0.0, 1.0),
     "goodput_mbps": (0.0, 10_000.0),
 }
-MAX_ROWS = 5_000_000
-
-
-class TraceError(ValueError):
-    """A trace is not as it must be; the message names the file, the column, the row and the bound."""
 
 
 class Given(NamedTuple):
@@ -77,70 +73,28 @@ def read_links(path: str | Path, drones: int) -> LinkTrace:
         drones: drones of the fleet; a trace of another is refused.
 
     Raises:
-        TraceError: no such file, no table, a column missing, a value out of bounds, a link to oneself, time that does
-            not increase.
+        TraceError: as for `scenarios.traces.read_columns`; no quality, an unknown drone, a link to oneself, time that
+            does not increase.
     """
     path = Path(path)
-    columns = _columns(path)
-    ends = np.stack([columns["sender"], columns["receiver"]], axis=1)
+    columns = read_columns(path, BOUNDS, required=("t_s", "sender", "receiver"))
+    if not any(name in columns for name in QUALITIES):
+        raise TraceError(f"{path}: a link trace needs a column {', '.join(QUALITIES[:-1])} or {QUALITIES[-1]}")
     for name in ("sender", "receiver"):
-        wrong = columns[name] != np.round(columns[name])  # NaN too
-        if wrong.any():
-            raise TraceError(f"{path}: {name} in row {_first(wrong)}, must be a whole number")
+        check_whole(path, name, columns[name])
         if (beyond := columns[name] >= drones).any():
-            at = _first(beyond)
-            raise TraceError(
-                f"{path}: {name} in row {at} is {ends[at - 1].max():g}, must be below fleet.drones = {drones}"
-            )
+            drone = columns[name][first_row(beyond) - 1]
+            raise TraceError(f"{path}: {name} {drone:g}, must be below fleet.drones = {drones}")
+    ends = np.stack([columns["sender"], columns["receiver"]], axis=1).astype(int)
     if (same := ends[:, 0] == ends[:, 1]).any():
-        raise TraceError(f"{path}: row {_first(same)} links drone {ends[_first(same) - 1, 0]:g} to itself")
+        raise TraceError(f"{path}: row {first_row(same)} links drone {ends[first_row(same) - 1, 0]} to itself")
     links = {}
-    for i, j in np.unique(ends, axis=0).astype(int).tolist():
+    for i, j in np.unique(ends, axis=0).tolist():
         row = np.flatnonzero((ends[:, 0] == i) & (ends[:, 1] == j))
-        t_s = columns["t_s"][row]
-        if (late := np.diff(t_s) <= 0).any():
-            at = int(row[_first(late)])
-            raise TraceError(f"{path}: t_s in row {at + 1} of link {i} to {j} is {columns['t_s'][at]:g}, must increase")
+        check_increasing(path, columns["t_s"], row, f"link {i} to {j}")
         known = {}
         for name in QUALITIES:
             if name in columns and (there := ~np.isnan(columns[name][row])).any():
-                known[name] = (t_s[there], columns[name][row][there])
+                known[name] = (columns["t_s"][row][there], columns[name][row][there])
         links[i, j] = known
     return LinkTrace(links)
-
-
-def _columns(path: Path) -> dict[str, FloatArray]:
-    import pyarrow as pa
-    import pyarrow.csv
-    import pyarrow.parquet
-
-    if not path.is_file():
-        raise TraceError(f"{path}: no such trace")
-    try:
-        table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise TraceError(f"{path}: is not a {path.suffix or 'Parquet'} table: {str(error).splitlines()[0]}") from error
-    missing = [name for name in COLUMNS[:3] if name not in table.column_names]
-    if missing or not any(name in table.column_names for name in QUALITIES):
-        lacks = ", ".join(missing) or " or ".join(QUALITIES)
-        raise TraceError(f"{path}: no column {lacks}, a link trace needs {', '.join(COLUMNS[:3])} and a quality")
-    if not 0 < table.num_rows <= MAX_ROWS:
-        raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
-    columns = {}
-    for name in (name for name in COLUMNS if name in table.column_names):
-        try:
-            values = table[name].cast(pa.float64()).to_numpy()
-        except pa.ArrowException:
-            raise TraceError(f"{path}: column {name} does not hold numbers") from None
-        low, high = BOUNDS[name]
-        wrong = ~((values >= low) & (values <= high) | (np.isnan(values) & (name in QUALITIES)))
-        if wrong.any():
-            at = _first(wrong)
-            raise TraceError(f"{path}: {name} in row {at} is {values[at - 1]:g}, must be within {low:g} … {high:g}")
-        columns[name] = values
-    return columns
-
-
-def _first(wrong: NDArray[np.bool_]) -> int:
-    """Row of the first true value, counted from 1."""
-    return int(np.argmax(wrong)) + 1

@@ -13,9 +13,10 @@ from typing import Any
 from fleet.agent import Agent, Received
 from fleet.auth import Dropped, Opened, open_datagram
 from fleet.gate import Payload
+from fleet.tiles import cells_of
 from perception.types import Capture
 from policies.contract import Representation
-from radio import Air, Status, Transmission
+from radio import Air, Transmission
 from sim.record import HANDSHAKE, REPRESENTATIONS, Recorder
 
 
@@ -66,6 +67,7 @@ class Ether:
             reliable=payload.reliable,
             deadline_s=deadline_s,
             on_done=self._done,
+            piece_bytes=payload.tile_bytes,
         )
         self._pending[number] = (payload, capture)
 
@@ -84,8 +86,9 @@ class Ether:
     def _done(self, transmission: Transmission) -> None:
         payload, capture = self._pending.pop(transmission.number)
         self._write(transmission, payload, capture)
-        if transmission.status is Status.DELIVERED and transmission.kind != HANDSHAKE:
-            self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s))
+        if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
+            missing = cells_of(transmission.missing, payload.cells, payload.tile_cells)
+            self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s, missing))
 
     def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
         self._recorder.rows["transmissions"].append((transmission, payload, capture.t_s))
@@ -101,7 +104,7 @@ def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
         t["t_sent_s"], t["sender"], t["receiver"], t["kind"], captured_s, p["rho"], p["cells"], p["boxes"],
         p["index_bytes"], t["payload_bytes"], t["wire_bytes"], t["deadline_s"], t["t_start_s"], t["t_done_s"],
         t["status"], t["reason"], t["fragments"], t["fragments_lost"], t["repairs"], t["mcs"], t["snr_db"],
-        t["airtime_s"],
+        t["airtime_s"], t["hops"], t["arrived_bytes"],
     ]  # fmt: skip
 
 

@@ -25,6 +25,9 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     sent = tables["transmissions"]
     data_sent = _sum(sent["payload_bytes"])
     by_status = {s: _sum(sent.filter(pc.equal(sent["status"], s))["payload_bytes"]) for s in DATA_STATUSES}
+    partial = sent.filter(pc.equal(sent["status"], "partial"))
+    by_status["delivered"] += _sum(partial["arrived_bytes"])  # what the rest of them came to is lost
+    by_status["lost"] += _sum(partial["payload_bytes"]) - _sum(partial["arrived_bytes"])
     context_bytes = totals["context_descriptor_bytes"] + totals["context_directive_bytes"]
     scenario = record.scenario
     minutes = scenario.duration_s / 60.0

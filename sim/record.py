@@ -49,11 +49,11 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         t_s=F, drone=I, peer=I, representation=S, rho=F, roi_x_m=F, roi_y_m=F, roi_radius_m=F, rate_hz=F,
         deadline_s=F, fusion_weight=F, duty_percent=I, asked=S, asked_rate_hz=F, link=S, reason=S,
     ),
-    # one row a payload handed to the radio, with its fate
+    # one row a payload handed to the radio, with its fate; `partial`: some of its tiles arrived, `arrived_bytes` of it
     "transmissions": dict(
         t_sent_s=F, drone=I, peer=I, representation=S, captured_s=F, rho=F, cells=I, boxes=I, index_bytes=I,
         payload_bytes=I, wire_bytes=I, deadline_s=F, t_start_s=F, t_done_s=F, status=S, reason=S, fragments=I,
-        fragments_lost=I, repairs=I, mcs=I, snr_db=F, airtime_s=F,
+        fragments_lost=I, repairs=I, mcs=I, snr_db=F, airtime_s=F, hops=I, arrived_bytes=I,
     ),
     # one row a scored fusion: an ego, and the peers whose payloads it held; a weight is the directive's times trust
     "fusions": dict(

@@ -33,7 +33,8 @@ def as_share(received: Received) -> Share:
     """A held payload as the detector takes it."""
     payload, roi = received.payload, received.payload.roi
     disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-    return Share(received.capture, payload.representation.name.lower(), payload.rho, disc, payload.fusion_weight)
+    name = payload.representation.name.lower()
+    return Share(received.capture, name, payload.rho, disc, payload.fusion_weight, received.missing)
 
 
 Moment = tuple[float, list[tuple[Capture, list[Share]]]]

@@ -123,6 +123,7 @@ def run_sortie(
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,
         compute_delay_s=config.compute_delay_s,
+        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
     )
     notes = AgentNotes(recorder)
     agents = [

@@ -102,9 +102,9 @@ class RecordedDetector:
         if share.representation != "raw":
             est = capture.est_pose
             rank = np.zeros((CELLS, CELLS))
-            if budget.must_choose(share.rho, share.roi, *est):
+            if share.missing or budget.must_choose(share.rho, share.roi, *est):
                 rank = self._recording.rank(frame, capture.drone, config.cells_by)
-            cells = budget.select(rank, share.rho, share.roi, *est)
+            cells = budget.select(rank, share.rho, share.roi, *est, share.missing)
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight)
 

@@ -165,6 +165,7 @@ class SurrogateDetector:
         sent = pairs.aimed & (
             (rank < (exchange.cells / np.maximum(exchange.allowed, 1.0))[pairs.row]) | everything[pairs.row]
         )
+        exchange.drop_missing(sent, rank, pairs.row)
         x = covariates(pairs, exchange, looks, confidence, sent, rank, zeros[pairs.row])
         score = p.find(x, luck.find[pairs.look])
         here = np.flatnonzero(score >= max(p.floor, config.score_threshold))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,25 @@ class Exchange:
     roi: Floats
     weight: Floats
     pose: Floats
+    missing: dict[tuple[int, int], NDArray[np.intp]] = field(default_factory=dict)
+    """Ranks (0 the best) of the cells that did not arrive, by (row, slot), where any."""
+
+    @property
+    def arrived(self) -> Floats:
+        """[m, k] how many cells came."""
+        if not self.missing:
+            return self.cells
+        out = self.cells.copy()
+        for at, ranks in self.missing.items():
+            out[at] -= len(ranks)
+        return out
+
+    def drop_missing(self, sent: NDArray[np.bool_], rank: NDArray[np.float32], row: Ints) -> None:
+        """Take back, of what was sent [n, k], what did not arrive; `rank` [n, k] and `row` [n] as in `covariates`."""
+        for (m, slot), ranks in self.missing.items():
+            here = np.flatnonzero((row == m) & sent[:, slot])
+            number = (rank[here, slot] * self.allowed[m, slot]).astype(np.intp)
+            sent[here, slot] = ~np.isin(number, ranks)
 
     @classmethod
     def of(
@@ -56,6 +75,7 @@ class Exchange:
         """Of jobs whose captures stand in `column`; `lies` are other poses than the senders' own for their maps."""
         rows: list[tuple[int, int, int]] = []
         values: list[tuple[float, ...]] = []
+        missing: dict[tuple[int, int], NDArray[np.intp]] = {}
         for m, (_, shares) in enumerate(jobs):
             slot = 0
             for i, s in enumerate(shares):
@@ -65,6 +85,8 @@ class Exchange:
                     pose = (x, y, yaw) if lies is None else lies[m][i]
                     rows.append((m, slot, column[s.capture]))
                     values.append((rho, s.weight, *(disc or (0.0, 0.0, np.inf)), *pose, x, y, yaw))
+                    if s.missing:
+                        missing[m, slot] = np.array(s.missing, np.intp)
                     slot += 1
         m = len(jobs)
         row, slots, sender_of = np.array(rows, np.intp).reshape(-1, 3).T
@@ -80,7 +102,9 @@ class Exchange:
         sender = np.full((m, k), -1)
         sender[row, slots] = sender_of
         egos = np.array([column[ego] for ego, _ in jobs], np.intp)
-        return cls(egos, sender, filled[..., 8], filled[..., 9], filled[..., 2:5], filled[..., 1], filled[..., 5:8])
+        return cls(
+            egos, sender, filled[..., 8], filled[..., 9], filled[..., 2:5], filled[..., 1], filled[..., 5:8], missing
+        )  # fmt: skip
 
 
 def _allowed(roi: Floats, pose: Floats) -> Floats:
@@ -187,8 +211,9 @@ def covariates(
     count = np.maximum(total, np.float32(1e-6))
     mean = np.where(total > 0, sure / count, np.float32(NO_PEER))
     spread = np.sqrt(middle_x * middle_x + middle_y * middle_y) / (1.0 + total)
-    most = np.log(np.maximum(np.where(exchange.sender >= 0, exchange.cells, 1.0).max(axis=1, initial=1.0), 1.0)) / 8.0
-    part = np.where(exchange.sender >= 0, allow, 0.0).max(axis=1, initial=0.0)
+    most = np.log(np.maximum(np.where(exchange.sender >= 0, exchange.arrived, 1.0).max(axis=1, initial=1.0), 1.0)) / 8.0
+    came_of = exchange.arrived / np.maximum(exchange.allowed, 1.0)
+    part = np.where(exchange.sender >= 0, came_of, 0.0).max(axis=1, initial=0.0)
     own = looks.covariates[pairs.look]
     columns = (
         confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
@@ -210,7 +235,7 @@ def alarm_covariates(exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_],
     m = len(exchange.ego)
     cars = (looks.index[exchange.ego] >= 0).sum(axis=1)
     shares = (exchange.sender >= 0).sum(axis=1)
-    received = exchange.cells.sum(axis=1) / CELLS**2
+    received = exchange.arrived.sum(axis=1) / CELLS**2
     silent = np.where(zeros, shares - received, 0.0)
     seams = np.where(zeros, 0.0, np.sqrt(np.clip(received, 0, 1) * np.clip(shares - received, 0, 4)))
     plenty = np.where(shares > 0, np.log10(np.maximum(received, 1e-3)), 0.0)
