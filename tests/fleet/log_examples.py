@@ -1,0 +1,116 @@
+"""Small flight logs of every kind, made by hand: a square flown level, its battery draining, with a radio."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from fleet.mavlink import Origin, Telemetry, Transmitter, geodetic, messages
+
+ORIGIN = Origin(47.0, 8.0, 400.0)
+STEPS = 100
+PERIOD_S = 0.1
+
+
+def state(k: int) -> Telemetry:
+    """At step k: 3 m/s east and 4 m/s north, climbing 1 m/s, heading 90° (north)."""
+    t_s = k * PERIOD_S
+    return Telemetry(
+        time_s=t_s,
+        position_m=(3 * t_s, 4 * t_s, t_s),
+        orientation_xyzw=(0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)),
+        velocity_mps=(3.0, 4.0, 1.0),
+        body_rates_radps=(0.0, 0.0, 0.0),
+        soc=0.9 - 0.001 * k,
+        voltage_v=16.0 - 0.01 * k,
+        current_a=15.0,
+        energy_used_j=0.0,
+        cpu_load=0.5,
+        landed=False,
+    )
+
+
+def tlog() -> bytes:
+    """The flight as this project's own telemetry."""
+    transmitter = Transmitter(0)
+    out = b""
+    for k in range(STEPS):
+        for message in messages(state(k), ORIGIN):
+            out += struct.pack(">Q", 1_700_000_000_000_000 + k * 100_000) + transmitter.pack(message)
+    return out
+
+
+_DATAFLASH = {
+    "FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"),
+    "PARM": (129, "QNf", "TimeUS,Name,Value"),
+    "GPS": (130, "QBLLe", "TimeUS,Status,Lat,Lng,Alt"),
+    "XKF1": (131, "QBfffffff", "TimeUS,C,VN,VE,VD,PN,PE,PD,Roll"),
+    "ATT": (132, "Qccc", "TimeUS,Roll,Pitch,Yaw"),
+    "BAT": (133, "QBfff", "TimeUS,Instance,Volt,Curr,CurrTot"),
+    "RAD": (134, "QBB", "TimeUS,RSSI,RemRSSI"),
+}
+_STRUCT = {"Q": "Q", "B": "B", "n": "4s", "N": "16s", "Z": "64s", "f": "f", "L": "i", "e": "i", "c": "h"}
+
+
+def dataflash_message(name: str, *values: object) -> bytes:
+    number, form, _ = _DATAFLASH[name]
+    return b"\xa3\x95" + bytes([number]) + struct.pack("<" + "".join(_STRUCT[c] for c in form), *values)
+
+
+def dataflash() -> bytes:
+    """The flight as ArduPilot would log it, begun 5 s after boot."""
+    out = b""
+    for name, (number, form, columns) in _DATAFLASH.items():
+        length = 3 + struct.calcsize("<" + "".join(_STRUCT[c] for c in form))
+        out += dataflash_message("FMT", number, length, name.encode(), form.encode(), columns.encode())
+    out += dataflash_message("PARM", 5_000_000, b"BATT_CAPACITY", 5000.0)
+    for k in range(STEPS):
+        s, us = state(k), 5_000_000 + k * 100_000
+        (east, north, up), (ve, vn, vu) = s.position_m, s.velocity_mps
+        lat, lon, alt = geodetic(s.position_m, ORIGIN)
+        out += dataflash_message("GPS", us, 3, round(lat * 1e7), round(lon * 1e7), round(alt * 100))
+        out += dataflash_message("XKF1", us, 0, vn, ve, -vu, north, east, -up, 0.0)
+        out += dataflash_message("XKF1", us, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0)  # another core
+        out += dataflash_message("ATT", us, 0, 0, 0)
+        out += dataflash_message("BAT", us, 0, s.voltage_v, s.current_a, 5000 * (1 - s.soc))
+        out += dataflash_message("RAD", us, 190, 150)
+    return out
+
+
+_TOPICS = {
+    "vehicle_local_position": "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz;bool xy_valid;"
+    "bool z_valid;bool v_xy_valid;bool v_z_valid;uint8_t[4] _padding0;",
+    "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+    "battery_status": "uint64_t timestamp;float voltage_v;float current_a;float remaining;",
+    "input_rc": "uint64_t timestamp;int32_t rssi;",
+}
+
+
+def ulog_message(kind: str, body: bytes) -> bytes:
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def ulog() -> bytes:
+    """The flight as PX4 would log it."""
+    out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 5_000_000)
+    out += ulog_message("P", b"\x14float BAT_CAPACITY__" + struct.pack("<f", 5000.0))
+    for name, fields in _TOPICS.items():
+        out += ulog_message("F", f"{name}:{fields}".encode())
+    for number, name in enumerate(_TOPICS):
+        out += ulog_message("A", struct.pack("<BH", 0, number) + name.encode())
+    for k in range(STEPS):
+        s, us = state(k), 5_000_000 + k * 100_000
+        (east, north, up), (ve, vn, vu) = s.position_m, s.velocity_mps
+        rows = (
+            struct.pack("<Q6f4?", us, north, east, -up, vn, ve, -vu, True, True, True, True),
+            struct.pack("<Q4f", us, 1.0, 0.0, 0.0, 0.0),
+            struct.pack("<Q3f", us, s.voltage_v, s.current_a, s.soc),
+            struct.pack("<Qi", us, 80),
+        )
+        for number, row in enumerate(rows):
+            out += ulog_message("D", struct.pack("<H", number) + row)
+    return out
+
+
+KINDS = {"tlog": tlog, "bin": dataflash, "ulg": ulog}
