@@ -85,7 +85,7 @@ class Air:
             seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
         )  # fmt: skip
         self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
-        self._service = Service(config)
+        self._service = Service(config, seed, replication)
         self._luck = SampleLuck(seed, replication)
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
@@ -383,6 +383,7 @@ class Air:
     def _book(self, s: Sample) -> None:
         """Count what was acknowledged since the last time."""
         if s.remaining < s.mark_left:
+            self._service.learn(s, self._env.now)
             self._drained_bits[s.sender] += s.book()
 
     def _drained(self, sender: int) -> float:

@@ -22,6 +22,7 @@ from radio.airtime import (
 from radio.contention import contention
 from radio.medium import Job
 from radio.overrides import LinkNow
+from radio.rate_control import Minstrel
 from radio.rates import STANDARDS, rate_table, rescale
 from radio.transmission import Status, Transmission, losses
 from scenarios.schema import Radio
@@ -54,6 +55,7 @@ class Sample(Job):
         "on_done",
         "origin",
         "pass_bytes",
+        "pass_frames",
         "passes",
         "payload_bytes",
         "piece_bytes",
@@ -103,6 +105,7 @@ class Sample(Job):
         self.fragments = fragments
         self.left = fragments  # fragments of this pass
         self.pass_bytes = wire_bytes  # on the wire in this pass
+        self.pass_frames = 0.0  # with MAC retries, in this pass
         self.lost = 0
         self.repairs = 0
         self.passes = 0  # through the medium, on this hop and before this one
@@ -203,13 +206,14 @@ class Sample(Job):
 class Service:
     """What a link of a given quality asks of the medium for a sample: rate control, MAC retries, exchanges."""
 
-    def __init__(self, config: Radio) -> None:
+    def __init__(self, config: Radio, seed: int, replication: int) -> None:
         self._config = config
         self._frame_bytes = frame_bytes(config.fragment_bytes, fragmented=True)
         self._standard = STANDARDS[config.standard]
         self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes, config.standard)
         self._rates = self._standard.rates_mbps[config.bandwidth_mhz]
         self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
+        self._minstrel = Minstrel(self._rates, seed, replication) if config.rate_control == "minstrel" else None
         probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S, self._standard)
         self._probe = probe.scaled(config.retry_limit + 1.0)
         self._mbps_at: FloatArray | None = None
@@ -242,6 +246,8 @@ class Service:
         s.snr_db = snr_db
         table = self._table
         mcs = table.mcs[table.index(known_snr_db)]
+        if self._minstrel is not None and mcs >= 0:
+            mcs = self._minstrel.mcs(s.sender, s.receiver, now_s)
         if given is not None:
             mcs = self._given_mcs(mcs, given)
         reason = "receiver_gone" if receiver_gone else "no_link" if mcs < 0 else ""
@@ -267,6 +273,7 @@ class Service:
         if given is not None:
             per = 1.0 - (1.0 - per) * (1.0 - given.burst_loss) if isnan(given.loss) else given.loss
         mean_tries, s.loss_probability, s.full_mbps = self._quality(mcs, per)
+        s.pass_frames = s.left * mean_tries
         if given is not None and not isnan(given.goodput_mbps):
             mean_tries, s.full_mbps = self._full_mbps[mcs] / given.goodput_mbps, given.goodput_mbps
         key = (payload, mcs, s.reliable, s.piece_bytes)
@@ -276,6 +283,13 @@ class Service:
                 self._demands.clear()
             demand = self._demands[key] = self._demand(*key)
         s.demand(demand, mean_tries)
+
+    def learn(self, s: Sample, now_s: float) -> None:
+        """Let rate control see what a sample has sent since its progress was last booked."""
+        if self._minstrel is not None and not s.unreachable:
+            at = self._table.index(s.snr_db)
+            frames = (s.mark_left - s.remaining) * s.pass_frames
+            self._minstrel.sent(s.sender, s.receiver, now_s, s.mcs, frames, [row[at] for row in self._table.all_per])
 
     def _given_mcs(self, mcs: int, given: LinkNow) -> int:
         """The slowest MCS that carries a traced goodput (or the fastest); some MCS where a loss alone is traced."""
