@@ -7,10 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+
+class Connectivity(NamedTuple):
+    """A fleet's links in one look."""
+
+    connected: bool
+    """Whether every drone reaches every other, over several hops if need be."""
+    cut: tuple[int, ...]
+    """Drones outside the largest group whose members all reach one another, ascending."""
+    bottleneck: tuple[int, int, float] | None
+    """Sender, receiver and quality of the link that limits the worst-off pair that is connected; None without links."""
 
 
 def link_graph(quality: ArrayLike, threshold: float) -> Any:
@@ -90,6 +101,39 @@ def widest_path(graph: Any, source: int, target: int) -> list[int]:
     if low == len(strengths):
         return []
     return [int(i) for i in nx.shortest_path(_at_least(graph, strengths[low]), source, target)]
+
+
+def widths(quality: ArrayLike) -> NDArray[np.float64]:
+    """How good the weakest link of the widest route between each pair is (Floyd's recursion with min and max).
+
+    Args:
+        quality: [N, N], sender by receiver; NaN is no link.
+
+    Returns:
+        [N, N]; −inf where there is no route, and on the diagonal.
+    """
+    wide = np.array(quality, dtype=float)
+    wide[np.isnan(wide)] = -np.inf
+    np.fill_diagonal(wide, -np.inf)
+    for via in range(len(wide)):
+        np.maximum(wide, np.minimum(wide[:, via, None], wide[None, via, :]), out=wide)
+    np.fill_diagonal(wide, -np.inf)
+    return wide
+
+
+def connectivity(quality: ArrayLike, threshold: float) -> Connectivity:
+    """How a fleet hangs together; arguments and errors as for `link_graph`."""
+    graph = link_graph(quality, threshold)
+    usable = np.array(quality, dtype=float)
+    usable[~(usable >= threshold)] = np.nan
+    np.fill_diagonal(usable, np.nan)
+    reached = widths(usable)
+    worst = None
+    if np.isfinite(reached).any():
+        limit = reached[np.isfinite(reached)].min()
+        i, j = (int(at[0]) for at in np.nonzero(usable == limit))
+        worst = (i, j, float(limit))
+    return Connectivity(is_connected(graph), tuple(cut_drones(graph)), worst)
 
 
 def _at_least(graph: Any, quality: float) -> Any:

@@ -67,6 +67,11 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     "mission": dict(t_s=F, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target_x_m=F, target_y_m=F),
     # the medium, one row a frame
     "medium": dict(t_s=F, busy_fraction=F, connected_drones=I),
+    # once a second where payloads are relayed: whether all drones reach all, who is outside the largest such group, and
+    # the link that limits the worst-off pair (−1 and NaN where there is none)
+    "topology": dict(
+        t_s=F, connected=B, cut_drones=pa.list_(I), bottleneck_sender=I, bottleneck_receiver=I, bottleneck_mbps=F,
+    ),
     # energy by drone and cause at the end
     "energy": dict(drone=I, cause=S, energy_j=F),
     # what happened to the fleet: scenario events, landings

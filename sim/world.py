@@ -22,7 +22,7 @@ from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc
 from radio import Air
-from radio.topology import linked_drones
+from radio.topology import connectivity, linked_drones
 from scenarios.schema import Scenario
 from sim.mission import MissionPlan
 from sim.record import Recorder
@@ -32,6 +32,9 @@ _NO_DISC, _NOWHERE = (NAN, NAN, NAN), (NAN, NAN)
 SECOND_S = 1.0
 USABLE_SNR_DB = 0.0
 """Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
+
+LEAST_MBPS = 1e-6
+"""A link that carries anything at all."""
 
 
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
@@ -150,6 +153,16 @@ class World:
         flying = [a.drone for a in self.agents if a.airborne]
         linked = linked_drones(self.air.snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
         self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
+        if self._scenario.radio.relay_max_hops > 1:
+            self._write_topology(flying)
+
+    def _write_topology(self, flying: Sequence[int]) -> None:
+        """How the fleet hangs together: whether all reach all, who is cut off, and the link that limits the worst-off pair."""
+        whole = connectivity(self.air.link_mbps()[np.ix_(flying, flying)], LEAST_MBPS)
+        i, j, mbps = whole.bottleneck or (None, None, NAN)
+        ends = (-1, -1) if i is None or j is None else (flying[i], flying[j])
+        cut = [flying[k] for k in whole.cut]
+        self._recorder.rows["topology"].append((self.env.now, whole.connected, cut, *ends, mbps))
 
     def _write(self, frame: int) -> None:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
