@@ -37,6 +37,7 @@ from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
 from sim.expect import check as check_expectations
 from sim.folders import RunError
+from sim.named import policy_overrides
 from sim.outcome import outcome
 from sim.sortie import VERSION, Observer, run_sortie
 
@@ -81,7 +82,9 @@ def _plain(error: BaseException) -> str:
 
 @app.command()
 def fly(
-    scenario: ScenarioArgument,
+    scenario: Annotated[
+        str | None, typer.Argument(help="A scenario file, or a library scenario's name; none with --from-campaign.")
+    ] = None,
     policy: PolicyOption = None,
     seed: SeedOption = None,
     set_: SetOption = None,
@@ -90,9 +93,16 @@ def fly(
     view_: Annotated[bool, typer.Option("--view", help="Open the recording afterwards.")] = False,
     recording: Annotated[bool, typer.Option(help="Save sortie.rrd.")] = True,
     profile: Annotated[bool, typer.Option("--profile", help="Tell where the wall time went.")] = False,
+    campaign: Annotated[
+        Path | None, typer.Option("--from-campaign", metavar="DIR", help="Fly one run of a campaign again; see --run.")
+    ] = None,
+    run: Annotated[int | None, typer.Option("--run", help="Its number, as in the table's column `run`.", min=0)] = None,
 ) -> None:
     """Fly one sortie, print its outcome, and keep the run."""
-    flown = _load(scenario, set_, policy)
+    if campaign is not None or run is not None:
+        flown, seed, replication, expected = cli_campaign.again(campaign, run, (scenario, policy, seed, set_))
+    else:
+        flown, replication, expected = _load(_named(scenario), set_, policy), 0, None
     if out_dir is not None:
         rundir.ensure_writable(out_dir)
     observer: Observer | None = None
@@ -101,7 +111,8 @@ def fly(
 
         observer = LiveViewer()
     with _profiled(profile) as report, bars() as bar:
-        record = run_sortie(flown, None, seed, progress=bar(flown.name, flown.duration_s), observer=observer)
+        ticker = bar(flown.name, flown.duration_s)
+        record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=observer)
     path = out_dir or rundir.default_path(record)
 
     def save_recording(folder: Path) -> None:
@@ -114,6 +125,9 @@ def fly(
     out.print(tables.transitions_table(result))
     report(result)
     out.print(f"kept in [bold]{path}[/bold]" + (f", see it with: sortie view {path}" if recording else ""))
+    if expected is not None:
+        same = "is" if record.fingerprint[:16] == expected else "[red]is not[/red]"
+        out.print(f"the record {same} the campaign's")
     if view_:
         view(path)
 
@@ -128,6 +142,7 @@ def compare(
         bool, typer.Option("--own-fusion", help="Prior methods fly with the fusion they were published with.")
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
+    recording: Annotated[Path | None, typer.Option(help="Save all of them side by side as a Rerun recording.")] = None,
 ) -> None:
     """Fly a scenario under several policies, same seed and draws, and print them side by side."""
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
@@ -142,6 +157,11 @@ def compare(
     if out_file is not None:
         _write_json(out_file, {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows})
         out.print(f"kept in [bold]{out_file}[/bold]")
+    if recording is not None:
+        from sim.playback import save_comparison
+
+        save_comparison([(r.policy, r.record) for r in rows], recording)
+        out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
 
 
 @app.command()
@@ -224,17 +244,7 @@ def _load(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario
     """The scenario with `--set` and the policy put in; another policy than its own starts from its own defaults."""
     overrides = list(set_ or [])
     flown = load(scenario, overrides)
-    if policy is None:
-        return flown
-    name, bracket, rest = policy.partition("(")
-    name = name.strip()
-    if bracket and not rest.endswith(")"):
-        raise PolicyError(f"policy {policy!r}: the bracket is not closed, as in best-2(rho=0.1)")
-    overrides.append(f"policy.name={name}")
-    if bracket or name != flown.policy.name:
-        overrides.append("policy.params={}")
-    overrides += [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
-    return load(scenario, overrides)
+    return flown if policy is None else load(scenario, overrides + policy_overrides(policy, flown.policy.name))
 
 
 def _with_own_fusion(scenario: Scenario) -> Scenario:
@@ -243,6 +253,12 @@ def _with_own_fusion(scenario: Scenario) -> Scenario:
         return scenario
     perception = scenario.perception.model_copy(update={"fusion": fusion})
     return scenario.model_copy(update={"perception": perception})
+
+
+def _named(scenario: str | None) -> str:
+    if scenario is None:
+        raise RunError("no scenario named, as in: sortie fly track_target")
+    return scenario
 
 
 def _split_policies(text: str) -> list[str]:

@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 from sim.console import err, out, user_errors
 
 if TYPE_CHECKING:
+    from scenarios.schema import Scenario
     from sim.campaign.drive import Progress
 
 
@@ -83,6 +84,30 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
 
         path = write_report(folder)
     out.print(f"told in [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
+
+
+def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
+    """A campaign's run for `sortie fly`: scenario, seed, replication, and the fingerprint it had.
+
+    Raises:
+        RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
+    """
+    from sim.campaign.code import code_version
+    from sim.campaign.rows import find_row
+    from sim.campaign.store import read_plan
+    from sim.campaign.work import unpack
+    from sim.folders import RunError
+
+    if folder is None or run is None:
+        raise RunError("--from-campaign DIR and --run ID go together")
+    if any(others):
+        raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
+    row, plan = find_row(folder, run), read_plan(folder)
+    if code_version() != plan.code:
+        err.print(f"[yellow]this is Sortie {code_version()}, the campaign was flown with {plan.code}[/yellow]")
+    with user_errors():
+        scenario, seed, replication = unpack(plan.task(run))
+    return scenario, seed, replication, row["fingerprint"] or None
 
 
 def _ensure_usable(folder: Path, plan: Any) -> None:

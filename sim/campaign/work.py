@@ -77,9 +77,19 @@ def fly_task(task: str) -> SortieRecord:
     Raises:
         ValidationError, PolicyError, ...: whatever a sortie raises.
     """
+    scenario, seed, replication = unpack(task)
+    return run_sortie(scenario, None, seed, replication=replication)
+
+
+def unpack(task: str) -> tuple[Scenario, int, int]:
+    """A task's scenario, seed and replication.
+
+    Raises:
+        ValidationError: a drawn value that the schema does not allow.
+    """
     asked = json.loads(task)
     scenario = Scenario.model_validate_json(json.dumps(asked["scenario"]), strict=True)
-    return run_sortie(scenario, None, asked["seed"], replication=asked["replication"])
+    return scenario, asked["seed"], asked["replication"]
 
 
 def _fly(run: int, task: str, code: str) -> Result:

@@ -1,0 +1,130 @@
+"""In which contexts another policy wins: the flip, looked for in a campaign's own rows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.campaign.rows import Rows, sign
+from sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """A part of a varied field's range where another policy than the overall winner comes out first."""
+
+    field: str
+    part: str
+    winner: str
+    gain: Estimate
+    """Of the part's winner over the overall one, paired, the interval widened for all parts looked at (Bonferroni)."""
+
+    @property
+    def sure(self) -> bool:
+        """Whether the interval leaves 0 out."""
+        return self.gain.low > 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """The best rule of the form: field below a threshold → one policy, above → another."""
+
+    field: str
+    threshold: float
+    below: str
+    above: str
+    gain: Estimate
+    """Over the best fixed policy, on units that had no part in finding the rule."""
+
+
+def winner(rows: Rows, metric: str) -> str:
+    """The policy with the best mean."""
+    return rows.plan.policies[int(np.nanargmax(sign(metric) * np.nanmean(rows.by_unit(metric), axis=0)))]
+
+
+def contexts(rows: Rows, metric: str) -> list[Context]:
+    """Every part of every varied field in which another policy than the overall winner has the best mean."""
+    policies = rows.plan.policies
+    best = policies.index(winner(rows, metric))
+    parts = [(field, *part) for field in rows.plan.campaign.vary for part in rows.bins(field)]
+    level = 1 - (1 - LEVEL) / max(1, len(parts) * (len(policies) - 1))
+    found = []
+    for field, label, _, mask in parts:
+        means = sign(metric) * rows.by_unit(metric, mask)
+        if not len(means):
+            continue
+        here = int(np.nanargmax(np.nanmean(means, axis=0)))
+        if here != best:
+            gain = estimate(means[:, here] - means[:, best], level)
+            found.append(Context(field, label, policies[here], gain))
+    return found
+
+
+def rule(rows: Rows, metric: str) -> Rule | None:
+    """The best one-threshold rule, found on every second cell and judged on the others, and the other way round.
+
+    Returns:
+        The rule found on all cells, with the gain that rules found on one half had on the other; None where no field
+        has enough distinct numbers or there is one policy.
+    """
+    cells, x, y = _cells(rows, metric)
+    if len(rows.plan.policies) < 2 or not x or len(cells) < 8:
+        return None
+    even = np.arange(len(cells)) % 2 == 0
+    gains = []
+    for learn, judge in ((even, ~even), (~even, even)):
+        found = _best({k: v[learn] for k, v in x.items()}, y[learn])
+        if found is None:
+            return None
+        field, threshold, below, above = found
+        fixed = int(np.argmax(y[learn].mean(axis=0)))
+        chosen = np.where(x[field][judge] < threshold, y[judge][:, below], y[judge][:, above])
+        gains.append(chosen - y[judge][:, fixed])
+    whole = _best(x, y)
+    if whole is None:
+        return None
+    field, threshold, below, above = whole
+    if below == above:
+        return None
+    labels = rows.plan.policies
+    return Rule(field, threshold, labels[below], labels[above], estimate(np.concatenate(gains)))
+
+
+def _cells(rows: Rows, metric: str) -> tuple[Floats, dict[str, Floats], Floats]:
+    """Cells that every policy has a value in: their numbers, their numeric fields, and what each policy got."""
+    cell, values = rows.table["cell"].to_numpy(), sign(metric) * rows.values(metric)
+    numbers, at = np.unique(cell, return_inverse=True)
+    policies = len(rows.plan.policies)
+    use = ~np.isnan(values)
+    slot = at[use] * policies + rows.policy[use]
+    count = np.bincount(slot, minlength=len(numbers) * policies)
+    with np.errstate(invalid="ignore"):
+        y = (np.bincount(slot, values[use], minlength=len(count)) / count).reshape(len(numbers), policies)
+    whole = ~np.isnan(y).any(axis=1)
+    first = np.unique(at, return_index=True)[1]
+    x = {}
+    for field in rows.plan.campaign.vary:
+        column = rows.table[field].to_numpy(zero_copy_only=False)
+        if column.dtype != object:
+            x[field] = column.astype(float)[first][whole]
+    return numbers[whole], x, y[whole]
+
+
+def _best(x: dict[str, Floats], y: Floats) -> tuple[str, float, int, int] | None:
+    """The threshold with the highest mean, at least an eighth of the cells on either side; ties go to the first."""
+    best, found = -math.inf, None
+    least = max(2, len(y) // 8)
+    for field, values in x.items():
+        order = np.argsort(values, kind="stable")
+        ordered = values[order]
+        upto = np.cumsum(y[order], axis=0)
+        for i in range(least, len(y) - least + 1):
+            if ordered[i - 1] == ordered[i]:
+                continue
+            below, above = int(np.argmax(upto[i - 1])), int(np.argmax(upto[-1] - upto[i - 1]))
+            score = float(upto[i - 1, below] + upto[-1, above] - upto[i - 1, above])
+            if score > best + 1e-12:
+                best, found = score, (field, float((ordered[i - 1] + ordered[i]) / 2), below, above)
+    return found

@@ -1,0 +1,100 @@
+"""A campaign's figures. matplotlib is imported where it draws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.campaign.rows import Rows, judged
+from sim.campaign.statistics import estimate
+
+MAX_METRICS, MAX_FIELDS = 6, 6
+COST = ("bytes.data_sent", "bytes.data_delivered", "data_rate_mbps", "energy_j.total")
+
+
+def costs(metrics: tuple[str, ...]) -> list[str]:
+    """The metrics that accuracy is set against: bytes, and energy."""
+    return [m for m in COST if m in metrics]
+
+
+def on_front(x: list[float], y: list[float]) -> list[bool]:
+    """Which points are Pareto-optimal: no other costs as little and sees as much, and one of both strictly."""
+    return [
+        not any(
+            (a <= x[i] and b >= y[i] and (a < x[i] or b > y[i]))
+            for j, (a, b) in enumerate(zip(x, y, strict=True))
+            if j != i
+        )
+        for i in range(len(x))
+    ]
+
+
+def draw_varied(rows: Rows, path: Path) -> bool:
+    """Metrics (rows) over varied fields (columns), a line a policy, whiskers 95 %; whether there is anything to draw."""
+    metrics = list(rows.plan.campaign.metrics[:MAX_METRICS])
+    fields = [f for f in rows.plan.campaign.vary if rows.bins(f)][:MAX_FIELDS]
+    if not fields:
+        return False
+    figure, axes = _axes(len(metrics), len(fields))
+    for r, metric in enumerate(metrics):
+        for c, field in enumerate(fields):
+            ax = axes[r][c]
+            bins = rows.bins(field)
+            words = isinstance(rows.table[field][0].as_py(), str)
+            for p, label in enumerate(rows.plan.policies):
+                found = [(x, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
+                ax.errorbar(
+                    [x for x, _ in found],
+                    [e.mean for _, e in found],
+                    [0.0 if np.isnan(e.half_width) else e.half_width for _, e in found],
+                    marker="o",
+                    markersize=3,
+                    capsize=2,
+                    label=label,
+                )
+            if words:
+                ax.set_xticks([x for _, x, _ in bins], [name for name, _, _ in bins])
+            if c == 0:
+                ax.set_ylabel(metric)
+            if r == len(metrics) - 1:
+                ax.set_xlabel(field)
+    axes[0][0].legend(fontsize="small")
+    figure.savefig(path)
+    return True
+
+
+def draw_pareto(rows: Rows, path: Path) -> bool:
+    """Accuracy against each cost, a point a policy with both intervals; whether there is anything to draw."""
+    accuracies = [m for m in judged(rows.plan.campaign.metrics) if m.startswith("ap50.")]
+    prices = costs(rows.plan.campaign.metrics)
+    if not accuracies or not prices:
+        return False
+    figure, axes = _axes(len(accuracies), len(prices))
+    for r, accuracy in enumerate(accuracies):
+        for c, price in enumerate(prices):
+            ax = axes[r][c]
+            xs = [estimate(_column(rows.by_unit(price), p)) for p in range(len(rows.plan.policies))]
+            ys = [estimate(_column(rows.by_unit(accuracy), p)) for p in range(len(rows.plan.policies))]
+            for p, label in enumerate(rows.plan.policies):
+                ax.errorbar(xs[p].mean, ys[p].mean, ys[p].half_width, xs[p].half_width, "o", capsize=2, label=label)
+            front = on_front([x.mean for x in xs], [y.mean for y in ys])
+            line = sorted((x.mean, y.mean) for x, y, f in zip(xs, ys, front, strict=True) if f)
+            ax.plot([x for x, _ in line], [y for _, y in line], color="0.6", zorder=0)
+            ax.set_xlabel(price)
+            ax.set_ylabel(accuracy)
+    axes[0][0].legend(fontsize="small")
+    figure.savefig(path)
+    return True
+
+
+def _column(means: Any, policy: int) -> Any:
+    return means[:, policy]
+
+
+def _axes(rows: int, columns: int) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.4 * columns + 0.6, 2.4 * rows + 0.5), dpi=110, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)

@@ -1,0 +1,128 @@
+"""Which varied field moves a metric, and by how much: Morris, Sobol' indices, or rank correlation, as the design allows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.campaign.rows import Rows
+from sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
+from sim.campaign.statistics import Floats
+from sim.folders import RunError
+
+COLUMNS = {
+    "morris": ("μ*", "95 % of μ*", "σ"),
+    "saltelli": ("first order", "± 95 %", "total", "± 95 %"),
+    "other": ("Spearman's ρ",),
+}
+MEANING = {
+    "morris": "Morris' elementary effects, in the metric's unit over the field's whole range: μ* how much it moves the "
+    "metric, σ how much that depends on the other fields or is curved.",
+    "saltelli": "Sobol' indices: the part of the metric's variance that is the field's alone (first order), and with all "
+    "that it does together with others (total).",
+    "other": "Spearman's rank correlation of field and metric over the draws: direction and monotony, not amount. For "
+    "amounts fly the campaign with `sample.method: morris`, then `saltelli` on the fields that matter.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """Of one policy and metric: `figures` [fields, columns]."""
+
+    policy: str
+    metric: str
+    method: str
+    fields: tuple[str, ...]
+    figures: Floats
+    used: int
+    """Draws that it is worked out from."""
+
+
+def sensitivity(rows: Rows, metric: str, policy: int) -> Sensitivity | None:
+    """None where no numeric field is drawn, or too little is finished.
+
+    Raises:
+        RunError: the rows are not in the order of the design, so that indices would be of something else.
+    """
+    plan = rows.plan
+    design = plan.campaign.sample.method
+    method = design if design in ("morris", "saltelli") else "other"
+    fields = tuple(drawn_fields(plan.campaign)) if method != "other" else _numeric(rows)
+    if not fields:
+        return None
+    label = plan.policies[policy]
+    if method == "other":
+        mine = (rows.policy == policy) & ~np.isnan(rows.values(metric))
+        x = [rows.table[f].to_numpy(zero_copy_only=False).astype(float)[mine] for f in fields]
+        y = rows.values(metric)[mine]
+        if len(y) < 8:
+            return None
+        figures = np.array([[_spearman(column, y)] for column in x])
+        return Sensitivity(label, metric, method, fields, figures, len(y))
+    y, order = _in_order(rows, metric, policy)
+    block = len(fields) + (1 if method == "morris" else 2)
+    whole = len(y) // block
+    y, points = y[: whole * block].reshape(whole, block), plan.points[order[: whole * block]]
+    kept = ~np.isnan(y).any(axis=1)  # a failed run takes its trajectory with it
+    if kept.sum() < 2:
+        return None
+    points = points.reshape(whole, block, len(fields))[kept].reshape(-1, len(fields))
+    figures = _morris(points, y[kept].ravel()) if method == "morris" else _saltelli(len(fields), y[kept].ravel())
+    return Sensitivity(label, metric, method, fields, figures, int(kept.sum()) * block)
+
+
+def _numeric(rows: Rows) -> tuple[str, ...]:
+    return tuple(f for f in rows.plan.campaign.vary if rows.table[f].to_numpy(zero_copy_only=False).dtype != object)
+
+
+def _in_order(rows: Rows, metric: str, policy: int) -> tuple[Floats, NDArray[np.int64]]:
+    """A policy's values by draw, 0, 1, 2, …, replications averaged; each row's fields held against the design's."""
+    plan = rows.plan
+    mine = np.flatnonzero(rows.policy == policy)
+    unit = rows.unit[mine]
+    distinct, first = np.unique(unit, return_index=True)
+    if (np.diff(unit) < 0).any() or not np.array_equal(distinct, np.arange(len(distinct))):
+        raise RunError("sensitivity: the rows are not in the order of the design")
+    table = rows.table
+    for field in drawn_fields(plan.campaign):
+        column = table[field].to_pylist()
+        for number in (0, len(distinct) // 2, len(distinct) - 1):
+            if plan.varied(int(distinct[number]))[field] != column[int(mine[first[number]])]:
+                raise RunError(f"sensitivity: {field} of draw {number} is not the design's")
+    values = rows.values(metric)[mine]
+    total, count = np.bincount(unit, np.nan_to_num(values)), np.bincount(unit, ~np.isnan(values))
+    with np.errstate(invalid="ignore"):
+        return np.where(count == np.bincount(unit), total / count, math.nan), distinct
+
+
+def _morris(points: Floats, y: Floats) -> Floats:
+    from SALib.analyze import morris
+
+    if np.ptp(y) == 0:
+        return np.zeros((points.shape[1], 3))
+    found = morris.analyze(unit_problem(points.shape[1]), points, y, num_levels=MORRIS_LEVELS, seed=0)
+    return np.column_stack([np.asarray(found[k], float) for k in ("mu_star", "mu_star_conf", "sigma")])
+
+
+def _saltelli(fields: int, y: Floats) -> Floats:
+    from SALib.analyze import sobol
+
+    if np.ptp(y) == 0:
+        return np.zeros((fields, 4))
+    found = sobol.analyze(unit_problem(fields), y, calc_second_order=False, seed=0)
+    return np.column_stack([np.asarray(found[k], float) for k in ("S1", "S1_conf", "ST", "ST_conf")])
+
+
+def _spearman(x: Floats, y: Floats) -> float:
+    a, b = (_ranks(v) for v in (x, y))
+    return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else math.nan
+
+
+def _ranks(values: Floats) -> Floats:
+    """Ranks, ties at their mean."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    upto = np.cumsum(counts)
+    return (upto - (counts - 1) / 2)[inverse]
