@@ -57,6 +57,8 @@ class Verdict:
     outcome: Outcome
     what: str
     counterexample: FleetView | None = None
+    raised_age_s: Mapping[int, float] | None = None
+    """The ages to which the counterexample's were raised, where that is what the property is about."""
 
 
 class View:
@@ -181,9 +183,10 @@ def _verdict(policy: Policy, prop: Property, max_drones: int, period_s: float, m
         if system is None:
             return Verdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
         found = system.example()
-        confirmed = complaint_on(prop, policy, found, system.raised_example())
+        raised = system.raised_example()
+        confirmed = complaint_on(prop, policy, found, raised)
         if confirmed is not None:
-            return Verdict(prop.name, "refuted", confirmed, found)
+            return Verdict(prop.name, "refuted", confirmed, found, raised)
         reason = "the search meets a fault that no plain view shows"
     for view in draw_views(seed, TRIED_VIEWS):
         if fails(view):

@@ -48,12 +48,7 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
         InvariantError: an invariant sums or counts links: which of them should yield is not the shield's to say; nor
             `every_link(…)`, which says the same as its requirement alone.
     """
-    rules = tuple(invariants)
-    for rule in rules:
-        for top in (rule.when, rule.then):
-            for node in () if top is None else walk(top):
-                if isinstance(node, Links) and node.function in _SUMS:
-                    raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
+    rules = checked(invariants)
     asks_fresh = any(rule.needs_fresh for rule in rules)
 
     def shielded(view: FleetView, /) -> list[Directive]:
@@ -63,6 +58,21 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
 
     shielded.__doc__ = f"{getattr(policy, '__name__', 'a policy')}, shielded."
     return shielded
+
+
+def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
+    """The invariants, all of them such that a shield can keep them.
+
+    Raises:
+        InvariantError: as `shield` does.
+    """
+    rules = tuple(invariants)
+    for rule in rules:
+        for top in (rule.when, rule.then):
+            for node in () if top is None else walk(top):
+                if isinstance(node, Links) and node.function in _SUMS:
+                    raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
+    return rules
 
 
 def interventions(directives: Iterable[Directive]) -> int:

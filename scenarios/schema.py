@@ -401,10 +401,63 @@ class Perception(Section):
 # --- policy, events, expectations ----------------------------------------------------------------
 
 
+class PolicyChange(Section):
+    at_s: float | None = Field(None, ge=0, description="Takes over at this time …")
+    phase: PhaseName | None = Field(None, description="… or whenever a drone's own phase turns to this …")
+    command: str | None = Field(None, min_length=1, description="… or on this command; one of the three is given.")
+    name: str = Field(min_length=1, description="The policy that takes over, as policy.name.")
+    params: dict[str, float | int | bool | str] = Field({}, description="Its keyword arguments.")
+
+    @model_validator(mode="after")
+    def _one_trigger(self) -> PolicyChange:
+        given = [n for n in ("at_s", "phase", "command") if getattr(self, n) is not None]
+        if len(given) != 1:
+            raise _inconsistent((), " and ".join(given) or "no trigger", "one of at_s, phase and command")
+        return self
+
+
+class PolicyCommand(Section):
+    at_s: float = Field(ge=0, description="When the ground gives it.")
+    command: str = Field(min_length=1, description="The word that a change of policy.changes waits for.")
+    drones: tuple[DroneId, ...] = Field((), description="Whom it reaches; left out, all.")
+
+
+class ViewReplay(Section):
+    at_s: float = Field(ge=0, description="From when the drone's next decision is made on this view.")
+    drone: DroneId = Field(description="Whose policy sees it; the view's ego.")
+    view: str = Field(min_length=1, description="A fleet view as JSON, as `sortie verify` writes counterexamples.")
+
+
 class Policy(Section):
     name: str = Field("worked", min_length=1, description="A registered policy, or path/to/file.py:function.")
     params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
     dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
+    changes: tuple[PolicyChange, ...] = Field(
+        (),
+        max_length=100,
+        description="Policies that take over in flight; where two do at once, the later in the list.",
+    )
+    commands: tuple[PolicyCommand, ...] = Field((), max_length=1000, description="Commands from the ground.")
+    invariants: str = Field(
+        "", max_length=10000, description="What directives must keep, one line each (policies/invariants.py); counted."
+    )
+    shield: bool = Field(
+        False, description="Directives that break an invariant are replaced by the nearest that keep it."
+    )
+    replays: tuple[ViewReplay, ...] = Field(
+        (), max_length=100, description="Views that a policy is shown instead of what its drone heard."
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Policy:
+        known = [c.command for c in self.changes if c.command is not None]
+        for i, given in enumerate(self.commands):
+            if given.command not in known:
+                bound = f"one that a change waits for: {', '.join(known) or 'none does'}"
+                raise _inconsistent(("commands", i, "command"), repr(given.command), bound)
+        if self.shield and not self.invariants.strip():
+            raise _inconsistent(("invariants",), "missing", "given where there is a shield")
+        return self
 
 
 class _Event(Section):
@@ -539,6 +592,14 @@ class Scenario(Section):
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
                 raise _inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
+        for i, command in enumerate(self.policy.commands):
+            for k, who in enumerate(command.drones):
+                if who >= n:
+                    at = ("policy", "commands", i, "drones", k)
+                    raise _inconsistent(at, f"{who}", f"below fleet.drones = {n}")
+        for i, replay in enumerate(self.policy.replays):
+            if replay.drone >= n:
+                raise _inconsistent(("policy", "replays", i, "drone"), f"{replay.drone}", f"below fleet.drones = {n}")
         for i, decision in enumerate(self.expect_decisions):
             for end in ("drone", "peer"):
                 who = getattr(decision, end)

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from perception.ap import Matched, average_precision, match
 from perception.types import Boxes
-from sim.record import HANDSHAKE, SortieRecord
+from sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 
@@ -72,6 +72,12 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "battery": {d: v["soc"] for d, v in drones.items()},
         "drones": drones,
         "energy_j": _energy(tables["energy"]),
+        "policies": {
+            "decisions": {k.removeprefix(DECISIONS_OF): v for k, v in totals.items() if k.startswith(DECISIONS_OF)},
+            "changes": totals["policy_changes"],
+            "shield_interventions": totals["shield_interventions"],
+            "invariant_violations": totals["invariant_violations"],
+        },
         "switches": len(changes) / (links * minutes) if links else None,
         "transitions": changes,
         "phases": [_phase(record, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],

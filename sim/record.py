@@ -21,6 +21,8 @@ from policies.contract import Descriptor, Directive, Representation, TaskPhase
 from scenarios.schema import Scenario
 
 NAN = float("nan")
+DECISIONS_OF = "decisions_of "
+"""Prefix of the totals that count each policy's decisions."""
 REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
 """Names as the tables have them."""
 HANDSHAKE = "handshake"
@@ -48,7 +50,11 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     "directives": dict(
         t_s=F, drone=I, peer=I, representation=S, rho=F, roi_x_m=F, roi_y_m=F, roi_radius_m=F, rate_hz=F,
         deadline_s=F, fusion_weight=F, duty_percent=I, asked=S, asked_rate_hz=F, link=S, reason=S,
+        policy=S,
     ),
+    # one row a directive that the shield replaced ("shield"), or that breaks an invariant all the same ("broken");
+    # peer −1: all of a drone's together
+    "interventions": dict(t_s=F, drone=I, peer=I, policy=S, kind=S, text=S),
     # one row a payload handed to the radio, with its fate; `partial`: some of its tiles arrived, `arrived_bytes` of it
     "transmissions": dict(
         t_sent_s=F, drone=I, peer=I, representation=S, captured_s=F, rho=F, cells=I, boxes=I, index_bytes=I,
@@ -185,8 +191,9 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
 class AgentNotes:
     """Writes agents' acts into a recorder (fleet.agent.AgentLog)."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._rows = recorder.rows
+    def __init__(self, recorder: Recorder, deciding: Callable[[int], str]) -> None:
+        """Args: `deciding` names the policy that decides on a drone."""
+        self._rows, self._deciding = recorder.rows, deciding
         recorder.unfold |= {"descriptors": _unfold_descriptors, "ages": _unfold_ages}
         self._eval_ns: list[int] = []
         self._descriptor_bytes = self._directives = 0
@@ -205,6 +212,7 @@ class AgentNotes:
                 t_s, enforced.source, enforced.destination, REPRESENTATIONS[enforced.representation], enforced.rho, *roi,
                 enforced.rate_hz, enforced.deadline_s, enforced.fusion_weight, enforced.duty_percent,
                 REPRESENTATIONS[asked.representation], asked.rate_hz, _LINKS[link], reason,
+                self._deciding(enforced.source),
             )
         )  # fmt: skip
 

@@ -23,13 +23,13 @@ from perception.detectors import DetectsMany, make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
-from policies.registry import handshake_bytes, resolve
 from radio import Air
 from scenarios.schema import Scenario
 from scenarios.streams import stream
 from sim.adversity import group_key, schedule
 from sim.ether import Ether
 from sim.mission import MissionPlan
+from sim.pilot import Audit, Named, Pilot, Plan, named, plan_of, schedule_policies
 from sim.record import AgentNotes, Recorder, SortieRecord
 from sim.scoring import Scorer
 from sim.world import World, route_bounds
@@ -86,8 +86,7 @@ def run_sortie(
     """
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
-    name, decide = _policy(scenario, policy)
-    before_payloads = handshake_bytes(name, scenario.policy.params if name == scenario.policy.name else None)
+    name, flight_plan = _policy(scenario, policy)
     n, config = scenario.fleet.drones, scenario.perception
     env, recorder = simpy.Environment(), Recorder()
 
@@ -125,19 +124,21 @@ def run_sortie(
         compute_delay_s=config.compute_delay_s,
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
     )
-    notes = AgentNotes(recorder)
+    audit = Audit(env, recorder)
+    pilots = [Pilot(i, flight_plan, audit) for i in range(n)]
+    notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     agents = [
         Agent(
             env,
             i,
             rules=rules,
-            policy=decide,
+            policy=pilots[i],
             senses=world.senses(i, count_boxes if detector is not None else None),
             modem=ether.modem(i),
             log=notes,
             sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
             phase_s=PHASE_SHARE * scenario.frame_s * stream(seed, replication, i, "phase").random(),
-            handshake_bytes=before_payloads,
+            handshake_bytes=flight_plan.first.handshake_bytes,
         )
         for i in range(n)
     ]
@@ -157,6 +158,7 @@ def run_sortie(
     if observer is not None:
         observer.begin(scenario, scene)
     schedule(scenario, world, ether, seed=seed, replication=replication)
+    schedule_policies(env, flight_plan, pilots, agents)
     world.start()
     for agent in agents:
         agent.start()
@@ -179,7 +181,7 @@ def run_sortie(
         replication=replication,
         version=VERSION,
         tables=recorder.tables(),
-        totals={**notes.totals(), **_air_totals(air)},
+        totals={**notes.totals(), **audit.totals(), **_air_totals(air)},
         calibration=detector.calibration if isinstance(detector, DetectsMany) else None,
         wall={"wall_s": time.perf_counter() - begin_s, **notes.policy_eval_us()},
     )
@@ -190,10 +192,13 @@ def _air_totals(air: Air) -> dict[str, float]:
     return {**counters, "medium_busy_fraction": air.utilisation}
 
 
-def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Policy]:
-    """The policy's name and callable; the scenario's parameters go with the scenario's own policy only."""
-    if policy is None or policy == scenario.policy.name:
-        return scenario.policy.name, resolve(scenario.policy.name, scenario.policy.params)
-    if isinstance(policy, str):
-        return policy, resolve(policy)
-    return getattr(policy, "__name__", "policy"), policy
+def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Plan]:
+    """The policy's name in the record, and who decides when.
+
+    The scenario's parameters and changes go with the scenario's own policy only; its invariants and shield with all.
+    """
+    section = scenario.policy
+    if policy is None or policy == section.name:
+        return section.name, plan_of(section)
+    first = named(policy, {}) if isinstance(policy, str) else Named(getattr(policy, "__name__", "policy"), policy)
+    return first.name, plan_of(section, first)

@@ -6,6 +6,7 @@ field to matter; a test holds the table to the schema, so that a new field canno
 
 from __future__ import annotations
 
+import json
 import types
 import typing
 from pathlib import Path
@@ -15,6 +16,8 @@ from pydantic import BaseModel
 from recording_examples import record_flight
 from sim_examples import example
 
+from policies.contract import Descriptor, FleetView, TaskPhase
+from policies.views import to_json
 from scenarios.schema import Scenario
 from sim.sortie import run_sortie
 
@@ -38,6 +41,28 @@ TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
 BURSTS = "radio.bursts.good_to_bad=0.3"
 LINKS = str(Path(__file__).parent / "links.csv")
+
+AT_2 = "policy.changes=[{at_s: 2, name: worst-2}]"
+IN_TRACK = "policy.changes=[{phase: track, name: worst-2}]"
+TOLD = "policy.changes=[{command: a, name: silence}, {command: b, name: best-2}, {command: a, name: worst-2}]"
+TELL = "policy.commands=[{at_s: 2, command: a}]"
+
+
+def tired(ego: int) -> str:
+    """A view in which this drone has hardly any charge left, as a value of `--set`."""
+    view = FleetView(ego, 0.1, {i: descriptor(i) for i in range(5)}, dict.fromkeys(range(5), 0.0))
+    return json.dumps(to_json(view))
+
+
+def descriptor(agent_id: int) -> Descriptor:
+    at_m = (10.0 * agent_id, 0.0, 60.0)
+    return Descriptor(
+        0, agent_id, at_m, (0, 0, 0, 1), (0, 0, 0), 42.0, 0.15, 1, 1, (100.0,) * 4, bytes(64), 0, TaskPhase.SEARCH, None
+    )
+
+
+TIRED_VIEW = [tired(0), tired(1)]
+REPLAY = f"policy.replays=[{{at_s: 2, drone: 0, view: {TIRED_VIEW[0]}}}]"
 
 # field: (new value, settings that both sorties get)
 TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -132,6 +157,19 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "policy.name": ("worst-2", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),
+    "policy.changes.at_s": ("3", (AT_2,)),
+    "policy.changes.phase": ("search", (IN_TRACK,)),
+    "policy.changes.command": ("b", (TOLD, TELL)),
+    "policy.changes.name": ("best-2", (AT_2,)),
+    "policy.changes.params": ("{rho: 0.1}", (AT_2,)),
+    "policy.commands.at_s": ("2.5", (TOLD, TELL)),
+    "policy.commands.command": ("b", (TOLD, TELL)),
+    "policy.commands.drones": ("[1]", (TOLD, TELL)),
+    "policy.invariants": ("rate_hz <= 5", ()),
+    "policy.shield": ("true", ("policy.invariants=rate_hz <= 5",)),
+    "policy.replays.at_s": ("3", (REPLAY,)),
+    "policy.replays.drone": ("1", (REPLAY,)),
+    "policy.replays.view": (TIRED_VIEW[0].replace("0.15", "0.5"), (REPLAY,)),
     "events.kind": ("battery_fault", ()),  # covered by every event below: the kind is what makes it one
     "events.at_s": ("2", (DROP,)),
     "events.until_s": ("3", (DROP,)),
@@ -208,6 +246,9 @@ def place(field: str, shared: tuple[str, ...]) -> str:
         field.replace("fleet.overrides.", "fleet.overrides.0.")
         .replace("mission.phases.", f"mission.phases.{last_phase}.")
         .replace("events.", "events.0.")
+        .replace("policy.changes.", "policy.changes.0.")
+        .replace("policy.commands.", "policy.commands.0.")
+        .replace("policy.replays.", "policy.replays.0.")
     )
 
 
@@ -217,8 +258,11 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     if value == "TRACE":
         value = str(tmp_path / "trace.csv")
         Path(value).write_text("t_s,drone,soc\n0,1,0.7\n6,1,0.5\n")
+    change = [f"{place(field, shared)}={value}"]
+    if field == "policy.replays.drone":
+        change.append(f"policy.replays.0.view={TIRED_VIEW[1]}")  # a view is its drone's own
     before = run_sortie(example(*shared))
-    after = run_sortie(example(*shared, f"{place(field, shared)}={value}"))
+    after = run_sortie(example(*shared, *change))
     assert after.fingerprint != before.fingerprint
 
 

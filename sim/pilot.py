@@ -1,0 +1,217 @@
+"""Who decides on a drone right now: its policy, as the mission, the clock and the ground change it; and the audit.
+
+A pilot stands where the agent's policy stands. It takes over another policy between two decisions; what a link
+carries, its dwell time and when it last sent are the agent's and stay. It shows the policy a kept view where the
+scenario says so, counts the directives that break an invariant, and with a shield puts right what it can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import simpy
+
+from fleet.agent import Agent
+from policies.conformance import raised_part
+from policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase
+from policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
+from policies.registry import handshake_bytes, resolve
+from policies.shield import MARK, checked, enforce
+from policies.views import ViewError, from_json
+from scenarios.schema import Policy as PolicySection
+from scenarios.schema import PolicyChange
+from sim.record import DECISIONS_OF, Recorder
+from sim.world import at
+
+_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
+
+
+class Named(NamedTuple):
+    """A policy and what the audit calls it."""
+
+    name: str
+    decide: Policy
+    handshake_bytes: int = 0
+    """What it puts on every link and frame before payloads."""
+
+
+class Plan(NamedTuple):
+    """What a scenario says of the policies, resolved and checked before anything flies."""
+
+    first: Named
+    changes: tuple[tuple[PolicyChange, Named], ...] = ()
+    commands: tuple[tuple[float, str, tuple[int, ...]], ...] = ()
+    rules: tuple[Invariant, ...] = ()
+    shielded: bool = False
+    replays: tuple[tuple[float, int, FleetView], ...] = ()
+
+
+def plan_of(section: PolicySection, first: Named | None = None) -> Plan:
+    """A scenario's policies; `first` flies instead of them all, with the scenario's invariants and shield.
+
+    Raises:
+        PolicyError: an unknown policy or parameter, an invariant that is none, a view that cannot be read.
+    """
+    changes = () if first is not None else tuple((c, named(c.name, c.params)) for c in section.changes)
+    commands = () if first is not None else tuple((c.at_s, c.command, c.drones) for c in section.commands)
+    try:
+        rules = parse(section.invariants)
+        replays = tuple((r.at_s, r.drone, from_json(r.view)) for r in section.replays)
+        if section.shield:
+            checked(rules)
+    except InvariantError as error:
+        raise PolicyError(f"policy.invariants: {error}") from error
+    except ViewError as error:
+        raise PolicyError(f"policy.replays: {error}") from error
+    for k, (_, drone, view) in enumerate(replays):
+        if view.ego != drone:
+            raise PolicyError(f"policy.replays.{k}.view: its ego is {view.ego}, must be drone {drone}")
+    return Plan(first or named(section.name, section.params), changes, commands, rules, section.shield, replays)
+
+
+def named(name: str, params: Mapping[str, object]) -> Named:
+    inside = ", ".join(f"{k}={v}" for k, v in params.items())
+    return Named(f"{name}({inside})" if inside else name, resolve(name, params), handshake_bytes(name, params))
+
+
+class Audit:
+    """Writes down which policy took over when and why, and where a directive broke an invariant."""
+
+    def __init__(self, env: simpy.Environment, recorder: Recorder) -> None:
+        self._env, self._rows = env, recorder.rows
+        self.counts = {"policy_changes": 0, "shield_interventions": 0, "invariant_violations": 0}
+        self.decisions: dict[str, int] = {}
+        """By policy."""
+
+    def totals(self) -> dict[str, float]:
+        """Counts, and decisions by policy as `decisions_of NAME`."""
+        return {**self.counts, **{f"{DECISIONS_OF}{name}": n for name, n in self.decisions.items()}}
+
+    def took_over(self, drone: int, before: str, after: str, why: str) -> None:
+        """A drone's policy changed."""
+        self.counts["policy_changes"] += 1
+        self._rows["events"].append((self._env.now, drone, "policy", f"{before} → {after}: {why}"))
+
+    def stepped_in(self, policy: str, directive: Directive) -> None:
+        """The shield replaced a directive, or could not keep an invariant."""
+        self.counts["shield_interventions"] += 1
+        self._write(directive.source, directive.destination, policy, "shield", directive.reason.removeprefix(MARK))
+
+    def broke(self, drone: int, peer: int, policy: str, what: str) -> None:
+        """A directive that goes to the gate breaks an invariant; peer −1: they all together."""
+        self.counts["invariant_violations"] += 1
+        self._write(drone, peer, policy, "broken", what)
+
+    def _write(self, drone: int, peer: int, policy: str, kind: str, what: str) -> None:
+        self._rows["interventions"].append((self._env.now, drone, peer, policy, kind, what))
+
+
+class Pilot:
+    """One drone's policy in flight."""
+
+    def __init__(self, drone: int, plan: Plan, audit: Audit) -> None:
+        self.drone, self.policy = drone, plan.first
+        self.agent: Agent | None = None
+        self._by_phase = {_PHASES[c.phase]: then for c, then in plan.changes if c.phase is not None}
+        self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
+        self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
+        self._phase: TaskPhase | None = None
+        self._shown: FleetView | None = None
+        self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
+
+    def take_over(self, policy: Named, why: str) -> None:
+        """From the next decision on, `policy` decides."""
+        if policy != self.policy:
+            self._audit.took_over(self.drone, self.policy.name, policy.name, why)
+            self.policy = policy
+            if self.agent is not None:
+                self.agent.handshake_bytes = policy.handshake_bytes
+
+    def show(self, view: FleetView) -> None:
+        """The next decision is made on this view."""
+        self._shown = view
+
+    def __call__(self, view: FleetView) -> Sequence[Directive]:
+        """The agent's policy: the present policy's directives, put right where there is a shield."""
+        if self._by_phase:
+            self._follow_phase(view)
+        decisions = self._audit.decisions
+        decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
+        if not self._rules and self._shown is None:
+            return self._ask(view)
+        shown, self._shown = self._shown, None
+        directives = self._kept(view if shown is None else shown)
+        if shown is not None:
+            self._compare_with_last(shown, directives)
+        return directives
+
+    def _follow_phase(self, view: FleetView) -> None:
+        me = view.me
+        if me is not None and me.task_phase != self._phase:
+            self._phase = me.task_phase
+            policy = self._by_phase.get(me.task_phase)
+            if policy is not None:
+                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}")
+
+    def _ask(self, view: FleetView) -> Sequence[Directive]:
+        try:
+            answer = self.policy.decide(view)
+        except PolicyError:
+            raise
+        except Exception as error:
+            what = f"raises {type(error).__name__}: {error}"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
+        if not isinstance(answer, Sequence):
+            what = f"returns {type(answer).__name__}, must be a sequence of directives"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
+        return answer
+
+    def _kept(self, view: FleetView) -> Sequence[Directive]:
+        name, audit = self.policy.name, self._audit
+        directives = self._ask(view)
+        fresh = self._ask(just_heard(view)) if self._asks_fresh else ()
+        if self._shielded:
+            directives = enforce(self._rules, view, directives, fresh)
+            for d in directives:
+                if d.reason.startswith(MARK):
+                    audit.stepped_in(name, d)
+        for rule in self._rules:
+            for broken in violations(rule, view, directives, fresh):
+                if broken is None:
+                    audit.broke(self.drone, -1, name, f"{rule.text}: {spelt(directives)}")
+                else:
+                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {spelt([broken])}")
+        return directives
+
+    def _compare_with_last(self, shown: FleetView, directives: Sequence[Directive]) -> None:
+        """Two views shown one after the other that differ in ages alone, which rose: nothing may rise with them."""
+        before, self._last_shown = self._last_shown, (shown, directives)
+        if before is None or before[0].descriptors != shown.descriptors:
+            return
+        if all(shown.age_s[i] >= age_s for i, age_s in before[0].age_s.items()):
+            raised = raised_part(before[1], directives)
+            if raised is not None:
+                self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
+
+
+def schedule_policies(env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent]) -> None:
+    """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant."""
+    for pilot, agent in zip(pilots, agents, strict=True):
+        pilot.agent = agent
+    for change, policy in plan.changes:
+        if change.at_s is not None:
+            at(env, change.at_s, partial(_take_over, pilots, policy, f"time {change.at_s:g} s"))
+    for at_s, word, drones in plan.commands:
+        told = [p for p in pilots if not drones or p.drone in drones]
+        for change, policy in plan.changes:
+            if change.command == word:
+                at(env, at_s, partial(_take_over, told, policy, f"command {word!r}"))
+    for at_s, drone, view in plan.replays:
+        at(env, at_s, partial(pilots[drone].show, view))
+
+
+def _take_over(pilots: Sequence[Pilot], policy: Named, why: str) -> None:
+    for pilot in pilots:
+        pilot.take_over(policy, why)
