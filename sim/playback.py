@@ -14,18 +14,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
 
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
 from sim.folders import RunError
 from sim.playback_canvas import Canvas, Floats
 from sim.playback_charts import Charts
+from sim.playback_comparison import comparison, roots
 from sim.playback_layout import blueprint, legend
 from sim.playback_scene import Drawing
 from sim.record import SortieRecord
@@ -40,14 +43,15 @@ Sink = Callable[[rr.RecordingStream, Scenario], None]
 
 
 class Playback:
-    """Draws one sortie into a recording, from tables that come whole or second by second."""
+    """Draws one sortie into a recording, all below `root`, from tables that come whole or second by second."""
 
-    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel) -> None:
-        canvas = Canvas(recording, scenario.context.rate_hz)
+    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "") -> None:
+        canvas = Canvas(recording, scenario.context.rate_hz, root)
         self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
         self._disc_t_s: Floats = np.zeros(0)
         self._discs: Floats = np.zeros((0, 3))
-        recording.send_recording_name(f"{scenario.name} · {scenario.policy.name} · seed {scenario.seed}")
+        if not root:
+            recording.send_recording_name(f"{scenario.name} · {scenario.policy.name} · seed {scenario.seed}")
         canvas.static("about", legend(scenario))
         self._scene.begin()
         self._charts.begin()
@@ -69,12 +73,38 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
     Raises:
         RunError: the file cannot be written.
     """
+    with _new_file(path, blueprint(record.scenario)) as recording:
+        Playback(recording, record.scenario, scene_of(record)).add(record.scenario.duration_s, record.tables)
+
+
+def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> None:
+    """Save sorties of one scenario side by side in one recording, each below its label's root (`roots`).
+
+    Args:
+        flown: each policy's label and its sortie; alike but for the policy.
+        path: the recording.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    labels = [label for label, _ in flown]
+    scenario = flown[0][1].scenario
+    with _new_file(path, comparison(scenario, labels)) as recording:
+        recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {scenario.seed}")
+        for root, (_, record) in zip(roots(labels), flown, strict=True):
+            playback = Playback(recording, record.scenario, scene_of(record), root)
+            playback.add(record.scenario.duration_s, record.tables)
+
+
+@contextmanager
+def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails."""
     partial = path.with_name(f".{path.name}.partial")
     try:
         partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
         recording = rr.RecordingStream(APPLICATION)
-        recording.save(partial, default_blueprint=blueprint(record.scenario))
-        Playback(recording, record.scenario, scene_of(record)).add(record.scenario.duration_s, record.tables)
+        recording.save(partial, default_blueprint=layout)
+        yield recording
         recording.flush()
         recording.disconnect()
         partial.rename(path)

@@ -67,10 +67,16 @@ def about_z(yaw_rad: Floats) -> Floats:
 
 
 class Canvas:
-    """Writes to one recording, on both timelines; strict, so that a wrong shape is an error and not a warning."""
+    """Writes to one recording, on both timelines; strict, so that a wrong shape is an error and not a warning.
 
-    def __init__(self, recording: rr.RecordingStream, rate_hz: float) -> None:
-        self._recording, self._rate_hz = recording, rate_hz
+    With a `root` all entities are below it, so that several sorties fit into one recording.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, rate_hz: float, root: str = "") -> None:
+        self._recording, self._rate_hz, self._root = recording, rate_hz, root
+
+    def _at(self, path: str) -> str:
+        return f"{self._root}/{path}" if self._root else path
 
     def columns(self, path: str, t_s: Floats, *columns: Iterable[rr.ComponentColumn]) -> None:
         """Send rows at the times `t_s` [n]; nothing where n is 0."""
@@ -80,7 +86,7 @@ class Canvas:
             rr.TimeColumn(SIM_TIME, duration=np.round(np.asarray(t_s) * 1e9).astype("timedelta64[ns]")),
             rr.TimeColumn(FRAME, sequence=np.floor(np.asarray(t_s) * self._rate_hz + 1e-6).astype(np.int64)),
         ]
-        self._recording.send_columns(path, indexes, [c for group in columns for c in group], strict=True)
+        self._recording.send_columns(self._at(path), indexes, [c for group in columns for c in group], strict=True)
 
     def scalars(self, path: str, t_s: Floats, values: Floats) -> None:
         """Send one plot's points."""
@@ -88,7 +94,7 @@ class Canvas:
 
     def static(self, path: str, *archetypes: Any) -> None:
         """Log what holds at all times."""
-        self._recording.log(path, *archetypes, static=True, strict=True)
+        self._recording.log(self._at(path), *archetypes, static=True, strict=True)
 
 
 def line(name: str, colour: Rgba, *, width: float = 1.8, steps: bool = False) -> rr.SeriesLines:

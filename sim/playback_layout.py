@@ -37,51 +37,9 @@ happened to the fleet; pink, the phase changed.
 
 def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     """Scene and decisions on the left, causes and costs over time on the right."""
-    n, altitude_m = scenario.fleet.drones, scenario.fleet.formation.altitude_m
-    offsets = slots(scenario.fleet.formation.shape, n, scenario.fleet.formation.spacing_m)
-    reach_m = float(np.abs(offsets).max()) + footprint_radius_m(altitude_m)
-    accuracy = scenario.perception.detector != "none"
-    hidden: dict[str | rr.encodings.EntityPath, Any] = {
-        f"world/{what}/{i}": rrb.EntityBehavior(visible=False)
-        for what in ("seen", "received")
-        for i in range(n)
-        if i != EGO
-    }
-    scene = rrb.Spatial3DView(
-        name="the fleet over the town",
-        origin="world/fleet",  # the eye flies along with the fleet
-        contents="/world/**",
-        overrides=hidden,
-        background=(20, 24, 30, 255),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=(-1.4 * reach_m, -1.0 * reach_m, altitude_m + 0.95 * reach_m),
-            look_target=(0.0, -0.1 * reach_m, 0.3 * altitude_m),
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
-    log = rrb.TextLogView(
-        name="who decided what, and why",
-        contents=["/log/**"],
-        columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.encodings.TimelineColumn(SIM_TIME)], text_log_columns=["Body"]
-        ),
-    )
-    legend = rrb.TextDocumentView(name="how to read this", contents=["/about"])
-    n_lanes = min(n, MAX_LANES)
-    lanes = ["/lanes/events", "/lanes/phase", *(f"/lanes/drone_{i}" for i in range(n_lanes))]
-    axis = rrb.TimeAxis(
-        link="Independent",
-        view_range=rrb.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seconds=0.0),
-            end=rrb.TimeRangeBoundary.absolute(seconds=scenario.duration_s),
-        ),
-    )
+    axis = time_axis(scenario)
 
-    def plot(
-        name: str, folder: str, y: tuple[float, float] | None = None, *, legend: bool = True
-    ) -> rrb.TimeSeriesView:
+    def plot(name: str, folder: str, y: tuple[float, float] | None = None, *, legend: bool = True) -> rrb.View:
         return rrb.TimeSeriesView(
             name=name,
             contents=[f"/plots/{folder}/**"],
@@ -91,9 +49,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         )
 
     plots: list[rrb.View | rrb.Container] = [
-        rrb.StateTimelineView(
-            name="events, phase, and what each drone sends on its best link", contents=lanes, time_view=axis
-        ),
+        lanes_view(scenario),
         plot("battery, %", "battery", legend=False),
         plot("goodput, mean of a drone's links, Mb/s", "goodput", legend=False),
         plot("traffic by representation and fate, Mb/s", "traffic"),
@@ -103,14 +59,25 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         ),
     ]
     shares = [1.0, 1.0, 1.2, 0.9]
-    if accuracy:
+    if scenario.perception.detector != "none":
         plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
         shares.insert(0, 1.2)
-    lanes_height = 0.05 + 0.042 * (n_lanes + 2)  # part of the window that shows every lane
+    lanes_height = 0.05 + 0.042 * (
+        min(scenario.fleet.drones, MAX_LANES) + 2
+    )  # part of the window that shows every lane
     shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
-    left = rrb.Vertical(scene, rrb.Horizontal(log, legend, column_shares=[1, 1]), row_shares=[3, 1])
+    about = rrb.TextDocumentView(name="how to read this", contents=["/about"])
+    left = rrb.Vertical(
+        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[1, 1]), row_shares=[3, 1]
+    )
+    body = rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2])
+    return sheet(body, live=live)
+
+
+def sheet(body: rrb.Container, *, live: bool = False) -> rrb.Blueprint:
+    """A layout with nothing beside it but the time line."""
     return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2]),
+        body,
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(
@@ -122,6 +89,64 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         ),
         auto_layout=False,
         auto_views=False,
+    )
+
+
+def scene_view(scenario: Scenario, root: str = "", name: str = "the fleet over the town") -> rrb.View:
+    """The 3-D scene below `root`, from an eye that flies along."""
+    n, altitude_m = scenario.fleet.drones, scenario.fleet.formation.altitude_m
+    offsets = slots(scenario.fleet.formation.shape, n, scenario.fleet.formation.spacing_m)
+    reach_m = float(np.abs(offsets).max()) + footprint_radius_m(altitude_m)
+    hidden: dict[str | rr.encodings.EntityPath, Any] = {
+        f"{root}/world/{what}/{i}": rrb.EntityBehavior(visible=False)
+        for what in ("seen", "received")
+        for i in range(n)
+        if i != EGO
+    }
+    return rrb.Spatial3DView(
+        name=name,
+        origin=f"{root}/world/fleet",
+        contents=f"{root}/world/**",
+        overrides=hidden,
+        background=(20, 24, 30, 255),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(-1.4 * reach_m, -1.0 * reach_m, altitude_m + 0.95 * reach_m),
+            look_target=(0.0, -0.1 * reach_m, 0.3 * altitude_m),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+    )
+
+
+def log_view(root: str = "", name: str = "who decided what, and why") -> rrb.View:
+    """Decisions and events in words."""
+    return rrb.TextLogView(
+        name=name,
+        contents=[f"{root}/log/**"],
+        columns=rrb.TextLogColumns(
+            timeline_columns=[rrb.encodings.TimelineColumn(SIM_TIME)], text_log_columns=["Body"]
+        ),
+    )
+
+
+def lanes_view(
+    scenario: Scenario, root: str = "", name: str = "events, phase, and what each drone sends on its best link"
+) -> rrb.View:
+    """Events, phase and drones as lanes."""
+    drones = range(min(scenario.fleet.drones, MAX_LANES))
+    lanes = [f"{root}/lanes/events", f"{root}/lanes/phase", *(f"{root}/lanes/drone_{i}" for i in drones)]
+    return rrb.StateTimelineView(name=name, contents=lanes, time_view=time_axis(scenario))
+
+
+def time_axis(scenario: Scenario) -> rrb.TimeAxis:
+    """The whole sortie, whatever other views show."""
+    return rrb.TimeAxis(
+        link="Independent",
+        view_range=rrb.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seconds=0.0),
+            end=rrb.TimeRangeBoundary.absolute(seconds=scenario.duration_s),
+        ),
     )
 
 
