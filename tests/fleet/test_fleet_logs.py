@@ -71,6 +71,19 @@ def test_local_metres_undo_the_geodetic(position: tuple[float, float, float]) ->
     np.testing.assert_allclose(local_m(fixes)[1], position, atol=1e-4)
 
 
+def test_nested_topics_keep_their_padding_and_rows_lose_theirs() -> None:
+    """Two inner records of 3 bytes and one of padding each, then a last field; the outer padding is not logged."""
+    data = WHOLE["ulg"][:16]
+    data += examples.ulog_message("F", b"inner:uint16_t a;uint8_t b;uint8_t[1] _padding0;")
+    data += examples.ulog_message("F", b"outer:uint64_t timestamp;inner[2] pair;uint8_t last;uint8_t[7] _padding0;")
+    data += examples.ulog_message("A", struct.pack("<BH", 0, 3) + b"outer")
+    data += examples.ulog_message("D", struct.pack("<HQHBBHBBB", 3, 1, 10, 11, 0, 20, 21, 0, 99))
+    table = read_ulog(data).tables["outer"]
+    assert table["pair"]["a"].tolist() == [[10, 20]]
+    assert table["pair"]["b"].tolist() == [[11, 21]]
+    assert table["last"].tolist() == [99]
+
+
 # --- damage ----------------------------------------------------------------------------------------
 
 

@@ -179,6 +179,15 @@ def test_a_traced_drone_lands_at_landing_soc_too() -> None:
     assert 0.48 < b.soc[0] <= 0.5
 
 
+def test_what_a_fault_took_stays_gone_from_a_trace() -> None:
+    b = FleetBatteries(Battery(), (), 1, {0: trace([0, 100], [0.9, 0.9])})
+    b.fault(0, 0.5)
+    steady(b, 1.0)
+    half = float(energy_fraction(0.9)) / 2
+    assert float(energy_fraction(b.soc[0])) == pytest.approx(half, abs=1e-6)
+    assert b.energy_j["fault"][0] == pytest.approx(half * 130 * 3600)
+
+
 # --- the ledger, everything on -------------------------------------------------------------------
 
 packs = st.builds(
