@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radio.bursts import PairNumbers, PairStates
-from radio.rates import group_mcs, rate_table, rescale
+from radio.rates import group_mcs, rate_table
 from radio.traces import Given, LinkTrace
 from scenarios.schema import Radio
 
@@ -62,7 +62,7 @@ class Overrides:
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
         self._group_gain_db = 10.0 * float(np.log10(config.bandwidth_mhz / 20.0))
         self._group_mcs = group_mcs(config.group_rate_mbps)
-        self._group_table = rate_table(20, config.rician_k_db)
+        self._k_db = config.rician_k_db
         self._snr_rows: list[list[float]] | None = None
         self._known_rows: list[list[float]] | None = None
 
@@ -135,9 +135,8 @@ class Overrides:
         for i in np.flatnonzero(traced).tolist():
             missed = float(loss[i])
             if isnan(missed):
-                table = self._group_table
+                table = rate_table(20, self._k_db, mpdu_bytes)  # kept: frames come in few lengths
                 per = table.all_per[self._group_mcs][table.index(float(snr_db[i]) + self._group_gain_db)]
-                per = rescale(per, mpdu_bytes / table.frame_bytes)
                 missed = 1.0 - (1.0 - per) * (1.0 - float(on_top[i]))
             if i != sender and luck[i] >= missed:
                 reached.append(i)
