@@ -1,39 +1,39 @@
 """Positions to signal-to-noise ratios: path loss, antennas, shadowing, fading, noise and jammers.
 
-Random numbers of the first `SQUARE` drones come from one stream per drone and purpose; the stream of drone h draws
-for its links to the drones of *lower* id, so that each link has numbers of its own and one more drone changes none
-of the others', with N streams and not N². Links of later drones take theirs by counter (`radio.draws`), which costs
-nothing for those that are out of earshot.
+Small fleets work out every link, with the random numbers of `radio.draws.StreamDraws`; large ones the links within
+earshot (`radio.crowd`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log10, sqrt
+from math import log10
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radio.antenna import antenna_loss_db
-from radio.draws import drone_keys, fade_table_db, levels, link_keys, normal_table, numbers, uniforms
-from radio.links import Links, all_links, links_in_range
+from radio.crowd import EPOCH, Crowd
+from radio.draws import StreamDraws, fade_table_db
+from radio.links import Links, all_links
 from radio.pathloss import path_loss_db, range_m
 from radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
-from radio.shadowing import ShadowField, gauss_markov, keep
+from radio.shadowing import ShadowField
 from scenarios.schema import Radio
 from scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
+AnyFloats = NDArray[np.floating[Any]]
+"""Large fleets are worked out in single precision."""
 Jammer = tuple[Sequence[float], float]
 """Position ENU in metres and power in the channel in dBm."""
 
-SQUARE = 64
+SQUARE = 32
 """Fleets of up to so many drones work out every link; larger ones those within earshot."""
-EPOCH = 32
-"""Frames for which a large fleet's list of links stands."""
 OUT_OF_RANGE_DB = -100.0
 """SNR that is told of a link out of earshot."""
-_EARSHOT_SIGMA = 4.0
+_EARSHOT_SIGMA = 5.0
 _BLOCK_NUMBERS = 1 << 18
 
 
@@ -42,18 +42,11 @@ def noise_dbm(bandwidth_mhz: float, noise_figure_db: float) -> float:
     return -174.0 + 10.0 * log10(bandwidth_mhz * 1e6) + noise_figure_db
 
 
-def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
-    """Power gain of mean 1 from two standard normals: a fixed path of K/(K + 1) and a scattered one of 1/(K + 1)."""
-    k = 10.0 ** (k_db / 10.0)
-    scatter = sqrt(0.5 / (k + 1.0))
-    return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
-
-
 def earshot_m(config: Radio) -> float:
     """The distance beyond which no frame is heard.
 
-    There a link with 4 σ of shadowing and the highest of 65,536 fades is still 2 dB short of half the group frames,
-    which leaves less than one in 10^6 of them: a sum of rare cases that no sortie meets.
+    There a link with 5 σ of shadowing (one in 3.5 million) and the highest of 65,536 fades is still 2 dB short of
+    half the group frames.
     """
     gain_db = _EARSHOT_SIGMA * config.shadowing_sigma_db + float(fade_table_db(config.rician_k_db)[-1])
     needed_db = min(S50_DB[0], S50_DB[group_mcs(config.group_rate_mbps)] - 10.0 * log10(config.bandwidth_mhz / 20.0))
@@ -61,7 +54,7 @@ def earshot_m(config: Radio) -> float:
     return range_m(config, config.tx_power_dbm - noise + gain_db - needed_db + 2.0)
 
 
-def _reach_at_1(luck: FloatArray) -> FloatArray:
+def _reach_at_1(luck: AnyFloats) -> AnyFloats:
     """How long a frame may be, bytes, to arrive with this luck where −log s (see `Channel._reach`) is 1."""
     return np.asarray(-REFERENCE_BYTES * np.log1p(-luck))
 
@@ -71,7 +64,7 @@ class FrameLinks:
 
     __slots__ = ("_rows", "_square", "links", "snr_db")
 
-    def __init__(self, links: Links, snr_db: FloatArray) -> None:
+    def __init__(self, links: Links, snr_db: AnyFloats) -> None:
         self.links, self.snr_db = links, snr_db
         self._square: FloatArray | None = None
         self._rows: list[list[float]] | None = None
@@ -143,32 +136,29 @@ class Channel:
         mcs = group_mcs(config.group_rate_mbps)
         self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
         self._frame_s = frame_s
-        self._keep = keep(frame_s, config.shadowing_time_s)
-        self._is_square = n_drones <= SQUARE
-        self._drawn = drawn = min(n_drones, SQUARE)
-        self._shadow_streams = [stream(seed, replication, h, "shadowing") for h in range(drawn)]
-        self._fade_streams = [stream(seed, replication, h, "fading") for h in range(drawn)]
-        self._luck_streams = [stream(seed, replication, h, "group loss") for h in range(drawn)]
-        self._block = max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones))) if self._is_square else EPOCH
-        self._drone_keys = drone_keys(seed, replication, 0 if self._is_square else n_drones)
-        self._earshot_m = earshot_m(config)
         self._field: ShadowField | None = None
         if config.shadowing_distance_m is not None:
             self._field = ShadowField(
                 config.shadowing_sigma_db, config.shadowing_distance_m, config.shadowing_time_s, seed, replication
             )
-        self.links = all_links(n_drones if self._is_square else 0)
-        self.now = self.before = FrameLinks(self.links, np.full(len(self.links.sender), np.nan))
+        early = min(n_drones, SQUARE)
+        self._draws = StreamDraws(config, seed, replication, early, frame_s)
+        self._crowd: Crowd | None = None
+        if n_drones > SQUARE:
+            self._crowd = Crowd(
+                config, n_drones, self._draws, self._field,
+                n_early=early, earshot_m=earshot_m(config), seed=seed, replication=replication, frame_s=frame_s,
+            )  # fmt: skip
+        self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
+        self.links = all_links(0 if self._crowd else n_drones)
+        self.now = self.before = FrameLinks(self.links, np.empty(0))
         # the block, [frames, L] each
-        self._snr_db: FloatArray
-        self._fades_db: FloatArray
-        self._luck: FloatArray
-        self._reach_at_1: FloatArray
-        self._reach_bytes: FloatArray
-        self._shadow_db: FloatArray
-        self._last_square_db: FloatArray | None = None  # where the shadowing of each pair stood at the block's end
-        self._last_keys: NDArray[np.int64] = np.empty(0, np.int64)
-        self._last_db: FloatArray = np.empty(0)
+        self._snr_db: AnyFloats
+        self._shadow_db: AnyFloats
+        self._fades_db: AnyFloats
+        self._luck: AnyFloats
+        self._reach_at_1: AnyFloats
+        self._reach_bytes: AnyFloats
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
@@ -240,11 +230,16 @@ class Channel:
         ids: list[int] = self.links.receiver[a:b][reach >= length_bytes].tolist()
         return ids
 
-    def _reach(self, faded_db: FloatArray, reach_at_1: FloatArray) -> FloatArray:
+    def _reach(self, faded_db: AnyFloats, reach_at_1: AnyFloats) -> AnyFloats:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
-        margin = faded_db + (self._group_gain_db - self._group_s50_db)
-        minus_log_s = np.log1p(np.exp(np.minimum(-self._group_slope * margin, 700.0)))
-        return np.asarray(reach_at_1 / np.maximum(minus_log_s, 1e-300))
+        x = faded_db + (self._group_gain_db - self._group_s50_db)
+        x *= -self._group_slope
+        is_single = x.dtype == np.float32
+        np.minimum(x, 80.0 if is_single else 700.0, out=x)  # keeps the exponential finite
+        minus_log_s: AnyFloats = np.log1p(np.exp(x, out=x), out=x)
+        np.maximum(minus_log_s, 1e-30 if is_single else 1e-300, out=minus_log_s)
+        minus_log_s = np.divide(reach_at_1, minus_log_s, out=minus_log_s)
+        return minus_log_s
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
@@ -266,93 +261,33 @@ class Channel:
 
     def _refill(self) -> None:
         c, p = self.config, self._positions_m[self.frame : self.frame + self._block]
-        if not self._is_square:
-            self.links = links_in_range(p, self._earshot_m)
-        links = self.links
-        loss_db = self._loss_db(p)
-        self._draw(len(p))
+        up = None if self._up is None else self._up[self.frame : self.frame + self._block]
+        if self._crowd is not None:
+            self.links, loss_db, self._shadow_db, self._fades_db, self._luck = self._crowd.block(self.frame, p, up)
+        else:
+            loss_db = self._loss_db(p, up)
+            drawn = self._draws.block(self._block, len(p))
+            self._shadow_db, self._fades_db, self._luck = (x.reshape(len(p), -1) for x in drawn)
+            if self._field is not None:
+                at = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
+                self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._reach_at_1 = _reach_at_1(self._luck)
-        if self._field is not None:
-            squares = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
-            self._shadow_db = np.stack(squares)[:, links.sender, links.receiver]
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
         self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._reach_at_1)
 
-    def _loss_db(self, p: FloatArray) -> FloatArray:
-        """[frames, L] of [frames, N, 3] positions: path and antennas."""
+    def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
+        """[frames, N²] of [frames, N, 3] positions: path and antennas."""
         links, c = self.links, self.config
-        if self._is_square:
-            delta = p[:, :, None, :] - p[:, None, :, :]
-            distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
-        else:
-            delta = p[:, links.sender] - p[:, links.receiver]
-            distance = np.sqrt(np.einsum("tlk,tlk->tl", delta, delta))
+        delta = p[:, :, None, :] - p[:, None, :, :]
+        distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
         heights = p[:, :, 2]
         loss_db = path_loss_db(c, distance, heights[:, links.sender], heights[:, links.receiver])
         if c.antenna != "isotropic":
             along = delta.reshape(len(p), -1, 3) / np.maximum(distance, 1e-9)[..., None]
             for end in (links.sender, links.receiver):
-                if self._up is None:
-                    cosine = along[..., 2]
-                else:
-                    up = self._up[self.frame : self.frame + self._block]
-                    cosine = np.einsum("tlk,tlk->tl", along, up[:, end])
+                cosine = along[..., 2] if up is None else np.einsum("tlk,tlk->tl", along, up[:, end])
                 loss_db = loss_db + antenna_loss_db(c.antenna, cosine)
         return loss_db
-
-    def _draw(self, flown: int) -> None:
-        """Shadowing, fades and luck of the block, [flown, L]."""
-        b, n = self._block, self._drawn
-        shadow_z, x, y, luck = (np.zeros((b, n, n)) for _ in range(4))
-        for h in range(1, n):
-            z = self._shadow_streams[h].standard_normal((b, h))
-            shadow_z[:, h, :h] = z
-            shadow_z[:, :h, h] = z
-            self._scatter(x, h, f := self._fade_streams[h].standard_normal((b, 2, 2, h)), 0)
-            self._scatter(y, h, f, 1)
-            self._scatter(luck, h, self._luck_streams[h].random((b, 1, 2, h)), 0)
-        luck[:, range(n), range(n)] = np.nan  # no drone hears itself
-        shadow_db = gauss_markov(shadow_z, self.config.shadowing_sigma_db, self._keep, self._last_square_db)
-        self._last_square_db = shadow_db[-1]
-        gain = rician_gain(x[:flown], y[:flown], self.config.rician_k_db)
-        if self._is_square:
-            self._luck = luck[:flown].reshape(flown, -1)
-            self._shadow_db = shadow_db[:flown].reshape(flown, -1)
-            self._fades_db = 10.0 * np.log10(np.maximum(gain.reshape(flown, -1), 1e-12))
-            return
-        self._count(flown)
-        early = np.flatnonzero((self.links.sender < n) & (self.links.receiver < n))
-        s, r = self.links.sender[early], self.links.receiver[early]
-        self._luck[:, early] = luck[:flown, s, r]
-        self._shadow_db[:, early] = shadow_db[:flown, s, r]
-        self._fades_db[:, early] = 10.0 * np.log10(np.maximum(gain[:, s, r], 1e-12))
-
-    def _count(self, flown: int) -> None:
-        """The same for every link of a large fleet, by counter; those of the first drones are overwritten."""
-        links, keys = self.links, self._drone_keys
-        bits = numbers(link_keys(keys, links.sender, links.receiver, 1), self.frame, flown)
-        self._luck = uniforms(bits)
-        self._fades_db = fade_table_db(self.config.rician_k_db)[levels(bits)]
-        low = np.flatnonzero(links.sender < links.receiver)
-        s, r = links.sender[low], links.receiver[low]
-        z = normal_table()[levels(numbers(link_keys(keys, s, r, 2), self.frame, flown))]
-        pair = (r << 32) + s  # does not depend on how many drones there are
-        order = np.argsort(pair)
-        begin_db = np.full(len(pair), np.nan)  # a pair that has come into earshot begins anew
-        if len(self._last_keys):
-            at = np.minimum(np.searchsorted(self._last_keys, pair), len(self._last_keys) - 1)
-            known = self._last_keys[at] == pair
-            begin_db[known] = self._last_db[at[known]]
-        shadow_db = gauss_markov(z, self.config.shadowing_sigma_db, self._keep, begin_db)
-        self._last_keys, self._last_db = pair[order], shadow_db[-1, order]
-        self._shadow_db = np.empty((flown, len(links.sender)))
-        self._shadow_db[:, low] = shadow_db
-        self._shadow_db[:, links.back[low]] = shadow_db
-
-    @staticmethod
-    def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:
-        into[:, h, :h] = drawn[:, part, 0]  # h sends
-        into[:, :h, h] = drawn[:, part, 1]  # h receives
 
 
 class SampleLuck:

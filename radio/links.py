@@ -7,11 +7,12 @@ Values of links are kept as vectors [L], the links of one sender side by side.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
 
@@ -26,14 +27,11 @@ class Links:
     begin: list[int]
     """[N + 1]: the links of drone i are begin[i] … begin[i + 1] − 1."""
     is_square: bool
-    back: IntArray
-    """[L]: where the link of the other direction stands."""
 
-    def square(self, values: FloatArray, elsewhere: float) -> FloatArray:
+    def square(self, values: FloatArray, elsewhere: float) -> NDArray[np.float64]:
         """[L] → [N, N], sender by receiver, NaN on the diagonal, `elsewhere` where no link is listed."""
-        out: FloatArray
         if self.is_square:
-            out = values.reshape(self.n, self.n).copy()
+            out = values.reshape(self.n, self.n).astype(np.float64)
         else:
             out = np.full((self.n, self.n), elsewhere)
             out[self.sender, self.receiver] = values
@@ -44,23 +42,42 @@ class Links:
 def all_links(n: int) -> Links:
     """Every drone with every drone."""
     ids = np.arange(n)
-    sender, receiver = np.repeat(ids, n), np.tile(ids, n)
-    return Links(n, sender, receiver, [i * n for i in range(n + 1)], True, receiver * n + sender)
+    return Links(n, np.repeat(ids, n), np.tile(ids, n), [i * n for i in range(n + 1)], True)
 
 
-def links_in_range(positions_m: FloatArray, range_m: float) -> Links:
-    """Links whose ends come within `range_m` in some frame of [frames, N, 3] positions; grows with N × neighbours."""
+def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs whose ends come within `range_m` in some frame; the work grows with N × neighbours.
+
+    Args:
+        positions_m: [frames, N, 3].
+        range_m: ≥ 0.
+
+    Returns:
+        Lower ids [P], higher ids [P], and distances [frames, P], in the type of `positions_m`.
+    """
     from scipy.spatial import cKDTree
 
-    n = positions_m.shape[1]
     middle = positions_m[len(positions_m) // 2]
     astray_m = float(np.sqrt(((positions_m - middle) ** 2).sum(axis=-1).max()))
-    pairs = cKDTree(middle).query_pairs(range_m + 2.0 * astray_m, output_type="ndarray").astype(np.int64)
-    apart = positions_m[:, pairs[:, 0]] - positions_m[:, pairs[:, 1]]
-    pairs = pairs[((apart**2).sum(axis=-1) <= range_m**2).any(axis=0)]
-    sender = np.concatenate([pairs[:, 0], pairs[:, 1]])
-    receiver = np.concatenate([pairs[:, 1], pairs[:, 0]])
-    order = np.lexsort((receiver, sender))
+    pairs = cKDTree(middle).query_pairs(range_m + 2.0 * astray_m, output_type="ndarray")
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    apart = np.zeros((len(positions_m), len(pairs)), positions_m.dtype)
+    for axis in range(3):
+        along = np.ascontiguousarray(positions_m[:, :, axis])
+        step = along[:, low] - along[:, high]
+        step *= step
+        apart += step
+    np.sqrt(apart, out=apart)
+    near = (apart <= range_m).any(axis=0)
+    if near.all():
+        return low, high, apart
+    return low[near], high[near], apart[:, near]
+
+
+def both_ways(n: int, low: IntArray, high: IntArray) -> tuple[Links, IntArray]:
+    """The links of some pairs, and [L] the number of each link's pair."""
+    sender, receiver = np.concatenate([low, high]), np.concatenate([high, low])
+    order = np.argsort(sender * n + receiver)
     sender, receiver = sender[order], receiver[order]
-    back = np.searchsorted(sender * n + receiver, receiver * n + sender)
-    return Links(n, sender, receiver, np.searchsorted(sender, np.arange(n + 1)).tolist(), False, back)
+    begin = np.searchsorted(sender, np.arange(n + 1)).tolist()
+    return Links(n, sender, receiver, begin, False), order % max(1, len(low))

@@ -23,7 +23,7 @@ def free_space_loss_db(distance_m: ArrayLike, carrier_ghz: float) -> FloatArray:
 
 def log_distance_loss_db(distance_m: ArrayLike, carrier_ghz: float, exponent: float) -> FloatArray:
     """Free space at 1 m, then 10 · exponent · log10(d), dB; nearer than 1 m counts as 1 m."""
-    d = np.maximum(np.asarray(distance_m, dtype=float), 1.0)
+    d = np.maximum(distance_m, 1.0)
     return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) + 10.0 * exponent * np.log10(d))
 
 
@@ -64,7 +64,7 @@ def two_ray_loss_db(
     return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) - 10.0 * np.log10(np.maximum(power, 1e-30)))
 
 
-def path_loss_db(config: Radio, distance_m: FloatArray, height_a_m: FloatArray, height_b_m: FloatArray) -> FloatArray:
+def path_loss_db(config: Radio, distance_m: ArrayLike, height_a_m: ArrayLike, height_b_m: ArrayLike) -> FloatArray:
     """The path loss that a scenario asks for, dB; arguments as for `two_ray_loss_db`."""
     if config.path_loss == "two_ray":
         return two_ray_loss_db(distance_m, height_a_m, height_b_m, config.carrier_ghz, config.ground_roughness_m)

@@ -9,6 +9,7 @@ the surroundings change. It is a sum of plane waves whose wave vectors are drawn
 from __future__ import annotations
 
 from math import exp, sqrt
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
+Floats = TypeVar("Floats", bound=NDArray[np.floating[Any]])
 
 WAVES = 256
 
@@ -51,7 +53,7 @@ class ShadowField:
         return np.asarray(field)
 
 
-def gauss_markov(innovations: FloatArray, sigma_db: float, keep: float, before_db: FloatArray | None) -> FloatArray:
+def gauss_markov(innovations: Floats, sigma_db: float, keep: float, before_db: Floats | None) -> Floats:
     """First-order Gauss–Markov process along the first axis.
 
     Args:
@@ -64,7 +66,7 @@ def gauss_markov(innovations: FloatArray, sigma_db: float, keep: float, before_d
         [frames, ...] dB.
     """
     renew = sqrt(1.0 - keep**2)
-    out = np.empty_like(innovations)
+    out: Floats = np.empty_like(innovations)
     for t, normals in enumerate(innovations):
         if before_db is None:
             before_db = sigma_db * normals

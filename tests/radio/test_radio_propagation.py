@@ -10,9 +10,10 @@ from radio_examples import CROSS_M, still
 from scipy import stats
 
 from radio.antenna import FLOOR_DB, antenna_loss_db
-from radio.channel import EPOCH, OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
+from radio.channel import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
+from radio.crowd import EPOCH
 from radio.draws import fade_table_db, normal_table
-from radio.links import links_in_range
+from radio.links import both_ways, near_pairs
 from radio.pathloss import LIGHT_MPS, free_space_loss_db, path_loss_db, range_m, two_ray_loss_db
 from radio.shadowing import ShadowField, gauss_markov
 from scenarios.schema import Radio
@@ -213,17 +214,17 @@ def test_links_of_a_large_fleet_do_not_depend_on_how_many_more_there_are() -> No
         np.testing.assert_array_equal(few.fade_db, many.fade_db[:90, :90])
         np.testing.assert_array_equal(few.group_reach_bytes, many.group_reach_bytes[:90, :90])
         both = few.snr_db[:SQUARE, :SQUARE] > OUT_OF_RANGE_DB
-        np.testing.assert_allclose(few.snr_db[:SQUARE, :SQUARE][both], small.snr_db[both])
+        np.testing.assert_allclose(few.snr_db[:SQUARE, :SQUARE][both], small.snr_db[both], atol=1e-4)
 
 
 def test_nothing_out_of_earshot_would_have_been_heard() -> None:
-    """A small fleet works every link out: beyond earshot, in 300 frames of 60 drones, no link carries a frame."""
-    positions = np.repeat(_wide_fleet(60, 1), 300, axis=0)
+    """A small fleet works every link out: beyond earshot, in 1000 frames of 32 drones, no link carries a frame."""
+    positions = np.repeat(_wide_fleet(SQUARE, 1), 1000, axis=0)
     channel = Channel(NEAR, positions, 2, 0, 0.1)
     apart = np.sqrt(((positions[0][:, None] - positions[0][None]) ** 2).sum(axis=-1))
     beyond = apart > earshot_m(NEAR)
-    assert beyond.sum() > 1000
-    for _ in range(300):
+    assert beyond.sum() > 500
+    for _ in range(1000):
         channel.advance()
         assert not (channel.group_reach_bytes[beyond] >= 200).any()
 
@@ -270,12 +271,13 @@ def test_a_gauss_markov_process_goes_on_over_a_gap_in_its_block() -> None:
 
 def test_every_pair_in_range_is_listed_both_ways() -> None:
     p = np.random.default_rng(2).random((5, 80, 3)) * 100.0
-    links = links_in_range(p, 25.0)
-    apart = np.sqrt(((p[:, :, None] - p[:, None]) ** 2).sum(axis=-1)).min(axis=0)
-    near = (apart <= 25.0) & ~np.eye(80, dtype=bool)
+    low, high, distance = near_pairs(p, 25.0)
+    links, pair_of = both_ways(80, low, high)
+    apart = np.sqrt(((p[:, :, None] - p[:, None]) ** 2).sum(axis=-1))
+    near = (apart.min(axis=0) <= 25.0) & ~np.eye(80, dtype=bool)
     assert np.argwhere(near).tolist() == np.stack([links.sender, links.receiver], axis=1).tolist()
-    assert (links.sender[links.back] == links.receiver).all()
     assert links.begin == [0, *np.cumsum(near.sum(axis=1)).tolist()]
+    np.testing.assert_allclose(distance[:, pair_of], apart[:, links.sender, links.receiver])
 
 
 def test_broken_attitudes_are_refused() -> None:

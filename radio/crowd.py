@@ -1,0 +1,114 @@
+"""A block of frames of a large fleet: the links within earshot and what is drawn for them, in single precision.
+
+The work grows with drones × neighbours; links out of earshot cost nothing. Links between the first drones keep the
+numbers that they have in a small fleet, so that one more drone changes none of the others'.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radio.antenna import antenna_loss_db
+from radio.draws import StreamDraws, drone_keys, fade_table_db, levels, link_keys, normal_table, numbers, uniforms
+from radio.links import IntArray, Links, both_ways, near_pairs
+from radio.pathloss import path_loss_db
+from radio.shadowing import ShadowField, gauss_markov, keep
+from scenarios.schema import Radio
+
+Array = NDArray[np.floating[Any]]
+
+EPOCH = 32
+"""Frames for which the list of links stands."""
+
+
+class Block(NamedTuple):
+    """Links, and [frames, L] of each."""
+
+    links: Links
+    loss_db: Array
+    shadow_db: Array
+    fades_db: Array
+    luck: Array
+
+
+class Crowd:
+    """Blocks of `EPOCH` frames, one after another; arguments as for `Channel`."""
+
+    def __init__(
+        self,
+        config: Radio,
+        n: int,
+        early: StreamDraws,
+        field: ShadowField | None,
+        *,
+        n_early: int,
+        earshot_m: float,
+        seed: int,
+        replication: int,
+        frame_s: float,
+    ) -> None:
+        self._config, self._n, self._n_early = config, n, n_early
+        self._early, self._field, self._earshot_m = early, field, earshot_m
+        self._keys = drone_keys(seed, replication, n)
+        self._fades = fade_table_db(config.rician_k_db)
+        self._frame_s = frame_s
+        self._keep = keep(frame_s, config.shadowing_time_s)
+        self._last_pairs: IntArray = np.empty(0, np.int64)
+        self._last_db: Array = np.empty(0, np.float32)
+
+    def block(self, frame: int, positions_m: Array, up: Array | None) -> Block:
+        """The frames from `frame` on, of [frames, N, 3] positions (and vectors along the airframes' z axes)."""
+        p = positions_m.astype(np.float32)
+        low, high, distance = near_pairs(p, self._earshot_m)
+        loss_db = path_loss_db(self._config, distance, p[:, low, 2], p[:, high, 2])
+        if self._config.antenna != "isotropic":
+            loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
+        links, pair_of = both_ways(self._n, low, high)
+        bits = numbers(link_keys(self._keys, links.sender, links.receiver), frame, len(p))
+        luck, fades_db = uniforms(bits), self._fades[levels(bits, 0)]
+        forward = np.empty(len(low), np.int64)  # where each pair's link from the lower id stands
+        up_links = np.flatnonzero(links.sender < links.receiver)
+        forward[pair_of[up_links]] = up_links
+        shadow_db = self._shadowing(frame, positions_m, low, high, bits[:, forward])
+        self._draw_early(links, low, high, len(p), luck, fades_db, shadow_db)
+        return Block(links, loss_db[:, pair_of], shadow_db[:, pair_of], fades_db, luck)
+
+    def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
+        along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
+        if up is None:
+            return 2.0 * antenna_loss_db(self._config.antenna, along[..., 2])
+        ends = (np.einsum("tpk,tpk->tp", along, up[:, end]) for end in (low, high))
+        return np.asarray(sum(antenna_loss_db(self._config.antenna, cosine) for cosine in ends))
+
+    def _shadowing(self, frame: int, positions_m: Array, low: IntArray, high: IntArray, bits: Any) -> Array:
+        """[frames, P] dB; a pair that has come into earshot begins anew."""
+        if self._field is not None:
+            at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
+            return np.stack([square[low, high] for square in at])
+        pairs = (high << 32) + low  # does not depend on how many drones there are
+        begin_db = np.full(len(pairs), np.nan, np.float32)
+        if len(self._last_pairs):
+            where = np.minimum(np.searchsorted(self._last_pairs, pairs), len(self._last_pairs) - 1)
+            known = self._last_pairs[where] == pairs
+            begin_db[known] = self._last_db[where[known]]
+        z = normal_table()[levels(bits, 1)]
+        shadow_db = gauss_markov(z, self._config.shadowing_sigma_db, self._keep, begin_db)
+        order = np.argsort(pairs)
+        self._last_pairs, self._last_db = pairs[order], shadow_db[-1, order]
+        return shadow_db
+
+    def _draw_early(
+        self, links: Links, low: IntArray, high: IntArray, flown: int, luck: Array, fades_db: Array, shadow_db: Array
+    ) -> None:
+        """Put the first drones' own numbers in their places."""
+        early_shadow_db, early_fades_db, early_luck = self._early.block(EPOCH, flown)
+        at = np.flatnonzero((links.sender < self._n_early) & (links.receiver < self._n_early))
+        sender, receiver = links.sender[at], links.receiver[at]
+        luck[:, at] = early_luck[:, sender, receiver]
+        fades_db[:, at] = early_fades_db[:, sender, receiver]
+        if self._field is None:
+            pairs = np.flatnonzero(high < self._n_early)
+            shadow_db[:, pairs] = early_shadow_db[:, low[pairs], high[pairs]]
