@@ -30,6 +30,7 @@ from sim import (
     cli_recording,
     cli_study,
     cli_train,
+    cli_verify,
     rundir,
     tables,
 )
@@ -227,6 +228,7 @@ app.command()(cli_train.train)
 app.command()(cli_calibrate.calibrate)
 app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
+app.command()(cli_verify.verify)
 app.command()(cli_export.export)
 
 

@@ -123,7 +123,7 @@ class Pilot:
 
     def take_over(self, policy: Named, why: str) -> None:
         """From the next decision on, `policy` decides."""
-        if policy != self.policy:
+        if policy.name != self.policy.name:
             self._audit.took_over(self.drone, self.policy.name, policy.name, why)
             self.policy = policy
             if self.agent is not None:
@@ -144,7 +144,7 @@ class Pilot:
         shown, self._shown = self._shown, None
         directives = self._kept(view if shown is None else shown)
         if shown is not None:
-            self._compare_with_last(shown, directives)
+            self._judge_shown(shown, directives)
         return directives
 
     def _follow_phase(self, view: FleetView) -> None:
@@ -185,8 +185,10 @@ class Pilot:
                     audit.broke(self.drone, broken.destination, name, f"{rule.text}: {spelt([broken])}")
         return directives
 
-    def _compare_with_last(self, shown: FleetView, directives: Sequence[Directive]) -> None:
-        """Two views shown one after the other that differ in ages alone, which rose: nothing may rise with them."""
+    def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:
+        """One directive a link; and where ages alone rose since the last view shown, no directive may have risen."""
+        for peer in set(shown.peers) - {d.destination for d in directives}:
+            self._audit.broke(self.drone, peer, self.policy.name, "one directive a link: none for this one")
         before, self._last_shown = self._last_shown, (shown, directives)
         if before is None or before[0].descriptors != shown.descriptors:
             return

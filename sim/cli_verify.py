@@ -1,0 +1,129 @@
+"""`sortie verify`: hold a policy to the plane's contract, prove its invariants, keep what breaks them.
+
+`sortie overhead`: what the plane costs, in bytes and in time, by the size of the fleet.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from policies.conformance import VIEWS, Check, conform
+from policies.contract import FleetView, Policy
+from policies.invariants import Invariant, InvariantError, parse
+from policies.proof import PLANE, Verdict, prove
+from policies.properties import PROMISES
+from policies.registry import resolve
+from policies.views import to_json
+from scenarios.load import dump, loads
+from scenarios.schema import Policy as PolicySection
+from scenarios.schema import Scenario
+from sim.console import err, out
+from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
+from sim.folders import RunError, write_text
+
+COLOURS = {"holds": "green", "proved": "green", "fails": "red", "refuted": "red", "not proved": "yellow"}
+OWN_INVARIANTS = "INVARIANTS"
+"""The name under which a policy's file keeps its own invariants, as text."""
+
+
+def verify(
+    policy: Annotated[str, typer.Argument(help="A policy's name, name(key=value), or path/to/file.py:function.")],
+    invariants: Annotated[
+        Path | None,
+        typer.Option(help="A file of invariants, one a line; left out, those of the policy's file or its promises."),
+    ] = None,
+    drones: Annotated[int, typer.Option(help="Proofs search fleets of 1 to so many.", min=1, max=5)] = 3,
+    views: Annotated[int, typer.Option(help="The kit tries so many drawn views.", min=10)] = VIEWS,
+    out_dir: Annotated[Path, typer.Option("--out", help="Where counterexamples are kept.")] = Path("runs/verify"),
+) -> None:
+    """Try a policy on drawn views, prove its properties, and keep a counterexample of each that fails.
+
+    Exit code 1 if a rule fails or a property is refuted. A counterexample is a view as JSON, and a scenario that
+    shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
+    """
+    section = _section(policy)
+    name, params = section.name, section.params
+    decide = resolve(name, params)
+    rules = _invariants(name, decide, invariants)
+    broken = 0
+    table = Table("rule", "verdict", "what", title=f"{policy}: the conformance kit, {views} drawn views")
+    checks = conform(decide, count=views)
+    for check in checks:
+        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
+        broken += not check.holds
+    out.print(table)
+    table = Table("property", "verdict", "what", title=f"{policy}: proofs")
+    verdicts = prove(decide, rules, max_drones=drones)
+    for verdict in verdicts:
+        table.add_row(verdict.name, _verdict(verdict.outcome), verdict.what)
+        broken += verdict.outcome == "refuted"
+    out.print(table)
+    _keep(out_dir / slug(policy), _counterexamples(decide, section, checks, verdicts))
+    if broken:
+        err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
+        raise typer.Exit(1)
+
+
+def _verdict(word: str) -> str:
+    return f"[{COLOURS[word]}]{word}[/{COLOURS[word]}]"
+
+
+def _section(policy: str) -> PolicySection:
+    """`name(key=value, …)` as a scenario's section, parsed and checked as one is."""
+    name, bracket, rest = policy.partition("(")
+    if bracket and not rest.endswith(")"):
+        raise RunError(f"policy {policy!r}: the bracket is not closed, as in best-2(rho=0.1)")
+    params = [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
+    return loads("name: verify", overrides=[f"policy.name={name.strip()}", *params]).policy
+
+
+def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant, ...]:
+    """From the file named, or the policy's own file, or what a registered policy promises."""
+    inner: Any = decide.func if isinstance(decide, functools.partial) else decide
+    own = getattr(inner, "__globals__", {}).get(OWN_INVARIANTS) if ":" in name else PROMISES.get(name)
+    source = f"{name}: {OWN_INVARIANTS}" if file is None else str(file)
+    try:
+        text = (own or "") if file is None else file.read_text("utf-8")
+        return parse(str(text))
+    except OSError as error:
+        raise RunError(f"{file}: {error.strerror}") from error
+    except InvariantError as error:
+        raise RunError(f"{source}, {error}") from error
+
+
+def _counterexamples(
+    decide: Policy, section: PolicySection, checks: Sequence[Check], verdicts: Sequence[Verdict]
+) -> Iterator[tuple[str, FleetView, Scenario]]:
+    """Of everything that failed and has one: what failed, the view and the scenario."""
+    shown = functools.partial(replay_scenario, policy=section.name, params=section.params)
+    aged = PLANE[1]
+    for check in checks:
+        view = check.counterexample
+        if view is not None:
+            raised = raised_ages(decide, view) if check.name == "age-monotone" else None
+            yield check.name, view, shown(check.name, check.what, view=view, raised_age_s=raised)
+    for v in verdicts:
+        view = v.counterexample
+        if view is not None:
+            invariant = "" if v.name in {p.name for p in PLANE} else v.name
+            raised = (v.raised_age_s or raised_ages(decide, view)) if v.name == aged.name else None
+            yield v.name, view, shown(v.name, v.what, view=view, invariant=invariant, raised_age_s=raised)
+
+
+def _keep(folder: Path, found: Iterable[tuple[str, FleetView, Scenario]]) -> None:
+    """Write each view, and its scenario where the fault shows in flight."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, view, scenario in found:
+        path = unused(folder, scenario.name)
+        write_text(path.with_suffix(".json"), to_json(view))
+        out.print(f"counterexample of [bold]{name}[/bold]: {path}.json", soft_wrap=True)
+        if shows_in_flight(scenario):
+            write_text(path.with_suffix(".yaml"), dump(scenario))
+            out.print(f"  fails until the policy is mended: sortie check {path}.yaml", soft_wrap=True)

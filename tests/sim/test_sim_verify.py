@@ -1,0 +1,127 @@
+"""`sortie verify`, as a user meets it: verdicts, exit codes, and counterexamples that can be flown again."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from policies.conformance import RULES
+from policies.contract import TaskPhase
+from policies.views import draw_views, from_json, to_json
+from sim.cli import main
+from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
+
+FAULTY = '''
+from policies.contract import Directive, Representation
+
+INVARIANTS = """
+when target_in_region and peers >= 1: any_link(representation >= detections)
+"""
+
+def decide(view, *, quiet_below=0.4000001):
+    me = view.me
+    tired = me is not None and 0.4 < me.battery_soc < quiet_below
+    rung = Representation.NONE if tired else Representation.DETECTIONS
+    return [Directive(view.ego, p, rung, 0.0, None, 5.0, reason="planted") for p in view.peers]
+
+def too_fast(view):
+    return [Directive(view.ego, p, Representation.DETECTIONS, 0.0, None, 31.0, reason="planted") for p in view.peers]
+
+def eager(view):
+    rate_hz = {p: 9.0 if view.age_s[p] > 0.55 else 5.0 for p in view.peers}
+    return [Directive(view.ego, p, Representation.DETECTIONS, 0.0, None, rate_hz[p], reason="x") for p in view.peers]
+
+def forgetful(view):
+    return decide(view)[:1]
+'''
+QUICK = ("--views", 10, "--drones", 2)
+
+
+def sortie(*arguments: object) -> int:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Path:
+    path = tmp_path / "faulty.py"
+    path.write_text(FAULTY)
+    return path
+
+
+def test_the_worked_policy_passes_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert sortie("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
+    printed = capsys.readouterr().out
+    assert "when battery < 0.6: rate_hz <= 5" in printed
+    assert printed.count("proved") == 10
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_planted_fault_gives_a_counterexample_that_fails_until_it_is_mended(
+    faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
+    assert "refuted" in capsys.readouterr().out
+    (kept,) = out.rglob("*.json")
+    view = from_json(kept.read_text())
+    me = view.descriptors[view.ego]
+    assert 0.4 < me.battery_soc < 0.4000001, "a sliver of charge in which no drawn view lies"
+    assert me.region is not None
+    scenario = kept.with_suffix(".yaml")
+    assert sortie("check", scenario) == 1
+    assert "invariant_violations" in capsys.readouterr().out
+    faulty.write_text(FAULTY.replace("quiet_below=0.4000001", "quiet_below=0.0"))
+    assert sortie("check", scenario) == 0
+
+
+def test_a_parameter_is_part_of_what_is_verified(faulty: Path, tmp_path: Path) -> None:
+    assert sortie("verify", f"{faulty}:decide(quiet_below=0.1)", *QUICK, "--out", tmp_path / "out") == 0
+
+
+def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rules = tmp_path / "rules.txt"
+    rules.write_text("rate_hz <= 4  # slower than it is\n")
+    assert sortie("verify", f"{faulty}:decide", *QUICK, "--invariants", rules, "--out", tmp_path / "out") == 1
+    assert "rate_hz <= 4" in capsys.readouterr().out
+    rules.write_text("rate_hz <=\n")
+    assert sortie("verify", "worked", *QUICK, "--invariants", rules) == 2
+    assert "line 1, 'rate_hz <=': 'rate_hz <=' is no expression" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["too_fast", "eager", "forgetful"])
+def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
+    from policies.registry import resolve
+
+    reference = f"{faulty}:{name}"
+    policy = resolve(reference)
+    rule = {"too_fast": "bounds kept", "eager": "age-monotone", "forgetful": "one directive a link"}[name]
+    view = next(v for v in draw_views(2, 200) if len(v.peers) == 3 and RULES[rule](policy, v) is not None)
+    raised = raised_ages(policy, view) if name == "eager" else None
+    assert shows_in_flight(replay_scenario(rule, "", reference, {}, view, raised_age_s=raised))
+    assert not shows_in_flight(replay_scenario(rule, "", "worked", {}, view, raised_age_s=raised))
+
+
+def test_an_unknown_policy_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert sortie("verify", "loud") == 2
+    assert "unknown policy 'loud'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("phase", TaskPhase)
+def test_any_view_becomes_a_scenario(phase: TaskPhase) -> None:
+    view = next(v for v in draw_views(9, 400) if v.me is not None and v.me.task_phase == phase)
+    scenario = replay_scenario("a rule: with signs ≤", "how " * 900, "worked", {"rho": 0.1}, view)
+    assert scenario.name == "a_rule_with_signs"
+    assert scenario.policy.replays[0].view == to_json(view)
+
+
+def test_slugs_are_names() -> None:
+    assert slug("mine/x.py:decide(rho=0.1)") == "mine_x_py_decide_rho_0_1"
+    assert slug("≤") == "rule"
