@@ -180,12 +180,11 @@ def test_a_traced_drone_lands_at_landing_soc_too() -> None:
 
 
 def test_what_a_fault_took_stays_gone_from_a_trace() -> None:
-    b = FleetBatteries(Battery(), (), 1, {0: trace([0, 100], [0.9, 0.9])})
+    b = FleetBatteries(Battery(), (), 1, {0: trace([0, 10], [0.9, 0.6])})
     b.fault(0, 0.5)
-    steady(b, 1.0)
-    half = float(energy_fraction(0.9)) / 2
-    assert float(energy_fraction(b.soc[0])) == pytest.approx(half, abs=1e-6)
-    assert b.energy_j["fault"][0] == pytest.approx(half * 130 * 3600)
+    steady(b, 11.0)
+    assert float(energy_fraction(b.soc[0])) == pytest.approx(float(energy_fraction(0.6)) / 2, abs=1e-6)
+    assert b.energy_j["fault"][0] == pytest.approx(float(energy_fraction(0.9)) / 2 * 130 * 3600)
 
 
 # --- the ledger, everything on -------------------------------------------------------------------
