@@ -112,8 +112,10 @@ def _base(name: str, here: Path, source: str, root: Node) -> Scenario:
 
 def _extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
     """The values that a spread can take, or its ends; of one without ends its middle alone."""
-    if isinstance(spread, Uniform | Triangular | Integers | Linspace):
+    if isinstance(spread, Uniform | Triangular | Integers):
         yield from (spread.low, spread.high)
+    elif isinstance(spread, Linspace):
+        yield from (whole(end) for end in (spread.low, spread.high))
     elif isinstance(spread, Choice | Grid):
         yield from spread.values
     elif isinstance(spread, Column):
@@ -124,6 +126,11 @@ def _extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
             yield spread.mean
     else:
         yield spread.median
+
+
+def whole(value: float) -> float | int:
+    """A whole number as one, so that it does where the schema asks for one (it does for a number as well)."""
+    return int(value) if value == int(value) else value
 
 
 def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:

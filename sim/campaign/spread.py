@@ -24,6 +24,7 @@ from scenarios.campaign import (
     Triangular,
     Uniform,
 )
+from scenarios.load_campaign import whole
 from scenarios.streams import stream
 
 Floats = NDArray[np.float64]
@@ -114,8 +115,3 @@ def grid(campaign: Campaign, columns: Mapping[str, Sequence[Any]]) -> list[dict[
         elif isinstance(spread, Grid):
             axes[name] = [{name: v} for v in spread.values]
     return [{k: v for part in parts for k, v in part.items()} for parts in itertools.product(*axes.values())]
-
-
-def whole(value: float) -> float | int:
-    """A whole number as one, so that it does where the schema asks for one (it does for a number as well)."""
-    return int(value) if value == int(value) else value

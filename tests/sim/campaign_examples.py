@@ -1,0 +1,79 @@
+"""Small campaigns that several tests of the room fly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from scenarios.load_campaign import load_campaign
+from sim.campaign.plan import Plan, make_plan
+from sim.campaign.work import Result, Task, task_key
+
+BASE = """
+name: small
+duration_s: 0.5
+fleet: {drones: 2}
+perception: {detector: none}
+"""
+CAMPAIGN = """
+campaign: small_ones
+base: base.yaml
+vary:
+  fleet.battery.initial_soc: {kind: uniform, low: 0.2, high: 1}
+  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}
+sample: {count: 6}
+replications: 2
+policies: [worked, "best-2(rho=0.1)"]
+metrics: [bytes.data_sent, energy_j.total]
+seed: 5
+"""
+"""6 draws at 2 grid points, 2 replications, 2 policies: 48 runs in two parts."""
+
+
+def write(folder: Path, text: str = CAMPAIGN, base: str = BASE) -> Path:
+    """A campaign's file, its base beside it."""
+    (folder / "base.yaml").write_text(base)
+    path = folder / "small_ones.yaml"
+    path.write_text(text)
+    return path
+
+
+def plan(folder: Path, text: str = CAMPAIGN, base: str = BASE) -> Plan:
+    """The plan of a campaign."""
+    return make_plan(load_campaign(write(folder, text, base)))
+
+
+def table_bytes(folder: Path) -> dict[str, bytes]:
+    """The files of a campaign's table."""
+    return {p.name: p.read_bytes() for p in sorted((folder / "runs").iterdir())}
+
+
+class Pretended:
+    """An engine whose rows follow from the task alone, without flying; it can break off after some runs."""
+
+    workers = 1
+
+    def __init__(self, order: Sequence[int] | None = None, stop_after: int | None = None) -> None:
+        self.order, self.stop_after, self.flown = order, stop_after, list[int]()
+
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+        todo = list(tasks)
+        if self.order is not None:
+            todo = [todo[i] for i in self.order if i < len(todo)]
+        for run, task in todo:
+            if self.stop_after is not None and len(self.flown) >= self.stop_after:
+                raise KeyboardInterrupt
+            self.flown.append(run)
+            yield [pretend(run, task, code)]
+
+
+def pretend(run: int, task: str, code: str) -> Result:
+    """A row made of the task."""
+    asked, key = json.loads(task), task_key(task, code)
+    scenario = asked["scenario"]
+    value = scenario["fleet"]["battery"]["initial_soc"] + 10 * (scenario["policy"]["name"] == "worked")
+    return Result(run, key, "done", "", key[:16], (value, float(asked["replication"])))
+
+
+__all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "table_bytes", "write"]

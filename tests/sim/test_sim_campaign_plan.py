@@ -1,0 +1,209 @@
+"""What a campaign flies: draws, grids, seeds, keys; and what is refused before anything flies."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_examples import BASE, CAMPAIGN, plan, write
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from scenarios.campaign import (
+    Choice,
+    Integers,
+    LogNormal,
+    Normal,
+    Sample,
+    Spread,
+    Triangular,
+    Uniform,
+)
+from scenarios.load import ScenarioError
+from scenarios.load_campaign import load_campaign
+from sim.campaign.plan import Plan
+from sim.campaign.spread import design, quantile
+from sim.folders import RunError
+
+U = st.floats(0.001, 0.999)
+
+
+@given(u=U)
+def test_quantiles_are_those_of_scipy(u: float) -> None:
+    pairs: list[tuple[Spread, object]] = [
+        (Uniform(kind="uniform", low=-2, high=3), stats.uniform(-2, 5)),
+        (Normal(kind="normal", mean=1, sd=2), stats.norm(1, 2)),
+        (Normal(kind="normal", mean=1, sd=2, low=0), stats.truncnorm(-0.5, np.inf, 1, 2)),
+        (Normal(kind="normal", mean=1, sd=2, low=0, high=2), stats.truncnorm(-0.5, 0.5, 1, 2)),
+        (LogNormal(kind="log_normal", median=3, sigma=0.5), stats.lognorm(0.5, scale=3)),
+        (Triangular(kind="triangular", low=1, mode=2, high=5), stats.triang(0.25, 1, 4)),
+        (Triangular(kind="triangular", low=1, mode=5, high=5), stats.triang(1, 1, 4)),
+    ]
+    for spread, reference in pairs:
+        assert quantile(spread, u) == pytest.approx(reference.ppf(u), abs=1e-9)  # type: ignore[attr-defined]
+
+
+def test_choices_and_integers_come_as_often_as_they_should() -> None:
+    u = (np.arange(1000) + 0.5) / 1000
+    choice = Choice(kind="choice", values=("a", "b", "c"), weights=(1, 0, 3))
+    drawn = [quantile(choice, x) for x in [*u.tolist(), 1.0]]
+    assert (drawn.count("a"), drawn.count("b"), drawn.count("c")) == (250, 0, 751)
+    whole = [quantile(Integers(kind="integers", low=3, high=6), x) for x in [*u.tolist(), 1.0]]
+    assert [whole.count(v) for v in (3, 4, 5, 6)] == [250, 250, 250, 251]
+
+
+@pytest.mark.parametrize("method", ["latin_hypercube", "sobol"])
+def test_even_designs_have_one_draw_in_every_slice(method: str) -> None:
+    points = design(Sample(method=method, count=64), 3, seed=2)  # type: ignore[arg-type]
+    for column in points.T:
+        assert sorted((column * 64).astype(int).tolist()) == list(range(64))
+
+
+def test_a_random_design_grows_at_its_end() -> None:
+    short, longer = (design(Sample(method="random", count=n), 2, seed=3) for n in (5, 9))
+    assert np.array_equal(short, longer[:5])
+
+
+def test_every_combination_is_flown_once_and_policies_of_a_scene_share_their_seed(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    assert (p.runs, p.cells, p.units, p.shard) == (48, 12, 6, 30)
+    at = [p.at(run) for run in range(p.runs)]
+    assert len({(a.cell, a.replication, a.policy) for a in at}) == p.runs
+    for first, second in zip(at[::2], at[1::2], strict=True):
+        assert (first.cell, first.replication) == (second.cell, second.replication)
+        a, b = (json.loads(p.task(x.run)) for x in (first, second))
+        assert (a["scenario"].pop("policy")["name"], b["scenario"].pop("policy")["name"]) == ("worked", "best-2")
+        assert a == b  # nothing else differs: common random numbers
+    assert len({p.seed(cell) for cell in range(p.cells)}) == p.cells
+
+
+def test_a_cells_seed_depends_on_campaign_seed_and_cell_alone(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    other = plan(
+        tmp_path, CAMPAIGN.replace("replications: 2", "replications: 3").replace("policies: [worked, ", "policies: [")
+    )
+    assert [p.seed(c) for c in range(12)] == [other.seed(c) for c in range(12)]
+    reseeded = plan(tmp_path, CAMPAIGN.replace("seed: 5", "seed: 6"))
+    assert all(p.seed(c) != reseeded.seed(c) for c in range(12))
+
+
+def test_columns_of_one_file_go_together_and_cross_with_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "links.csv").write_text("power,sigma\n10,2\n12.5,3\n")
+    text = CAMPAIGN.replace(
+        "sample:",
+        "  radio.tx_power_dbm: {kind: column, file: links.csv, column: power}\n"
+        "  radio.shadowing_sigma_db: {kind: column, file: links.csv, column: sigma}\nsample:",
+    )
+    grid = plan(tmp_path, text).grid
+    names = ("fleet.formation.spacing_m", "radio.tx_power_dbm", "radio.shadowing_sigma_db")
+    assert [tuple(g[n] for n in names) for g in grid] == [(20, 10, 2), (20, 12.5, 3), (40, 10, 2), (40, 12.5, 3)]
+
+
+def test_a_linspace_over_whole_numbers_gives_whole_numbers(tmp_path: Path) -> None:
+    text = CAMPAIGN.replace(
+        "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}",
+        "fleet.drones: {kind: linspace, low: 2, high: 4, count: 3}",
+    )
+    assert [g["fleet.drones"] for g in plan(tmp_path, text).grid] == [2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("seed: 5", "seed: 6"),
+        ("low: 0.2", "low: 0.21"),
+        ("rho=0.1", "rho=0.11"),
+        ("energy_j.total", "energy_j.hover"),
+    ],
+)
+def test_whatever_reaches_the_worker_changes_the_key(tmp_path: Path, old: str, new: str) -> None:
+    before, after = plan(tmp_path), plan(tmp_path, CAMPAIGN.replace(old, new))
+    changed = [before.key(run) != after.key(run) for run in range(before.runs)]
+    assert any(changed)
+    assert before.digest != after.digest
+    if "rho" in old:
+        assert changed == [False, True] * 24  # the other policy's runs are what they were
+
+
+def test_the_base_the_code_and_a_policys_file_change_the_key(tmp_path: Path) -> None:
+    before = plan(tmp_path)
+    assert plan(tmp_path, base=BASE.replace("0.5", "0.6")).key(0) != before.key(0)
+    assert Plan({**before.spec, "code": "other"}).key(0) != before.key(0)
+    policy = tmp_path / "mine.py"
+    text = CAMPAIGN.replace("worked", f"{policy}:decide")
+    policy.write_text("def decide(view):\n    return []\n")
+    first = plan(tmp_path, text)
+    policy.write_text("def decide(view):\n    return [] # otherwise\n")
+    assert plan(tmp_path, text).key(0) != first.key(0)
+
+
+def test_the_plan_survives_its_json(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    again = Plan(json.loads(json.dumps(p.spec)))
+    assert again.digest == p.digest
+    assert [again.task(r) for r in range(p.runs)] == [p.task(r) for r in range(p.runs)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("fleet.battery.initial_soc:", "fleet.batery.initial_soc:", "5: fleet.batery: unknown key, did you mean battery?"),
+        ("initial_soc:", "soc:", "5: fleet.battery.soc: unknown key, did you mean initial_soc?"),
+        (
+            "kind: uniform", "kind: gaussian",
+            '5: vary.fleet.battery.initial_soc.kind: "gaussian", must be uniform, integers, normal, log_normal, '
+            "triangular, choice, linspace, grid or column",
+        ),
+        ("high: 1}", "high: 1.5}", "5: fleet.battery.initial_soc: 1.5, must be ≤ 1"),
+        ("low: 0.2", "low: 2", "5: vary.fleet.battery.initial_soc.low: 2, must be below high = 1"),
+        ("low: 0.2", "lo: 0.2", "5: vary.fleet.battery.initial_soc.low: missing, must be given (and 1 more)"),
+        ("values: [20, 40]", "values: [20, -1]", "6: fleet.formation.spacing_m: -1, must be > 0"),
+        ("count: 6", "count: 6, method: sobol", "7: sample.count: 6, must be a power of two where method is sobol"),
+        (
+            "count: 6", "count: 6, method: morris",
+            "7: sample.method: morris, must be another, or every field of vary drawn, none a grid",
+        ),
+        ("policies: [worked,", "policies: [worked, worked,", "9: policies.1: worked, must be named once"),
+        ("seed: 5", "stop_when: {metric: x, half_width: 1}", "11: stop_when.metric: x, must be one of metrics"),
+        ("seed: 5", "vry: 5", "11: vry: unknown key, did you mean vary?"),
+        (
+            "{kind: grid, values: [20, 40]}", "{kind: column, file: no.csv, column: a}",
+            "6: {here}/no.csv: no such file",
+        ),
+        (
+            "{kind: grid, values: [20, 40]}", "{kind: column, file: some.csv, column: b}",
+            "6: {here}/some.csv: no column b, it has a",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_told_at_its_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    (tmp_path / "some.csv").write_text("a\n1\n")
+    assert old in CAMPAIGN
+    path = write(tmp_path, CAMPAIGN.replace(old, new))
+    with pytest.raises(ScenarioError) as error:
+        load_campaign(path)
+    assert str(error.value) == f"{path}:{message.format(here=tmp_path)}"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("bytes.nothing", "metrics.0: bytes.nothing: bytes has no 'nothing', it has context_sent"),
+        ("wall_s", "metrics.0: wall_s: is wall clock, a metric must follow from the run alone"),
+        ("policy", "metrics.0: policy: is text, a metric must be a number"),
+        ("bytes", "metrics.0: bytes: is a section, a metric must be a number"),
+    ],
+)
+def test_a_metric_that_is_none_is_refused(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(RunError) as error:
+        plan(tmp_path, CAMPAIGN.replace("bytes.data_sent", name))
+    assert str(error.value).startswith(message)
+
+
+def test_a_scenario_is_no_campaign_and_the_library_tells_them_apart() -> None:
+    with pytest.raises(ScenarioError, match="is a scenario, a campaign begins with `campaign: its_name`"):
+        load_campaign("track_target")
+    assert load_campaign("link_battery").campaign.campaign == "link_battery"
