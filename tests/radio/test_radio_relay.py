@@ -102,7 +102,7 @@ def test_far_ends_of_a_row_are_reached_over_its_middle() -> None:
         came[hops] = sum(r.status is Status.DELIVERED for r in flight.rows) / len(flight.rows)
         assert sum(r.hops == hops for r in flight.rows) > 90  # in the first frame nothing is known before it
     assert came[1] < 0.2
-    assert came[2] > 0.95
+    assert came[2] > 0.9
 
 
 def test_a_lost_relay_is_left(tmp_path: Path) -> None:

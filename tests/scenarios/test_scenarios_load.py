@@ -358,7 +358,7 @@ def test_a_library_scenario_loads_and_comes_back(name: str) -> None:
 
 
 def test_the_library_is_what_the_design_names() -> None:
-    assert sorted(library()) == ["paper_replay", "search_grid", "track_target"]
+    assert sorted(library()) == ["paper_context", "paper_replay", "search_grid", "track_target"]
 
 
 @pytest.mark.parametrize("name", ["track_target", "paper_replay"])
