@@ -23,7 +23,7 @@ from perception.types import Boxes
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Matched", "area", "average_precision", "best_first",
-    "corners", "hits", "iou_pairs", "match", "suppress", "suppressed",
+    "corners", "hits", "iou_pairs", "match", "match_many", "suppress", "suppressed",
 ]  # fmt: skip
 
 Bools = NDArray[np.bool_]
@@ -50,6 +50,8 @@ CONVENTIONS = {
 }
 """Ours; OpenCOOD's default, where the order of frames decides; UAV3D's, after PASCAL VOC 2007."""
 ROTATED = CONVENTIONS["rotated"]
+MATCH_BATCH = 64
+"""Frames matched together; memory grows with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +154,27 @@ def match(
     good = value >= iou
     hit = hits(len(found), i[good], j[good], value[good], convention.match)
     return Matched(found.score.astype(np.float64), hit, len(truth))
+
+
+def match_many(found: Sequence[Boxes], truth: Sequence[Boxes], iou: float = 0.5) -> list[Matched]:
+    """As `match`, frame by frame, of many frames at once."""
+    made: list[Matched] = []
+    for a in range(0, len(found), MATCH_BATCH):
+        some, cars = found[a : a + MATCH_BATCH], truth[a : a + MATCH_BATCH]
+        many, image = np.array([len(b) for b in some], np.int64), np.arange(len(some))
+        boxes, at = Boxes.join(some), np.repeat(image, many)
+        order = best_first(boxes.score, at)
+        boxes, at = boxes.take(order), at[order]
+        ours, theirs = boxes.table(), Boxes.join(cars).table()
+        i, j, value = overlapping(ours, theirs, at, np.repeat(image, [len(c) for c in cars]))
+        good = value >= iou
+        hit, first = hits(len(boxes), i[good], j[good], value[good]), np.cumsum(many) - many
+        score = boxes.score.astype(np.float64)
+        made += [
+            Matched(score[k : k + n], hit[k : k + n], len(c))
+            for k, n, c in zip(first.tolist(), many.tolist(), cars, strict=True)
+        ]
+    return made
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perception.ap import Matched, average_precision, match
+from perception.ap import Matched, average_precision, match_many
 from perception.types import Boxes
 from sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
@@ -34,6 +34,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
     changes = list(transitions(tables["directives"], {}))
     drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
+    both = both_matched(record)
     return {
         "scenario": scenario.name,
         "policy": record.policy,
@@ -44,7 +45,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "duration_s": scenario.duration_s,
         "frame_s": scenario.frame_s,
         "ap50": {
-            **accuracy(record),
+            **_accuracy(both),
             "detector": scenario.perception.detector,
             "calibration": record.calibration,
             "sample_rate_hz": scenario.perception.sample_rate_hz,
@@ -80,7 +81,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         },
         "switches": len(changes) / (links * minutes) if links else None,
         "transitions": changes,
-        "phases": [_phase(record, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
+        "phases": [_phase(record, both, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
         "events": tables["events"].to_pylist(),
         "policy_eval_us": {
             "p50": record.wall.get("policy_eval_us_p50"),
@@ -107,7 +108,7 @@ def matched(
     truths = _boxes_by_fusion(record.tables["truths"])
     mission_t = missions["t_s"].to_numpy()
     discs = np.column_stack([missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
-    found = {}
+    asked: dict[tuple[float, int], tuple[Boxes, Boxes]] = {}
     for t_s, drone in zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True):
         if not begin_s <= t_s < end_s:
             continue
@@ -116,15 +117,29 @@ def matched(
             continue
         key = (t_s, drone)
         boxes, truth = detections.get(key, Boxes.empty()), truths.get(key, Boxes.empty())
-        found[key] = match(boxes, truth, tuple(disc) if mission else None)
-    return found
+        asked[key] = (boxes.inside(tuple(disc)), truth.inside(tuple(disc))) if mission else (boxes, truth)
+    both = match_many([b for b, _ in asked.values()], [t for _, t in asked.values()])
+    return dict(zip(asked, both, strict=True))
 
 
 def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
     """AP@0.5 in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
+    return _accuracy(both_matched(record), begin_s, end_s)
+
+
+Both = dict[str, dict[tuple[float, int], Matched]]
+"""Matched fusions, `full_scene` and `mission`."""
+
+
+def both_matched(record: SortieRecord) -> Both:
+    """Every scored fusion matched in the full scene and in the mission disc."""
+    return {"full_scene": matched(record, mission=False), "mission": matched(record, mission=True)}
+
+
+def _accuracy(both: Both, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
     found = {}
-    for name, mission in (("full_scene", False), ("mission", True)):
-        frames = list(matched(record, mission=mission, begin_s=begin_s, end_s=end_s).values())
+    for name, fusions in both.items():
+        frames = [m for (t_s, _), m in fusions.items() if begin_s <= t_s < end_s]
         ap = average_precision(frames) if frames else float("nan")
         found[name] = None if np.isnan(ap) else ap
     return found
@@ -236,7 +251,7 @@ def _phases(record: SortieRecord) -> Iterator[tuple[float, float, str]]:
             yield phase.at_s, min(end_s, following.at_s) if following else end_s, phase.phase
 
 
-def _phase(record: SortieRecord, begin_s: float, end_s: float, name: str) -> dict[str, Any]:
+def _phase(record: SortieRecord, both: Both, begin_s: float, end_s: float, name: str) -> dict[str, Any]:
     sent = record.tables["transmissions"]
     sent = sent.filter(pc.and_(pc.greater_equal(sent["captured_s"], begin_s), pc.less(sent["captured_s"], end_s)))
     features = sent.filter(pc.equal(sent["representation"], "features"))
@@ -244,7 +259,7 @@ def _phase(record: SortieRecord, begin_s: float, end_s: float, name: str) -> dic
         "phase": name,
         "begin_s": begin_s,
         "end_s": end_s,
-        "ap50": accuracy(record, begin_s, end_s),
+        "ap50": _accuracy(both, begin_s, end_s),
         "data_rate_mbps": _sum(sent["payload_bytes"]) * 8e-6 / (end_s - begin_s),
         "feature_payload_bytes": _percentiles(pc.cast(features["payload_bytes"], pa.float64()))["p50"],
         "deadline_miss_rate": _miss_rate(sent),
