@@ -57,6 +57,7 @@ AIR_C = 22.0
 PRESSURE_PA = 95_125.0
 DRIVETRAIN = Battery().drivetrain_efficiency
 SENSOR_LAG_S = 0.25
+TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0)
 
 
 def airframe(mass_kg: float) -> Airframe:
@@ -95,7 +96,19 @@ def voltage_figures(log: FlightLog) -> dict[str, Any]:
         "fitted_polarisation_mohm": fitted.polarisation_mohm,
         "fitted_first": voltage_error(log, fitted, 0.0, SPLIT_S),
         "fitted_rest": voltage_error(log, fitted, SPLIT_S, END_S),
+        "fitted_rest_by_time_constant_s": {
+            time_s: voltage_error(log, identify_pack(log, stated, SPLIT_S, time_s), SPLIT_S, END_S)
+            for time_s in TIME_CONSTANTS_S
+        },
+        "curve_low_before_takeoff_v": resting_error_v(log),
     }
+
+
+def resting_error_v(log: FlightLog) -> float:
+    """Measured less predicted voltage in the minute before the motors turn."""
+    assert log.battery is not None
+    early = log.battery.time_s < 60.0
+    return float((log.battery.values[:, 0] - predicted_voltage(log, stated_pack(log, CELLS)).values)[early].mean())
 
 
 def hover_figures(log: FlightLog) -> dict[str, Any]:
@@ -135,7 +148,14 @@ def thrust_figures(log: FlightLog, path: Path) -> dict[str, Any]:
     predicted = momentum_power_w(np.zeros_like(push), push, airframe(MASS_KG)) / DRIVETRAIN + electronics_w(log)
     measured = np.convolve(electric_power_w(log), np.ones(5) / 5, "same")[air]
     slope = float(np.polyfit(predicted, measured, 1)[0])
-    return {"slope": slope, "correlation": float(np.corrcoef(predicted, measured)[0, 1]), "lag_s": SENSOR_LAG_S}
+    assert log.velocity is not None
+    east, north = (np.interp(at, log.velocity.time_s, log.velocity.values[:, axis]) for axis in (0, 1))
+    return {
+        "slope": slope,
+        "correlation": float(np.corrcoef(predicted, measured)[0, 1]),
+        "lag_s": SENSOR_LAG_S,
+        "ground_speed_correlation": float(np.corrcoef(np.hypot(east, north), measured)[0, 1]),
+    }
 
 
 def read_begin_s(path: Path) -> float:
@@ -164,6 +184,27 @@ def endurance_min(battery: Battery, airframe_: Airframe | None = None, lost_cell
     return flown_s / 60.0
 
 
+def budgets() -> dict[str, dict[str, float]]:
+    """The default drone's endurance, mean power and where it goes, at 10 % airtime; and what the radio is worth."""
+    found = {}
+    for name, speed_mps, duty, airtime in (
+        ("hover, perception always on", 0.0, 1.0, 0.1),
+        ("hover, perception off", 0.0, 0.0, 0.1),
+        ("5 m/s, always on", 5.0, 1.0, 0.1),
+        ("5 m/s, off", 5.0, 0.0, 0.1),
+        ("hover, half duty, radio silent", 0.0, 0.5, 0.0),
+        ("hover, half duty, radio always sending", 0.0, 0.5, 1.0),
+    ):
+        packs, seconds = FleetBatteries(Battery(), (), 1), 0.0
+        while not packs.landed[0]:
+            packs.step(0.5, [float(rotor_power_w(speed_mps))], [duty], [airtime])
+            seconds += 0.5
+        spent = {cause: packs.energy_j[cause][0] for cause in CAUSES}
+        total = sum(spent.values())
+        found[name] = {"min": seconds / 60, "w": total / seconds, **{c: spent[c] / total for c in CAUSES}}
+    return found
+
+
 def effects() -> list[tuple[str, float]]:
     """Endurance with one effect after another, minutes."""
     cut = dict(cutoff_cell_v=3.3)
@@ -181,6 +222,15 @@ def effects() -> list[tuple[str, float]]:
     ]
 
 
+def cold_start() -> dict[str, float]:
+    """A fresh pack at −15 °C under the full load of hover: its voltage at once, at its highest, and when."""
+    packs, volts = FleetBatteries(Battery(ambient_c=-15), (), 1), []
+    for _ in range(900):
+        packs.step(1.0, [float(rotor_power_w(0.0))], [0.5], [0.1])
+        volts.append(packs.voltage_v[0])
+    return {"first_v": volts[0], "highest_v": max(volts), "after_min": volts.index(max(volts)) / 60}
+
+
 # --- report ----------------------------------------------------------------------------------------
 
 
@@ -190,7 +240,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    figures: dict[str, Any] = {"endurance_min": dict(effects())}
+    figures: dict[str, Any] = {"budgets": budgets(), "endurance_min": dict(effects()), "cold_start": cold_start()}
     if given.log.is_file():
         log = read_log(given.log)
         figures |= {
@@ -218,15 +268,30 @@ def markdown(figures: dict[str, Any]) -> str:
             f"{v['stated_whole']:.2%} / {v['stated_flight']:.2%} RMS |",
             f"| voltage, {v['fitted_mohm']:.1f} + {v['fitted_polarisation_mohm']:.1f} mΩ identified on the first part, "
             f"first / rest | {v['fitted_first']:.2%} / {v['fitted_rest']:.2%} RMS |",
+            "| … the rest, by time constant | "
+            + ", ".join(f"{e:.2%} at {float(s):g} s" for s, e in v["fitted_rest_by_time_constant_s"].items())
+            + " |",
+            f"| the curve at rest before take-off | {v['curve_low_before_takeoff_v']:.2f} V low |",
             f"| power at hover, measured over {h['seconds']:.0f} s | {h['measured_w']:.1f} ± {h['measured_std_w']:.1f} W |",
             f"| … predicted for {MASS_KG:.2f} kg | {h['predicted_w']:.1f} W ({h['predicted_w'] / h['measured_w'] - 1:+.1%}) |",
             f"| … for {BARE_KG:.2f} kg, without the camera | {h['predicted_bare_w']:.1f} W "
             f"({h['predicted_bare_w'] / h['measured_w'] - 1:+.1%}) |",
             f"| power by the accelerometer's thrust, 0.5 s | slope {t['slope']:.2f}, correlation {t['correlation']:.2f} |",
+            f"| … by ground speed | correlation {t['ground_speed_correlation']:.2f} |",
             "",
         ]
+    lines += [
+        "| | endurance | mean power | rotors | compute | radio | ohmic |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, b in figures["budgets"].items():
+        shares = " | ".join(f"{100 * b[cause]:.1f} %" for cause in ("rotor", "compute", "radio", "ohmic"))
+        lines.append(f"| {name} | {b['min']:.1f} min | {b['w']:.0f} W | {shares} |")
+    lines.append("")
     lines += ["| hover until landing | min |", "|---|---|"]
     lines += [f"| {name} | {minutes:.1f} |" for name, minutes in figures["endurance_min"].items()]
+    c = figures["cold_start"]
+    lines += ["", f"−15 °C: {c['first_v']:.1f} V at once, {c['highest_v']:.1f} V after {c['after_min']:.0f} min"]
     return "\n".join(lines) + "\n"
 
 

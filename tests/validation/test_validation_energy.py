@@ -6,6 +6,8 @@ without it these tests are skipped.
 
 from __future__ import annotations
 
+import json
+
 import energy
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ import pytest
 from fleet.flightlog import FlightLog, read_log
 from fleet.identify import hovering, identify_pack, stated_pack, voltage_error
 
-pytestmark = pytest.mark.skipif(not energy.LOG.is_file(), reason=f"{energy.LOG} is not here")
+needs_log = pytest.mark.skipif(not energy.LOG.is_file(), reason=f"{energy.LOG} is not here")
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +23,7 @@ def log() -> FlightLog:
     return read_log(energy.LOG)
 
 
+@needs_log
 def test_voltage_from_stated_pack_data_within_2_percent(log: FlightLog) -> None:
     """5,200 mAh and the charge from the log's own parameters and counter, the default curve and resistance: no fit."""
     pack = stated_pack(log, energy.CELLS)
@@ -29,12 +32,14 @@ def test_voltage_from_stated_pack_data_within_2_percent(log: FlightLog) -> None:
     assert voltage_error(log, pack, 0.0, energy.END_S) < 0.02
 
 
+@needs_log
 def test_voltage_identified_on_the_first_part_tested_on_the_rest(log: FlightLog) -> None:
     pack = identify_pack(log, stated_pack(log, energy.CELLS), energy.SPLIT_S)
     assert 3 < pack.cell_resistance_mohm < 13
     assert voltage_error(log, pack, energy.SPLIT_S, energy.END_S) < 0.01
 
 
+@needs_log
 def test_identification_reads_nothing_of_the_part_under_test(log: FlightLog) -> None:
     battery = log.battery
     assert battery is not None
@@ -48,6 +53,7 @@ def test_identification_reads_nothing_of_the_part_under_test(log: FlightLog) -> 
     assert identify_pack(tampered, stated, energy.SPLIT_S) == identify_pack(log, stated, energy.SPLIT_S)
 
 
+@needs_log
 def test_a_wrong_pack_misses_the_voltage(log: FlightLog) -> None:
     """The test can fail: without resistance, or with a pack of half the size, the error is above 2 %."""
     pack = stated_pack(log, energy.CELLS)
@@ -59,6 +65,7 @@ def test_a_wrong_pack_misses_the_voltage(log: FlightLog) -> None:
         assert voltage_error(log, pack.model_copy(update=changes), energy.TAKEOFF_S, energy.END_S) > 0.02
 
 
+@needs_log
 def test_power_at_hover_within_10_percent_from_mass_and_rotor_data(log: FlightLog) -> None:
     """1.88 kg on four 0.254 m propellers of CT 0.1213 and CP 0.0500 in air of 95,125 Pa and 22 °C; 80 % drivetrain."""
     found = energy.hover_figures(log)
@@ -67,6 +74,7 @@ def test_power_at_hover_within_10_percent_from_mass_and_rotor_data(log: FlightLo
     assert found["predicted_bare_w"] < 0.8 * found["measured_w"]  # mass matters: without the camera it would be far off
 
 
+@needs_log
 def test_hovering_rows_do_not_move(log: FlightLog) -> None:
     rows = hovering(log, energy.TAKEOFF_S, energy.END_S)
     assert log.battery is not None
@@ -76,8 +84,22 @@ def test_hovering_rows_do_not_move(log: FlightLog) -> None:
     assert rows[log.battery.time_s < energy.TAKEOFF_S].sum() == 0
 
 
+@needs_log
 def test_the_accelerometers_thrust_explains_the_powers_variation(log: FlightLog) -> None:
     """Momentum theory with the measured thrust, in half-seconds: no fit but the sensor's lag."""
     found = energy.thrust_figures(log, energy.LOG)
     assert found["correlation"] > 0.7
     assert found["slope"] == pytest.approx(1.0, abs=0.25)
+
+
+def test_the_readmes_figures_are_the_scripts() -> None:
+    figures = json.loads((energy.OUT / "energy.json").read_text("utf-8"))
+    readme = (energy.ROOT / "fleet/README.md").read_text("utf-8").splitlines()
+    text = "\n".join(readme)
+    for line in energy.markdown(figures).splitlines():
+        assert line in readme or line in text, line
+
+
+def test_what_the_effects_are_worth_is_as_written_down() -> None:
+    written = json.loads((energy.OUT / "energy.json").read_text("utf-8"))["endurance_min"]
+    assert dict(energy.effects()) == pytest.approx(written, abs=0.05)
