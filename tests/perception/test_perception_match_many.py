@@ -11,9 +11,9 @@ from perception.types import Boxes
 
 def boxes(rng: np.random.Generator, count: int) -> Boxes:
     """Crowded, so that detections compete; scores in tenths, so that they tie."""
-    xy = rng.uniform(-12, 12, (count, 2)).astype(np.float32)
+    xy = rng.uniform(-5, 5, (count, 2)).astype(np.float32)
     size = np.tile(np.float32([4.5, 1.9]), (count, 1))
-    yaw = rng.uniform(-0.3, 0.3, count).astype(np.float32)
+    yaw = rng.uniform(-0.1, 0.1, count).astype(np.float32)
     return Boxes(xy, size, yaw, (rng.integers(0, 10, count) / 10).astype(np.float32))
 
 
