@@ -89,8 +89,16 @@ def test_units_stand_in_names() -> None:
         "at_least",
         "at_most",
         "moving_cars_per_km",
+        "relay_max_hops",
+        "good_to_bad",
+        "bad_to_good",
+        "loss_good",
+        "loss_bad",
+        "figure_of_merit",
+        "cycles",
+        "life_cycles",
     }
-    units = {"m", "s", "hz", "mps", "db", "dbm", "ghz", "mhz", "mbps", "w", "wh", "mohm", "deg", "bytes"}
+    units = {"m", "s", "hz", "mps", "db", "dbm", "ghz", "mhz", "mbps", "w", "wh", "mohm", "deg", "bytes", "kg", "m2", "kgpm3", "v", "c"}
     schema = Scenario.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         for name, field in section["properties"].items():
