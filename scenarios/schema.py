@@ -523,10 +523,27 @@ class Expectation(Section):
     at_least: float | None = Field(None, description="Lower bound, inclusive.")
     at_most: float | None = Field(None, description="Upper bound, inclusive.")
     equals: float | str | bool | None = Field(None, description="The exact value.")
+    tolerance: float = Field(
+        0.0, ge=0, description="How far a number may lie beyond its bound, or off its exact value."
+    )
+    replications: int | None = Field(
+        None, ge=2, le=10_000, description="Fly so many and hold their mean to the bounds; left out, the one sortie."
+    )
+    confidence: float | None = Field(
+        None,
+        ge=0.5,
+        le=0.9999,
+        description="How sure the mean must be within each bound (one-sided, Student); goes with replications.",
+    )
     because: str = Field("", description="Why it is expected; shown when it fails.")
 
     @model_validator(mode="after")
     def _bounded(self) -> Expectation:
+        if (self.replications is None) != (self.confidence is None):
+            missing, given = ("confidence", "replications")[:: 1 if self.confidence is None else -1]
+            raise _inconsistent((missing,), "missing", f"given where {given} is")
+        if self.replications is not None and self.equals is not None:
+            raise _inconsistent(("equals",), f"{self.equals}", "at_least or at_most where replications is given")
         if self.at_least is None and self.at_most is None and self.equals is None:
             raise _inconsistent((), "no bound", "at_least, at_most or equals")
         if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
