@@ -1,0 +1,282 @@
+"""What the data plane does on bad links: every figure of transport, bursts, age and relay in radio/README.md.
+
+    python tests/validation/transport.py [--quick] [--torch] [--out FOLDER]
+
+Prints Markdown, writes transport.json and, with matplotlib, transport_*.png into FOLDER. `--torch` also flies a few
+frames with the network (minutes); without it accuracy is the surrogate's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import simpy
+
+from radio import Air, Status
+from radio.age import Chain, mean_age_s, share_older
+from scenarios.load import loads
+from scenarios.schema import Radio, Scenario
+from sim.outcome import outcome
+from sim.sortie import run_sortie
+
+ROOT = Path(__file__).resolve().parents[2]
+OUT = ROOT / "docs/validation"
+TABLE_Q, TABLE_K = 1e-3, (488, 122, 10, 1)
+LOSSES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+FLEET = """
+name: transport
+duration_s: 20
+fleet: {route: {waypoints_m: [[-240, 0], [80, 0]]}}
+mission:
+  target: {waypoints_m: [[-240, -1.75], [80, -1.75]]}
+  phases: [{at_s: 0, phase: search}]
+policy: {name: all-4, params: {rho: 0.1}, dwell_s: 0}
+"""
+FLOWN = (0.05, 0.28)
+"""Good to bad and bad to good over steps of 1 s, of a real flight's states (FACTS: 0.044–0.059, 0.19–0.38)."""
+
+
+def fleet(*settings: str) -> Scenario:
+    """Five drones at 20 m that share a tenth of their cells with all."""
+    return loads(FLEET, overrides=settings)
+
+
+# --- (1 − q)^k -------------------------------------------------------------------------------------
+
+
+def arrivals(k: int, samples: int, q: float, seed: int = 1) -> float:
+    """Share of best-effort samples of k fragments that arrive over a link that loses frames with probability q."""
+    with tempfile.TemporaryDirectory() as folder:
+        links = Path(folder) / "links.csv"
+        links.write_text(f"t_s,sender,receiver,loss,goodput_mbps\n0,0,1,{q},400\n")
+        env, rows = simpy.Environment(), []
+        at = np.broadcast_to(np.array([[0.0, 0, 60], [20, 0, 60]]), (samples, 2, 3))
+        air = Air(env, Radio(trace=str(links), retry_limit=0), at, seed=seed, frame_s=0.1)
+
+    def send() -> Any:
+        for _ in range(samples):
+            air.advance()
+            air.send(0, 1, k * 1344, kind="f", reliable=False, deadline_s=0.09, on_done=rows.append)
+            yield env.timeout(0.1)
+
+    env.process(send())
+    env.run()
+    return sum(r.status is Status.DELIVERED for r in rows) / len(rows)
+
+
+def fragments_table(samples: int) -> list[dict[str, float]]:
+    """The published table, and what the air makes of it."""
+    found = []
+    for k in TABLE_K:
+        expected = (1 - TABLE_Q) ** k
+        error = 1.96 * float(np.sqrt(expected * (1 - expected) / samples))
+        found.append({"k": k, "closed": expected, "interval": error, "flown": arrivals(k, samples, TABLE_Q)})
+    return found
+
+
+# --- sample and tile framing -----------------------------------------------------------------------
+
+
+def shared(scenario: Scenario, seeds: tuple[int, ...]) -> dict[str, float]:
+    """AP@0.5, feature cells at the receivers and goodput, over the seeds."""
+    results = [outcome(run_sortie(scenario, seed=seed)) for seed in seeds]
+    ap = [r["ap50"]["full_scene"] for r in results]
+    delivered = [r["bytes"]["data_delivered"] for r in results]
+    sent = [r["bytes"]["data_sent"] for r in results]
+    return {
+        "ap50": float(np.mean(ap)),
+        "ap50_spread": float(np.std(ap, ddof=1)) if len(ap) > 1 else 0.0,
+        "goodput_mbps": float(np.mean(delivered)) * 8e-6 / scenario.duration_s,
+        "arrived": float(np.sum(delivered) / np.sum(sent)),
+    }
+
+
+def framings(losses: tuple[float, ...], seeds: tuple[int, ...], detector: str, *more: str) -> list[dict[str, Any]]:
+    """Both framings over the probability that a frame is lost, retries off."""
+    found = []
+    for loss in losses:
+        for framing in ("sample", "tiles"):
+            scenario = fleet(
+                f"perception.detector={detector}",
+                f"radio.bursts.loss_good={loss}",
+                "radio.retry_limit=0",
+                f"radio.framing={framing}",
+                *more,
+            )
+            found.append({"loss": loss, "framing": framing, **shared(scenario, seeds)})
+    return found
+
+
+def crowded(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Both framings where the channel, not the link, is what is short: a quarter and all of the cells to all."""
+    found = []
+    for rho in (0.1, 0.25, 1.0):
+        for framing in ("sample", "tiles"):
+            scenario = fleet(
+                "perception.detector=surrogate", f"policy.params={{rho: {rho}}}", f"radio.framing={framing}"
+            )
+            found.append({"rho": rho, "framing": framing, **shared(scenario, seeds)})
+    return found
+
+
+# --- bursts ----------------------------------------------------------------------------------------
+
+
+def staleness(seeds: tuple[int, ...], duration_s: int) -> list[dict[str, Any]]:
+    """Ages of descriptors as policies read them, with bursts as flown and with independent losses of the same mean."""
+    chain = Chain(*FLOWN, 0.0, 1.0)
+    cases = {
+        "no loss": (),
+        "independent": (f"radio.bursts.loss_good={chain.mean_loss}",),
+        "bursts, steps of 0.1 s": _bursts(0.1),
+        "bursts, steps of 1 s": _bursts(1.0),
+    }
+    found = []
+    for name, settings in cases.items():
+        scenario = fleet("perception.detector=none", f"duration_s={duration_s}", "policy.params={rho: 0.02}", *settings)
+        ages, mean_s, states = [], [], {"degraded": 0, "detached": 0}
+        for seed in seeds:
+            record = run_sortie(scenario, seed=seed)
+            rows = record.tables["ages"]
+            ages.append(rows.filter(pc.greater(rows["t_s"], 1.0))["age_s"].to_numpy())
+            mean_s.append(float(ages[-1].mean()))
+            changes = record.tables["directives"]
+            for state in states:
+                states[state] += int(pc.sum(pc.equal(changes["link"], state)).as_py() or 0)
+        age = np.concatenate(ages)
+        minutes = len(seeds) * duration_s / 60.0
+        found.append(
+            {
+                "case": name,
+                "mean_age_s": float(np.mean(mean_s)),
+                "degraded_share": float((age > 0.3).mean()),
+                "detached_share": float((age > 1.0).mean()),
+                **{f"{state}_changes_per_link_minute": n / (20 * minutes) for state, n in states.items()},
+            }
+        )
+    return found
+
+
+def _bursts(step_s: float) -> tuple[str, ...]:
+    p, r = FLOWN
+    return (f"radio.bursts.good_to_bad={p}", f"radio.bursts.bad_to_good={r}", f"radio.bursts.step_s={step_s}")
+
+
+def closed_ages() -> list[dict[str, Any]]:
+    """The same in closed form, without what collisions and publishing add."""
+    per_frame = Chain(*FLOWN, 0.0, 1.0)
+    found = []
+    for name, loss in (("independent", per_frame.mean_loss), ("bursts, steps of 0.1 s", per_frame)):
+        found.append(
+            {
+                "case": name,
+                "mean_age_s": mean_age_s(0.1, loss),
+                "degraded_share": share_older(3, loss),
+                "detached_share": share_older(10, loss),
+            }
+        )
+    return found
+
+
+# --- relay -----------------------------------------------------------------------------------------
+
+
+def relayed(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
+    """A line of five, 120 m apart at 15 dBm, in which each sends a fiftieth of its cells to all: hops allowed, and what came."""
+    found = []
+    for hops in (1, 2, 4):
+        scenario = fleet(
+            "perception.detector=surrogate", "fleet.formation={shape: line, spacing_m: 120}", "radio.tx_power_dbm=15",
+            "policy.params={rho: 0.02}", f"radio.relay_max_hops={hops}", "context.detached_after_periods=100",
+            "context.degraded_after_periods=50",
+        )  # fmt: skip
+        row: dict[str, Any] = {"hops": hops, **shared(scenario, seeds)}
+        sent = run_sortie(scenario, seed=seeds[0]).tables
+        moved = sent["transmissions"]
+        row["airtime_share"] = float(pc.sum(moved["airtime_s"]).as_py()) / scenario.duration_s
+        row["over_others"] = float(pc.mean(pc.greater(moved["hops"], 1)).as_py())
+        whole = sent["topology"]
+        if whole.num_rows:
+            row["connected_share"] = float(pc.mean(whole["connected"]).as_py())
+            row["bottleneck_mbps"] = float(np.nanmedian(whole["bottleneck_mbps"].to_numpy()))
+        found.append(row)
+    return found
+
+
+# --- out -------------------------------------------------------------------------------------------
+
+
+def markdown(title: str, rows: list[dict[str, Any]]) -> str:
+    """Rows of dicts as a table."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [f"## {title}", "", "| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    for row in rows:
+        cells = [row.get(name, "") for name in names]
+        lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells) + " |")
+    return "\n".join([*lines, ""])
+
+
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
+    """AP and goodput of both framings over the loss of frames."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    panels = (("ap50", "AP@0.5, full scene"), ("goodput_mbps", "goodput of the fleet, Mb/s"))
+    drawn, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+    for axis, (name, label) in zip(axes, panels, strict=True):
+        for framing, mark in (("sample", "o"), ("tiles", "s")):
+            of = [r for r in rows if r["framing"] == framing]
+            axis.plot([max(r["loss"], 3e-4) for r in of], [r[name] for r in of], marker=mark, label=framing)
+        axis.set_xscale("log")
+        axis.set_xlabel("probability that a frame is lost (leftmost: none)")
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0)
+        axis.legend(frameon=False)
+    drawn.savefig(path, dpi=150)
+    plt.close(drawn)
+
+
+def main() -> None:
+    """Fly it all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer samples and seeds")
+    parser.add_argument("--torch", action="store_true", help="a few frames with the network too")
+    parser.add_argument("--out", type=Path, default=OUT)
+    asked = parser.parse_args()
+    seeds = (1,) if asked.quick else (1, 2, 3)
+    found: dict[str, Any] = {}
+
+    def tell(name: str, title: str, rows: list[dict[str, Any]]) -> None:
+        found[name] = rows
+        sys.stdout.write(markdown(title, rows) + "\n")
+        sys.stdout.flush()
+
+    tell("fragments", "(1 − q)^k, q = 0.001", fragments_table(2_000 if asked.quick else 20_000))
+    tell("framings", "Framing over the loss of frames (surrogate)", framings(LOSSES, seeds, "surrogate"))
+    tell("crowded", "Framing where the channel is full (surrogate)", crowded(seeds))
+    tell("closed_ages", "Ages in closed form", closed_ages())
+    tell("staleness", "Ages as policies read them", staleness(seeds, 60 if asked.quick else 300))
+    tell("relay", "Hops allowed", relayed(seeds))
+    if asked.torch:
+        tell("torch", "Framing with the network", framings((0.0, 0.01, 0.1), (1,), "torch", "duration_s=5"))
+    asked.out.mkdir(parents=True, exist_ok=True)
+    new = asked.out / ".transport.json.new"
+    new.write_text(json.dumps(found, indent=1) + "\n")
+    new.replace(asked.out / "transport.json")
+    try:
+        figure(found["framings"], asked.out / "transport_framing.png")
+    except ImportError:
+        sys.stdout.write("no matplotlib, no figure\n")
+
+
+if __name__ == "__main__":
+    main()
