@@ -31,6 +31,8 @@ _SENSORS = (
 _UNKNOWN_U16 = 0xFFFF
 _MAX_I16 = 0x7FFF
 _LOG_STAMP = struct.Struct(">Q")
+SIGNING_EPOCH_US = 1_420_070_400_000_000
+"""2015-01-01, from which the clocks of signed frames count."""
 _STAMP_BYTES = 8
 _MARKS = {0xFE: 8, 0xFD: 12}
 """First byte of a MAVLink 1 and 2 frame, and what stands around its payload; a signature adds 13."""
@@ -87,7 +89,8 @@ def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[fl
 
 
 def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:
-    """HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYS_STATUS, BATTERY_STATUS."""
+    """HEARTBEAT, ATTITUDE_QUATERNION and ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYS_STATUS,
+    EXTENDED_SYS_STATE, BATTERY_STATUS."""
     time_ms = round(state.time_s * 1000)
     q = to_wxyz(swap_attitude(state.orientation_xyzw)).tolist()
     rates = swap_flu_frd(state.body_rates_radps).tolist()
@@ -105,6 +108,7 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
             3,
         ),
         mavlink2.MAVLink_attitude_quaternion_message(time_ms, *q, *rates),
+        mavlink2.MAVLink_attitude_message(time_ms, *_roll_pitch_yaw(*q), *rates),
         mavlink2.MAVLink_local_position_ned_message(time_ms, *position, *velocity),
         mavlink2.MAVLink_global_position_int_message(
             time_ms,
@@ -125,6 +129,10 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
             charge,
             *(0,) * 6,
         ),
+        mavlink2.MAVLink_extended_sys_state_message(
+            mavlink2.MAV_VTOL_STATE_UNDEFINED,
+            mavlink2.MAV_LANDED_STATE_ON_GROUND if state.landed else mavlink2.MAV_LANDED_STATE_IN_AIR,
+        ),
         mavlink2.MAVLink_battery_status_message(
             0,
             mavlink2.MAV_BATTERY_FUNCTION_ALL,
@@ -139,6 +147,13 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
     ]
 
 
+def _roll_pitch_yaw(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The aircraft's angles of an attitude FRD in NED, rad."""
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 def _pack_voltage_mv(voltage_v: float) -> list[int]:
     """BATTERY_STATUS.voltages: cells are not modelled singly, so the pack's voltage stands in slot 0 and what does
     not fit there in slot 1, as the message's definition asks."""
@@ -148,17 +163,78 @@ def _pack_voltage_mv(voltage_v: float) -> list[int]:
     return [_UNKNOWN_U16 - 1, total - _UNKNOWN_U16 + 1] + [_UNKNOWN_U16] * 8
 
 
-class Transmitter:
-    """One vehicle's MAVLink 2 stream: system id = drone id + 1 (0 means everybody), frames numbered in a row."""
+STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS"})
+"""Messages of `messages` that an autopilot sends once a second; the others go at the telemetry's own rate."""
+KEY_BYTES = 32
 
-    def __init__(self, drone: int) -> None:
+
+class Transmitter:
+    """One vehicle's MAVLink 2 stream: system id = drone id + 1 (0 means everybody), frames numbered in a row.
+
+    With a key of 32 B every frame is signed (13 B more); `signed_at_us`, in µs since 1970, is where its clock begins.
+    """
+
+    def __init__(self, drone: int, key: bytes | None = None, signed_at_us: int = SIGNING_EPOCH_US) -> None:
         self._mav = mavlink2.MAVLink(None, srcSystem=drone + 1, srcComponent=mavlink2.MAV_COMP_ID_AUTOPILOT1)
+        if key is not None:
+            if len(key) != KEY_BYTES:
+                raise ValueError(f"the signing key has {len(key)} B, must have {KEY_BYTES}")
+            signing = self._mav.signing
+            signing.secret_key, signing.link_id, signing.sign_outgoing = key, 0, True
+            signing.timestamp = (signed_at_us - SIGNING_EPOCH_US) // 10
 
     def pack(self, message: mavlink2.MAVLink_message) -> bytes:
         """The next frame."""
         frame: bytes = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
+
+
+class Listener:
+    """Takes what ground stations say; bytes that are no frame are passed over."""
+
+    def __init__(self) -> None:
+        self._mav = mavlink2.MAVLink(None)
+        self._mav.robust_parsing = True
+
+    def heard(self, data: bytes) -> list[mavlink2.MAVLink_message]:
+        """The messages that these bytes complete."""
+        with contextlib.suppress(mavlink2.MAVError):
+            known = self._mav.parse_buffer(data) or []
+            return [m for m in known if m.get_type() != "BAD_DATA" and not m.get_type().startswith("UNKNOWN")]
+        return []
+
+
+def answers(request: mavlink2.MAVLink_message, drone: int) -> list[mavlink2.MAVLink_message]:
+    """What a drone says to a ground station that asks: who it is; that it has no parameters to set, no mission, no commands.
+
+    Nothing that a ground station sends changes a sortie.
+    """
+    asked, target = request.get_type(), getattr(request, "target_system", 0)
+    if target not in (0, drone + 1):
+        return []
+    if asked == "PARAM_REQUEST_LIST":
+        kind = mavlink2.MAV_PARAM_TYPE_REAL32
+        return [mavlink2.MAVLink_param_value_message(b"SYSID_THISMAV", float(drone + 1), kind, 1, 0)]
+    if asked == "MISSION_REQUEST_LIST":
+        peer, component = request.get_srcSystem(), request.get_srcComponent()
+        return [mavlink2.MAVLink_mission_count_message(peer, component, 0, request.mission_type)]
+    if asked == "COMMAND_LONG":
+        version = request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and int(request.param1) == _VERSION_ID
+        result = mavlink2.MAV_RESULT_ACCEPTED if version else mavlink2.MAV_RESULT_UNSUPPORTED
+        said: list[mavlink2.MAVLink_message] = [mavlink2.MAVLink_command_ack_message(request.command, result)]
+        return [*said, _version(drone)] if version else said
+    return []
+
+
+_VERSION_ID = mavlink2.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+
+
+def _version(drone: int) -> mavlink2.MAVLink_message:
+    none = bytes(8)
+    return mavlink2.MAVLink_autopilot_version_message(
+        mavlink2.MAV_PROTOCOL_CAPABILITY_MAVLINK2, 0, 0, 0, 0, none, none, none, 0, 0, drone + 1
+    )
 
 
 def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:

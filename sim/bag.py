@@ -31,9 +31,9 @@ from fleet.wire import (
     encode_descriptor,
     encode_directive,
 )
+from perception.traffic import TARGET_ID
 from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sim.folders import replacing
-from sim.mission import TARGET_ID
 from sim.outcome import transitions
 from sim.record import SortieRecord
 from sim.words import decision_in_words, event_in_words
@@ -62,7 +62,8 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     """Every published descriptor with its time; position and attitude are the true ones of the capture's frame."""
     rows = record.tables["descriptors"].to_pylist()
     n, states = record.scenario.fleet.drones, record.tables["states"]
-    column = {k: states[k].to_numpy() for k in states.column_names}
+    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
+    x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
     rate_hz = record.scenario.context.rate_hz
     for row in rows:
         k = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1) * n + row["drone"]
@@ -74,10 +75,10 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
         yield row["t_s"], Descriptor(
             stamp_ns=row["stamp_ns"],
             agent_id=row["drone"],
-            position_m=tuple(float(column[c][k]) for c in ("x_m", "y_m", "z_m")),
-            orientation_xyzw=tuple(float(column[c][k]) for c in ("qx", "qy", "qz", "qw")),
-            velocity_mps=tuple(float(column[c][k]) for c in ("vx_mps", "vy_mps", "vz_mps")),
-            footprint_radius_m=footprint_radius_m(float(column["z_m"][k])),
+            position_m=(float(x[k]), float(y[k]), float(z[k])),
+            orientation_xyzw=(float(qx[k]), float(qy[k]), float(qz[k]), float(qw[k])),
+            velocity_mps=(float(vx[k]), float(vy[k]), float(vz[k])),
+            footprint_radius_m=footprint_radius_m(float(z[k])),
             battery_soc=row["soc"],
             cpu_headroom=row["cpu_headroom"],
             gpu_headroom=row["gpu_headroom"],

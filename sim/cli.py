@@ -26,6 +26,7 @@ from sim import (
     cli_calibrate,
     cli_campaign,
     cli_export,
+    cli_import,
     cli_paper,
     cli_recording,
     cli_study,
@@ -40,7 +41,8 @@ from sim.expect import check as check_expectations
 from sim.folders import RunError
 from sim.named import policy_overrides
 from sim.outcome import outcome
-from sim.sortie import VERSION, Observer, run_sortie
+from sim.sortie import VERSION, run_sortie
+from sim.watchers import Watcher, Watchers
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -92,6 +94,13 @@ def fly(
     out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; left out, under runs/.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Stream to a Rerun viewer while it flies.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Open the recording afterwards.")] = False,
+    mavlink: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Be MAVLink vehicles while it flies: udpout:127.0.0.1:14550")
+    ] = None,
+    pace: Annotated[
+        float,
+        typer.Option(help="Simulated seconds in one of the wall's, with --mavlink; 0: as fast as it goes.", min=0),
+    ] = 1.0,
     recording: Annotated[bool, typer.Option(help="Save sortie.rrd.")] = True,
     profile: Annotated[bool, typer.Option("--profile", help="Tell where the wall time went.")] = False,
     campaign: Annotated[
@@ -106,14 +115,9 @@ def fly(
         flown, replication, expected = _load(_named(scenario), set_, policy), 0, None
     if out_dir is not None:
         rundir.ensure_writable(out_dir)
-    observer: Observer | None = None
-    if live:
-        from sim.playback import LiveViewer  # here: importing the viewer costs a third of a second
-
-        observer = LiveViewer()
-    with _profiled(profile) as report, bars() as bar:
+    with _watching(live, mavlink, pace) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
-        record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=observer)
+        record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=watchers or None)
     path = out_dir or rundir.default_path(record)
 
     def save_recording(folder: Path) -> None:
@@ -230,6 +234,7 @@ app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
 app.command()(cli_verify.verify)
 app.command()(cli_export.export)
+app.command("import")(cli_import.import_log)
 
 
 @app.callback(invoke_without_command=True)
@@ -240,6 +245,20 @@ def _version(version: Annotated[bool, typer.Option("--version", help="Print the 
 
 
 # --- helpers -------------------------------------------------------------------------------------
+
+
+def _watching(live: bool, mavlink: str | None, pace: float) -> Watchers:
+    """Who watches a sortie while it flies; imported here, since a viewer costs a third of a second."""
+    watchers: list[Watcher] = []
+    if live:
+        from sim.playback import LiveViewer
+
+        watchers.append(LiveViewer())
+    if mavlink is not None:
+        from sim.telemetry import MavlinkEndpoint
+
+        watchers.append(MavlinkEndpoint(mavlink, pace or None))
+    return Watchers(watchers)
 
 
 def _load(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario:

@@ -12,7 +12,7 @@ from sim import rundir
 from sim.console import out
 from sim.folders import RunError, ensure_folder
 
-BAG = "bag"
+BAG, TLOG = "bag", "sortie.tlog"
 BEGIN = "2026-01-01T00:00:00"
 """When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
 
@@ -22,20 +22,36 @@ def export(
     mcap: Annotated[
         bool, typer.Option("--mcap", help="A ROS 2 bag: a folder with metadata.yaml and one .mcap.")
     ] = False,
+    tlog: Annotated[
+        bool, typer.Option("--tlog", help="A MAVLink telemetry log: one file, a system id a drone.")
+    ] = False,
     out_path: Annotated[Path | None, typer.Option("--out", help="Where to; left out, in the run's folder.")] = None,
     begin: Annotated[str, typer.Option(help="When the sortie began, ISO 8601, UTC unless it says otherwise.")] = BEGIN,
+    origin: Annotated[
+        str | None,
+        typer.Option(help="LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0), for --tlog; left out, a field in Zurich."),
+    ] = None,
 ) -> None:
-    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove."""
-    if not mcap:
-        raise typer.BadParameter("name a format: --mcap")
-    began = moment(begin)
+    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, or as a log for ground stations."""
+    if mcap == tlog:
+        raise typer.BadParameter("name one format: --mcap or --tlog")
+    began_s = int(moment(begin).timestamp())
+    if tlog:
+        from sim.telemetry import ORIGIN, parse_origin, save_tlog
+
+        path = out_path or run / TLOG
+        frames = save_tlog(
+            rundir.load(run), path, began_s * 1_000_000, ORIGIN if origin is None else parse_origin(origin)
+        )
+        out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
+        return
     path = out_path or run / BAG
     ensure_folder(path, "metadata.yaml", "bag")
     record = rundir.load(run)
     try:
         from sim.bag import write_bag
 
-        counts = write_bag(record, path, int(began.timestamp()) * 1_000_000_000)
+        counts = write_bag(record, path, began_s * 1_000_000_000)
     except ImportError as error:
         raise RunError("rosbags is missing: pip install 'sortie-sim[ros2]'") from error
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)

@@ -40,20 +40,22 @@ def sent(state: Telemetry = STATE) -> dict[str, mavlink2.MAVLink_message]:
 def test_mavlink_2_from_system_drone_plus_one_and_numbered_in_a_row() -> None:
     transmitter = Transmitter(2)
     frames = [transmitter.pack(m) for m in messages(STATE, ZURICH)]
-    assert [frame[0] for frame in frames] == [0xFD] * 6
-    assert [frame[4] for frame in frames] == [0, 1, 2, 3, 4, 5]
+    assert [frame[0] for frame in frames] == [0xFD] * 8
+    assert [frame[4] for frame in frames] == [0, 1, 2, 3, 4, 5, 6, 7]
     assert {frame[5] for frame in frames} == {3}
     assert [m.get_type() for m in messages(STATE, ZURICH)] == [
         "HEARTBEAT",
         "ATTITUDE_QUATERNION",
+        "ATTITUDE",
         "LOCAL_POSITION_NED",
         "GLOBAL_POSITION_INT",
         "SYS_STATUS",
+        "EXTENDED_SYS_STATE",
         "BATTERY_STATUS",
     ]
     for _ in range(300):
         last = transmitter.pack(messages(STATE, ZURICH)[0])
-    assert last[4] == (5 + 300) % 256
+    assert last[4] == (7 + 300) % 256
 
 
 def test_position_and_velocity_are_ned() -> None:
@@ -68,6 +70,14 @@ def test_attitude_is_frd_in_ned_w_first() -> None:
     yaw, pitch, roll = Rotation.from_quat([m.q2, m.q3, m.q4, m.q1]).as_euler("ZYX", degrees=True)
     assert (yaw, pitch, roll) == pytest.approx((-45, 10, 0), abs=1e-4)  # north-west, nose up
     assert (m.rollspeed, m.pitchspeed, m.yawspeed) == pytest.approx((0.01, -0.02, -0.2))  # left is negative in NED
+
+
+def test_attitude_in_angles() -> None:
+    m = sent()["ATTITUDE"]
+    assert [math.degrees(a) for a in (m.yaw, m.pitch, m.roll)] == pytest.approx((-45, 10, 0), abs=1e-4)
+    rolled = tuple(Rotation.from_euler("ZYX", [90, 0, 20], degrees=True).as_quat().tolist())
+    m = sent(replace(STATE, orientation_xyzw=rolled))["ATTITUDE"]  # north, right wing down
+    assert [math.degrees(a) for a in (m.yaw, m.pitch, m.roll)] == pytest.approx((0, 0, 20), abs=1e-4)
 
 
 def test_global_position() -> None:
@@ -95,6 +105,8 @@ def test_battery_and_health() -> None:
 def test_landed_is_disarmed_and_large_packs_overflow_into_the_second_slot() -> None:
     large = sent(replace(STATE, voltage_v=100.0, current_a=500.0, landed=True))
     assert large["HEARTBEAT"].base_mode == 0
+    assert large["EXTENDED_SYS_STATE"].landed_state == mavlink2.MAV_LANDED_STATE_ON_GROUND
+    assert sent()["EXTENDED_SYS_STATE"].landed_state == mavlink2.MAV_LANDED_STATE_IN_AIR
     assert large["HEARTBEAT"].system_status == mavlink2.MAV_STATE_STANDBY
     assert large["BATTERY_STATUS"].voltages == [65534, 34466] + [65535] * 8
     assert large["SYS_STATUS"].voltage_battery == 65535
@@ -137,7 +149,7 @@ def test_pymavlink_opens_the_log(tmp_path: Path) -> None:
     while (m := log.recv_match()) is not None:
         read.append((m.get_type(), m._timestamp))
     log.close()
-    assert len(read) == 18
+    assert len(read) == 24
     assert "BAD_DATA" not in {name for name, _ in read}
     assert read[-1] == ("BATTERY_STATUS", pytest.approx(1_700_000_000.2))
 

@@ -1,0 +1,314 @@
+"""A fleet as MAVLink vehicles: logs that pymavlink's tools read, and an endpoint that a real ground station joins."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink2
+from sim_examples import BASE, example
+from typer.testing import CliRunner
+
+from fleet.mavlink import KEY_BYTES, Listener, Transmitter, answers
+from sim import rundir
+from sim.cli import app
+from sim.folders import RunError
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+from sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, save_tlog
+
+BEGIN_US = 1_767_225_600_000_000
+
+
+@pytest.fixture(scope="module")
+def record() -> SortieRecord:
+    """Four seconds, in which drone 3 is lost at 2 s."""
+    return run_sortie(example("duration_s=4", "events=[{kind: drone_lost, at_s: 2, drone: 3}]"))
+
+
+@pytest.fixture(scope="module")
+def log(record: SortieRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tlog") / "sortie.tlog"
+    save_tlog(record, path, BEGIN_US)
+    return path
+
+
+def read(path: Path) -> list[mavlink2.MAVLink_message]:
+    reader, found = mavutil.mavlink_connection(str(path)), []
+    while (m := reader.recv_match()) is not None:
+        found.append(m)
+    reader.close()
+    return found
+
+
+# --- logs ------------------------------------------------------------------------------------------
+
+
+def test_the_log_has_every_drone_s_pose_at_10_hz_and_status_at_1_hz(log: Path, record: SortieRecord) -> None:
+    read_back = read(log)
+    counts = Counter((m.get_srcSystem(), m.get_type()) for m in read_back)
+    for system in range(1, 6):
+        for name in ("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"):
+            assert counts[system, name] == record.scenario.frames
+        for name in ("HEARTBEAT", "SYS_STATUS", "BATTERY_STATUS"):
+            assert counts[system, name] == 4
+    assert not any(name == "BAD_DATA" for _, name in counts)
+    assert read_back[-1]._timestamp == pytest.approx(BEGIN_US * 1e-6 + 3.9)
+
+
+def test_values_are_the_record_s_in_mavlink_s_frames(log: Path, record: SortieRecord) -> None:
+    drone, frame = 1, 17
+    row = [s for s in record.tables["states"].to_pylist() if s["drone"] == drone][frame]
+    of = {name: [m for m in read(log) if m.get_srcSystem() == drone + 1 and m.get_type() == name] for name in (
+        "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "BATTERY_STATUS"
+    )}  # fmt: skip
+    ned, globe = of["LOCAL_POSITION_NED"][frame], of["GLOBAL_POSITION_INT"][frame]
+    assert ned.time_boot_ms == globe.time_boot_ms == 1700
+    assert (ned.x, ned.y, ned.z) == pytest.approx((row["y_m"], row["x_m"], -row["z_m"]), rel=1e-6)
+    assert (ned.vx, ned.vy, ned.vz) == pytest.approx((row["vy_mps"], row["vx_mps"], -row["vz_mps"]), rel=1e-6)
+    assert globe.relative_alt == round(1000 * row["z_m"])
+    assert globe.alt == round(1000 * (488.0 + row["z_m"]))
+    # a second of latitude is 30.88 m at 47.4°
+    assert (globe.lat / 1e7 - ORIGIN.latitude_deg) * 3600 * 30.88 == pytest.approx(row["y_m"], abs=0.05)
+    first = [s for s in record.tables["states"].to_pylist() if s["drone"] == drone][10]
+    assert of["SYS_STATUS"][1].voltage_battery == round(1000 * first["voltage_v"])
+    assert of["BATTERY_STATUS"][1].current_battery == round(100 * first["current_a"])
+    states = [s for s in record.tables["states"].to_pylist() if s["drone"] == drone][:11]
+    joules = sum(s["voltage_v"] * s["current_a"] for s in states) / 10.0
+    assert of["BATTERY_STATUS"][1].energy_consumed == round(joules / 100)
+    published = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == drone and d["t_s"] < 1.05]
+    assert of["SYS_STATUS"][1].load == round(1000 * (1 - published[-1]["cpu_headroom"]))
+
+
+def test_a_lost_drone_is_disarmed(log: Path) -> None:
+    armed = [
+        bool(m.base_mode & mavlink2.MAV_MODE_FLAG_SAFETY_ARMED)
+        for m in read(log)
+        if m.get_srcSystem() == 4 and m.get_type() == "HEARTBEAT"
+    ]
+    assert armed[:2] == [True, True]
+    assert armed[-1] is False
+
+
+def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    rundir.save(record, run)
+    arguments = ["export", str(run), "--tlog", "--begin", "2026-11-21T09:00:00", "--origin", "52.5,13.4,30"]
+    said = CliRunner().invoke(app, arguments)
+    assert said.exit_code == 0, said.output
+    dump = [str(Path(sys.executable).parent / "mavlogdump.py"), "--format", "json", "--types", "GLOBAL_POSITION_INT"]
+    done = subprocess.run([sys.executable, *dump, str(run / "sortie.tlog")], capture_output=True, text=True, check=True)
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == 5 * record.scenario.frames
+    assert lines[0]["meta"]["timestamp"] == 1_795_251_600.0
+    assert lines[0]["data"]["lat"] == pytest.approx(52.5e7, abs=5_000)
+
+
+# --- live ------------------------------------------------------------------------------------------
+
+
+def test_a_ground_station_by_mavsdk_reads_position_attitude_battery_and_mode() -> None:
+    pytest.importorskip("mavsdk")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    script = Path(__file__).with_name("mavsdk_client.py")
+    client = subprocess.Popen(
+        [sys.executable, "-W", "ignore", str(script), str(port), "5"], stdout=subprocess.PIPE, text=True
+    )
+    assert client.stdout is not None
+    try:
+        lines = (line for line in client.stdout if line.startswith(("ready", "{")))
+        assert next(lines) == "ready\n"
+        endpoint = MavlinkEndpoint(f"udpout:127.0.0.1:{port}", pace=4.0)
+        record = run_sortie(example("duration_s=16"), observer=endpoint)
+        endpoint.close()
+        told = json.loads(next(lines))
+    finally:
+        client.kill()
+        client.wait()
+        client.stdout.close()
+    assert sorted(told) == ["1", "2", "3", "4", "5"]
+    states = record.tables["states"].to_pylist()
+    for system, seen in told.items():
+        own = [s for s in states if s["drone"] == int(system) - 1]
+        north, east, down = seen["ned"]
+        at = min(own, key=lambda s: math.dist((s["y_m"], s["x_m"], -s["z_m"]), (north, east, down)))
+        assert (at["y_m"], at["x_m"], -at["z_m"]) == pytest.approx((north, east, down), abs=1e-3)
+        assert seen["velocity"] == pytest.approx([at["vy_mps"], at["vx_mps"], -at["vz_mps"]], abs=1e-4)
+        latitude, longitude, altitude, height = seen["position"]
+        assert height == pytest.approx(at["z_m"], abs=1.0)  # another message, perhaps of the frame before
+        assert altitude - height == pytest.approx(488.0, abs=0.01)
+        assert (latitude, longitude) == pytest.approx((ORIGIN.latitude_deg, ORIGIN.longitude_deg), abs=0.01)
+        assert abs(seen["attitude"][2] - 90.0) < 30.0  # it flies east
+        voltage, current, charge = seen["battery"]
+        assert min(abs(voltage - s["voltage_v"]) for s in own) < 0.01
+        assert min(abs(current - s["current_a"]) for s in own) < 0.02
+        assert charge == pytest.approx(100 * own[0]["soc"], abs=1.5)
+        assert seen["mode"] == [True, True]
+
+
+class Clock:
+    """A clock that stands still but while somebody waits."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[MavlinkEndpoint, list[tuple[float, bytes]]]]:
+    """An endpoint at twice real time on a clock of its own, and what it sent when."""
+    clock, sent = Clock(), []
+    endpoint = MavlinkEndpoint("udpout:127.0.0.1:9", pace=2.0, clock=clock)
+
+    def wait(timeout_s: float) -> None:
+        clock.now_s += timeout_s
+
+    monkeypatch.setattr(endpoint, "_listen", wait)
+    monkeypatch.setattr(endpoint, "_send", lambda frame: sent.append((clock.now_s - 100.0, frame)))
+    yield endpoint, sent
+    endpoint.close()
+
+
+def test_frames_go_in_step_with_simulated_time(
+    watched: tuple[MavlinkEndpoint, list[tuple[float, bytes]]], record: SortieRecord
+) -> None:
+    endpoint, sent = watched
+    again = run_sortie(record.scenario, observer=endpoint)
+    assert again.fingerprint == record.fingerprint  # being watched changes nothing
+    parser = mavlink2.MAVLink(None)
+    checked = 0
+    for wall_s, frame in sent:
+        for m in parser.parse_buffer(frame):
+            if m.get_type() == "LOCAL_POSITION_NED":
+                assert wall_s == pytest.approx(m.time_boot_ms / 2000.0, abs=1e-9)
+                checked += 1
+    assert checked == 5 * record.scenario.frames
+
+
+def test_a_waiting_endpoint_answers_a_ground_station_and_sends_to_it(record: SortieRecord) -> None:
+    with (
+        closing(MavlinkEndpoint("udpin:127.0.0.1:0", pace=None)) as endpoint,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+    ):
+        station.settimeout(10.0)
+        mav = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+        station.sendto(mavlink2.MAVLink_param_request_list_message(2, 1).pack(mav), endpoint.address)
+        endpoint.begin(record.scenario, None)  # type: ignore[arg-type]
+        slices = {name: table.slice(0, 0) for name, table in record.tables.items()}
+        endpoint.second(0.0, slices)
+        (answer,) = mav.parse_buffer(station.recv(65_535))
+        assert (answer.get_type(), answer.get_srcSystem(), answer.param_id) == ("PARAM_VALUE", 2, "SYSID_THISMAV")
+        slices["states"] = record.tables["states"].slice(0, 5)
+        endpoint.second(1.0, slices)
+        heard = [m for _ in range(40) for m in mav.parse_buffer(station.recv(65_535)) or []]
+        assert {m.get_srcSystem() for m in heard} == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.parametrize(
+    ("request_", "names"),
+    [
+        (mavlink2.MAVLink_param_request_list_message(0, 0), ["PARAM_VALUE"]),
+        (mavlink2.MAVLink_mission_request_list_message(3, 1, 0), ["MISSION_COUNT"]),
+        (mavlink2.MAVLink_command_long_message(3, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0), ["COMMAND_ACK", "AUTOPILOT_VERSION"]),
+        (mavlink2.MAVLink_command_long_message(3, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0), ["COMMAND_ACK"]),
+        (mavlink2.MAVLink_command_long_message(4, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0), []),
+        (mavlink2.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), []),
+    ],
+)  # fmt: skip
+def test_what_a_drone_answers(request_: mavlink2.MAVLink_message, names: list[str]) -> None:
+    station = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+    (heard,) = Listener().heard(bytes(request_.pack(station)))
+    said = answers(heard, 2)
+    assert [m.get_type() for m in said] == names
+    assert all(Transmitter(2).pack(m) for m in said)  # they fit the wire
+    if names == ["COMMAND_ACK"]:
+        assert said[0].result == mavlink2.MAV_RESULT_UNSUPPORTED  # nobody arms or disarms a simulated drone
+
+
+def test_noise_is_passed_over() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, 4000, dtype=np.uint8).tobytes()
+    listener = Listener()
+    assert [m.get_type() for m in listener.heard(noise)] == []
+
+
+def test_signed_frames_are_believed_and_altered_ones_refused() -> None:
+    key = bytes(range(KEY_BYTES))
+    plain, signed = Transmitter(0), Transmitter(0, key, BEGIN_US)
+    beat = mavlink2.MAVLink_heartbeat_message(2, 0, 0, 0, 4, 3)
+    frame = signed.pack(beat)
+    assert len(frame) == len(plain.pack(beat)) + 13
+
+    def believed(data: bytes) -> bool:
+        reader = mavlink2.MAVLink(None)
+        reader.signing.secret_key = key
+        reader.robust_parsing = True
+        return [m.get_type() for m in reader.parse_buffer(data) or []] == ["HEARTBEAT"]
+
+    assert believed(frame)
+    assert not believed(frame[:-1] + bytes([frame[-1] ^ 1]))
+    assert not believed(plain.pack(beat))
+    with pytest.raises(ValueError, match=r"^the signing key has 3 B, must have 32$"):
+        Transmitter(0, b"abc")
+
+
+def test_the_command_sends_while_it_flies(tmp_path: Path) -> None:
+    """`sortie fly … --mavlink`: pymavlink's own connection hears every drone."""
+    scenario = tmp_path / "short.yaml"
+    scenario.write_text(BASE.replace("duration_s: 6", "duration_s: 3.5"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(10.0)
+        to = f"udpout:127.0.0.1:{station.getsockname()[1]}"
+        arguments = [
+            "fly",
+            str(scenario),
+            "--no-recording",
+            "--mavlink",
+            to,
+            "--pace",
+            "0",
+            "--out",
+            str(tmp_path / "run"),
+        ]
+        said = CliRunner().invoke(app, arguments)
+        assert said.exit_code == 0, said.output
+        parser = mavlink2.MAVLink(None)
+        heard = [m for _ in range(60) for m in parser.parse_buffer(station.recv(65_535)) or []]
+    assert {m.get_srcSystem() for m in heard} == {1, 2, 3, 4, 5}
+
+
+# --- what can go wrong -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("address", ["14550", "udp:127.0.0.1:14550", "udpout::14550", "udpout:127.0.0.1:99999"])
+def test_an_address_that_is_none_is_named(address: str) -> None:
+    with pytest.raises(RunError, match=re.escape(f"{address!r} is no MAVLink address, must be as udpout:")):
+        MavlinkEndpoint(address)
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        with pytest.raises(RunError, match=rf"^udpin:127\.0\.0\.1:{port}: Address already in use$"):
+            MavlinkEndpoint(f"udpin:127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize("text", ["here", "47", "1,2,3,4", "89,0"])
+def test_an_origin_that_is_none_is_named(text: str) -> None:
+    with pytest.raises(RunError, match=rf"^origin is '{text}', must be latitude,longitude or"):
+        parse_origin(text)
