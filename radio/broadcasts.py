@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Set
+from math import inf
 
 from radio.airtime import frame_bytes, group_frame_s
 from radio.channel import Channel
@@ -28,7 +29,7 @@ class Broadcast(GroupFrame):
     def __init__(
         self, sender: int, airtime_s: float, slots: int, residual: float, mpdu_bytes: int, on_heard: OnHeard
     ) -> None:
-        super().__init__(sender, airtime_s, slots)
+        self.sender, self.airtime_s, self.slots, self.fire_s = sender, airtime_s, slots, inf  # as GroupFrame, in one go
         self.residual = residual
         self.mpdu_bytes = mpdu_bytes
         self.on_heard = on_heard

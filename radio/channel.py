@@ -56,6 +56,8 @@ def earshot_m(config: Radio) -> float:
 
 def _reach_at_1(luck: AnyFloats) -> AnyFloats:
     """How long a frame may be, bytes, to arrive with this luck where −log s (see `Channel._reach`) is 1."""
+    if luck.dtype == np.float32:  # in steps of 2⁻²⁴, whose difference from 1 is exact
+        return np.asarray(-REFERENCE_BYTES * np.log(1.0 - luck))
     return np.asarray(-REFERENCE_BYTES * np.log1p(-luck))
 
 
@@ -159,6 +161,10 @@ class Channel:
         self._luck: AnyFloats
         self._reach_at_1: AnyFloats
         self._reach_bytes: AnyFloats
+        # who hears whom in this frame, if every frame is of this length
+        self._heard_bytes = -1
+        self._heard_ids: list[int] = []
+        self._heard_from: list[int] = []
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
@@ -174,6 +180,7 @@ class Channel:
         if self.frame + 1 >= len(self._positions_m):
             raise IndexError(f"the flight has {len(self._positions_m)} frames")
         self.frame += 1
+        self._heard_bytes = -1
         row = self.frame % self._block
         if row == 0:
             self._refill()
@@ -221,14 +228,19 @@ class Channel:
             times: how many frames it has sent before in this frame of time: same fade, new luck. The luck is the
                 first frame's shifted by multiples of the golden ratio, modulo 1.
         """
-        a, b = self.links.begin[sender], self.links.begin[sender + 1]
-        reach = self.reach_bytes[a:b]
+        links = self.links
         if times:
-            row = self.frame % self._block
-            luck = (self._luck[row, a:b] + times * 0.6180339887498949) % 1.0
-            reach = self._reach(self.now.snr_db[a:b] + self._fades_db[row, a:b], _reach_at_1(luck))
-        ids: list[int] = self.links.receiver[a:b][reach >= length_bytes].tolist()
-        return ids
+            row, mine = self.frame % self._block, links.by_sender[links.begin[sender] : links.begin[sender + 1]]
+            luck = (self._luck[row, mine] + times * 0.6180339887498949) % 1.0
+            reach = self._reach(self.now.snr_db[mine] + self._fades_db[row, mine], _reach_at_1(luck))
+            again: list[int] = links.receiver[mine[reach >= length_bytes]].tolist()
+            return again
+        if self._heard_bytes != length_bytes:  # most frames of a moment have one length: look at all links together
+            through = (self.reach_bytes >= length_bytes)[links.by_sender]
+            self._heard_ids = links.receiver[links.by_sender[through]].tolist()
+            self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
+            self._heard_bytes = length_bytes
+        return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
 
     def _reach(self, faded_db: AnyFloats, reach_at_1: AnyFloats) -> AnyFloats:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
@@ -263,7 +275,8 @@ class Channel:
         c, p = self.config, self._positions_m[self.frame : self.frame + self._block]
         up = None if self._up is None else self._up[self.frame : self.frame + self._block]
         if self._crowd is not None:
-            self.links, loss_db, self._shadow_db, self._fades_db, self._luck = self._crowd.block(self.frame, p, up)
+            self.links, gain_db, self._shadow_db, self._fades_db, self._luck = self._crowd.block(self.frame, p, up)
+            self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
         else:
             loss_db = self._loss_db(p, up)
             drawn = self._draws.block(self._block, len(p))
@@ -271,8 +284,8 @@ class Channel:
             if self._field is not None:
                 at = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
                 self._shadow_db = np.stack(at).reshape(len(p), -1)
+            self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
         self._reach_at_1 = _reach_at_1(self._luck)
-        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
         self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._reach_at_1)
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:

@@ -28,7 +28,8 @@ class Block(NamedTuple):
     """Links, and [frames, L] of each."""
 
     links: Links
-    loss_db: Array
+    gain_db: Array
+    """Path, antennas and shadowing."""
     shadow_db: Array
     fades_db: Array
     luck: Array
@@ -66,15 +67,13 @@ class Crowd:
         loss_db = path_loss_db(self._config, distance, p[:, low, 2], p[:, high, 2])
         if self._config.antenna != "isotropic":
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
-        links, pair_of = both_ways(self._n, low, high)
+        links = both_ways(self._n, low, high)
         bits = numbers(link_keys(self._keys, links.sender, links.receiver), frame, len(p))
-        luck, fades_db = uniforms(bits), self._fades[levels(bits, 0)]
-        forward = np.empty(len(low), np.int64)  # where each pair's link from the lower id stands
-        up_links = np.flatnonzero(links.sender < links.receiver)
-        forward[pair_of[up_links]] = up_links
-        shadow_db = self._shadowing(frame, positions_m, low, high, bits[:, forward])
-        self._draw_early(links, low, high, len(p), luck, fades_db, shadow_db)
-        return Block(links, loss_db[:, pair_of], shadow_db[:, pair_of], fades_db, luck)
+        luck, fades_db = uniforms(bits), np.take(self._fades, levels(bits, 0))
+        shadow_db = self._shadowing(frame, positions_m, low, high, bits[:, : len(low)])
+        self._draw_early(low, high, len(p), luck, fades_db, shadow_db)
+        gain_db = shadow_db - loss_db
+        return Block(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2), fades_db, luck)
 
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
@@ -88,27 +87,26 @@ class Crowd:
         if self._field is not None:
             at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
             return np.stack([square[low, high] for square in at])
-        pairs = (high << 32) + low  # does not depend on how many drones there are
+        pairs = (high << 32) + low  # rising, and independent of how many drones there are
         begin_db = np.full(len(pairs), np.nan, np.float32)
         if len(self._last_pairs):
             where = np.minimum(np.searchsorted(self._last_pairs, pairs), len(self._last_pairs) - 1)
             known = self._last_pairs[where] == pairs
             begin_db[known] = self._last_db[where[known]]
-        z = normal_table()[levels(bits, 1)]
+        z = np.take(normal_table(), levels(bits, 1))
         shadow_db = gauss_markov(z, self._config.shadowing_sigma_db, self._keep, begin_db)
-        order = np.argsort(pairs)
-        self._last_pairs, self._last_db = pairs[order], shadow_db[-1, order]
+        self._last_pairs, self._last_db = pairs, shadow_db[-1]
         return shadow_db
 
     def _draw_early(
-        self, links: Links, low: IntArray, high: IntArray, flown: int, luck: Array, fades_db: Array, shadow_db: Array
+        self, low: IntArray, high: IntArray, flown: int, luck: Array, fades_db: Array, shadow_db: Array
     ) -> None:
-        """Put the first drones' own numbers in their places."""
-        early_shadow_db, early_fades_db, early_luck = self._early.block(EPOCH, flown)
-        at = np.flatnonzero((links.sender < self._n_early) & (links.receiver < self._n_early))
-        sender, receiver = links.sender[at], links.receiver[at]
-        luck[:, at] = early_luck[:, sender, receiver]
-        fades_db[:, at] = early_fades_db[:, sender, receiver]
+        """Put the first drones' own numbers in their places; their pairs are the first ones."""
+        count, n = int(np.searchsorted(high, self._n_early)), self._n_early
+        there, back = low[:count] * n + high[:count], high[:count] * n + low[:count]
+        drawn = [x.reshape(flown, -1) for x in self._early.block(EPOCH, flown)]
+        for mine, theirs in ((luck, drawn[2]), (fades_db, drawn[1])):
+            mine[:, :count] = np.take(theirs, there, axis=1)
+            mine[:, len(low) : len(low) + count] = np.take(theirs, back, axis=1)
         if self._field is None:
-            pairs = np.flatnonzero(high < self._n_early)
-            shadow_db[:, pairs] = early_shadow_db[:, low[pairs], high[pairs]]
+            shadow_db[:, :count] = np.take(drawn[0], there, axis=1)

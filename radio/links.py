@@ -1,7 +1,7 @@
 """Who can hear whom: the list of links that are worth working out.
 
 Small fleets have every link, in a square; in larger ones a link is listed while its ends are within earshot.
-Values of links are kept as vectors [L], the links of one sender side by side.
+Values of links are kept as vectors [L].
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """Directed links by sender, then receiver."""
+    """Directed links, in some order."""
 
     n: int
     sender: IntArray
     receiver: IntArray
     """[L] each; a square list holds every drone with itself too, whose values mean nothing."""
+    by_sender: IntArray
+    """[L]: their order by sender, then receiver."""
     begin: list[int]
-    """[N + 1]: the links of drone i are begin[i] … begin[i + 1] − 1."""
+    """[N + 1]: in that order, the links of drone i are begin[i] … begin[i + 1] − 1."""
     is_square: bool
 
     def square(self, values: FloatArray, elsewhere: float) -> NDArray[np.float64]:
@@ -42,7 +44,7 @@ class Links:
 def all_links(n: int) -> Links:
     """Every drone with every drone."""
     ids = np.arange(n)
-    return Links(n, np.repeat(ids, n), np.tile(ids, n), [i * n for i in range(n + 1)], True)
+    return Links(n, np.repeat(ids, n), np.tile(ids, n), np.arange(n * n), [i * n for i in range(n + 1)], True)
 
 
 def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntArray, FloatArray]:
@@ -53,18 +55,23 @@ def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntAr
         range_m: ≥ 0.
 
     Returns:
-        Lower ids [P], higher ids [P], and distances [frames, P], in the type of `positions_m`.
+        Lower ids [P], higher ids [P], and distances [frames, P], in the type of `positions_m`; pairs by higher, then
+        lower id.
     """
     from scipy.spatial import cKDTree
 
+    n = positions_m.shape[1]
     middle = positions_m[len(positions_m) // 2]
     astray_m = float(np.sqrt(((positions_m - middle) ** 2).sum(axis=-1).max()))
     pairs = cKDTree(middle).query_pairs(range_m + 2.0 * astray_m, output_type="ndarray")
     low, high = pairs.min(axis=1), pairs.max(axis=1)
+    order = np.argsort(high * n + low)
+    low, high = low[order], high[order]
     apart = np.zeros((len(positions_m), len(pairs)), positions_m.dtype)
     for axis in range(3):
         along = np.ascontiguousarray(positions_m[:, :, axis])
-        step = along[:, low] - along[:, high]
+        step = np.take(along, low, axis=1)
+        step -= np.take(along, high, axis=1)
         step *= step
         apart += step
     np.sqrt(apart, out=apart)
@@ -74,10 +81,9 @@ def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntAr
     return low[near], high[near], apart[:, near]
 
 
-def both_ways(n: int, low: IntArray, high: IntArray) -> tuple[Links, IntArray]:
-    """The links of some pairs, and [L] the number of each link's pair."""
+def both_ways(n: int, low: IntArray, high: IntArray) -> Links:
+    """The links of some pairs: all those from the lower id, then all those from the higher one."""
     sender, receiver = np.concatenate([low, high]), np.concatenate([high, low])
     order = np.argsort(sender * n + receiver)
-    sender, receiver = sender[order], receiver[order]
-    begin = np.searchsorted(sender, np.arange(n + 1)).tolist()
-    return Links(n, sender, receiver, begin, False), order % max(1, len(low))
+    begin = np.searchsorted(sender[order], np.arange(n + 1)).tolist()
+    return Links(n, sender, receiver, order, begin, False)

@@ -313,10 +313,14 @@ class Medium(Generic[J, F]):
             frame: its `slots` drawn, 0 … CW_CONTEXT.
             residual: uniform in [0, 1): how much of a running data exchange is still to come.
         """
-        now = self.sync()
         waiting = self._waiting
-        if not waiting:
+        if waiting:
+            now = self.sync()
+        elif self._heads:
+            now = self.sync()
             self._context_from_s = now + residual * self._mean_exchange_s()
+        else:
+            self._context_from_s = self._last_s = now = self._env.now
         waiting.append(frame)
         if now >= self._context_fire_s:
             return  # heard the frame that is on the air; counts down after it

@@ -272,12 +272,14 @@ def test_a_gauss_markov_process_goes_on_over_a_gap_in_its_block() -> None:
 def test_every_pair_in_range_is_listed_both_ways() -> None:
     p = np.random.default_rng(2).random((5, 80, 3)) * 100.0
     low, high, distance = near_pairs(p, 25.0)
-    links, pair_of = both_ways(80, low, high)
+    links = both_ways(80, low, high)
     apart = np.sqrt(((p[:, :, None] - p[:, None]) ** 2).sum(axis=-1))
     near = (apart.min(axis=0) <= 25.0) & ~np.eye(80, dtype=bool)
-    assert np.argwhere(near).tolist() == np.stack([links.sender, links.receiver], axis=1).tolist()
+    order = links.by_sender
+    assert np.argwhere(near).tolist() == np.stack([links.sender[order], links.receiver[order]], axis=1).tolist()
     assert links.begin == [0, *np.cumsum(near.sum(axis=1)).tolist()]
-    np.testing.assert_allclose(distance[:, pair_of], apart[:, links.sender, links.receiver])
+    np.testing.assert_allclose(np.tile(distance, 2), apart[:, links.sender, links.receiver])
+    assert (np.diff(high * 80 + low) > 0).all()
 
 
 def test_broken_attitudes_are_refused() -> None:
