@@ -265,7 +265,7 @@ def _decides_in_time(policy: Policy) -> Check:
     """CPU time of a decision, the median of many, at 5 and at 20 drones."""
     name, took_s = "time per decision", {}
     for drones in (5, 20):
-        view = _full_view(drones)
+        view = full_view(drones)
         try:
             for _ in range(3):
                 policy(view)
@@ -281,7 +281,8 @@ def _decides_in_time(policy: Policy) -> Check:
     return Check(name, not slow, what + (f", must be at most {DECISION_LIMIT_S * 1e3:g} ms" if slow else ""))
 
 
-def _full_view(drones: int) -> FleetView:
+def full_view(drones: int) -> FleetView:
+    """A view of so many drones, all heard, in drawn states: what decisions are timed on."""
     drawn = next(v for v in draw_views(2, 10_000) if len(v.descriptors) >= 3)
     some = list(drawn.descriptors.values())
     descriptors = {

@@ -233,6 +233,7 @@ app.command()(cli_calibrate.calibrate)
 app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
 app.command()(cli_verify.verify)
+app.command()(cli_verify.overhead)
 app.command()(cli_export.export)
 app.command("import")(cli_import.import_log)
 

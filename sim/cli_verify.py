@@ -24,9 +24,11 @@ from policies.views import to_json
 from scenarios.load import dump, loads
 from scenarios.schema import Policy as PolicySection
 from scenarios.schema import Scenario
-from sim.console import err, out
+from sim.console import bars, err, out
 from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sim.folders import RunError, write_text
+from sim.overhead import SCENARIO, SECONDS, host_s, measure
+from sim.plane import machine
 
 COLOURS = {"holds": "green", "proved": "green", "fails": "red", "refuted": "red", "not proved": "yellow"}
 OWN_INVARIANTS = "INVARIANTS"
@@ -71,6 +73,40 @@ def verify(
         raise typer.Exit(1)
 
 
+def overhead(
+    policies: Annotated[str, typer.Option(help="Comma-separated names.")] = "worked",
+    drones: Annotated[str, typer.Option(help="Comma-separated sizes of the fleet.")] = "5,25,100",
+    seconds: Annotated[float, typer.Option(help="Length of each flight, without a detector.", min=1)] = SECONDS,
+) -> None:
+    """What the plane costs: context bytes against data bytes, and CPU time of a decision, by the size of the fleet."""
+    try:
+        sizes = [int(n) for n in drones.split(",")]
+    except ValueError as error:
+        raise RunError(f"--drones {drones!r}, must be whole numbers with commas, as in 5,25,100") from error
+    columns = (
+        "policy",
+        "drones",
+        "context KB/s",
+        "data MB/s",
+        "context share",
+        "decides in ms, median",
+        "99th percentile",
+    )
+    table = Table(*columns, title=f"{SCENARIO}, {seconds:g} s")
+    for name in policies.split(","):
+        for n in sizes:
+            with bars() as bar:
+                row = measure(name.strip(), n, seconds, progress=bar(f"{name}, {n} drones", seconds))
+            table.add_row(
+                row.policy, f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
+                f"{row.context_share:.2%}", f"{row.p50_ms:.4f}", f"{row.p99_ms:.4f}",
+            )  # fmt: skip
+    out.print(table)
+    out.print(
+        f"{machine()}; a million additions in a plain loop take {host_s():.3f} s of CPU time here", soft_wrap=True
+    )
+
+
 def _verdict(word: str) -> str:
     return f"[{COLOURS[word]}]{word}[/{COLOURS[word]}]"
 
@@ -113,8 +149,8 @@ def _counterexamples(
         view = v.counterexample
         if view is not None:
             invariant = "" if v.name in {p.name for p in PLANE} else v.name
-            raised = (v.raised_age_s or raised_ages(decide, view)) if v.name == aged.name else None
-            yield v.name, view, shown(v.name, v.what, view=view, invariant=invariant, raised_age_s=raised)
+            older = (v.raised_age_s or raised_ages(decide, view)) if v.name == aged.name else None
+            yield v.name, view, shown(v.name, v.what, view=view, invariant=invariant, raised_age_s=older)
 
 
 def _keep(folder: Path, found: Iterable[tuple[str, FleetView, Scenario]]) -> None:

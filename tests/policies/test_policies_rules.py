@@ -6,6 +6,7 @@ import functools
 import gc
 import os
 import random
+import sys
 import time
 from collections.abc import Callable
 from enum import Enum
@@ -22,7 +23,7 @@ from fleet.gate import Gate
 from fleet.staleness import cap_by_age, health
 from fleet.wire import MAX_DESCRIPTOR_BYTES, encode_descriptor
 from policies.confine import Reached, confined
-from policies.conformance import RULES, raised_part
+from policies.conformance import RULES, full_view, raised_part
 from policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation, check_directives
 from policies.damping import LinkState, damp
 from policies.registry import POLICIES
@@ -36,6 +37,32 @@ FEATURE_CELLS = np.ones((64, 64, 80), np.float32)
 
 def share(view: FleetView, rate_hz: float = 10.0) -> list[Directive]:
     return [Directive(view.ego, p, Representation.FEATURES, 0.5, None, rate_hz, reason="share") for p in view.peers]
+
+
+# --- what a decision costs -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["worked", "all-4", "best-2", "silence"])
+def test_cost_grows_no_faster_than_the_fleet(name: str) -> None:
+    """Calls, not time: a crowded host counts the same."""
+
+    def calls(drones: int) -> int:
+        view, counted = full_view(drones), 0
+
+        def count(frame: object, event: str, argument: object) -> None:
+            nonlocal counted
+            counted += event in ("call", "c_call")
+
+        POLICIES[name](view)
+        sys.setprofile(count)
+        try:
+            POLICIES[name](view)
+        finally:
+            sys.setprofile(None)
+        return counted
+
+    at_25, at_100 = calls(25), calls(100)
+    assert 0 < at_100 <= 4.2 * at_25 + 10
 
 
 # --- 1: bounded size and rate --------------------------------------------------------------------
