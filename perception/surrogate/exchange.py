@@ -189,7 +189,7 @@ def covariates(
     n, k = pairs.peer.shape
     first, second = np.full((2, n), NO_PEER, np.float32)
     total, silent, sure, off, shift_first, middle_x, middle_y, deep = np.zeros((8, n), np.float32)
-    allow = exchange.cells / np.maximum(exchange.allowed, 1.0)
+    allow = exchange.arrived / np.maximum(exchange.allowed, 1.0)
     for j in range(k):
         weight = exchange.weight[pairs.row, j].astype(np.float32)
         came = sent[:, j] * weight
@@ -212,8 +212,7 @@ def covariates(
     mean = np.where(total > 0, sure / count, np.float32(NO_PEER))
     spread = np.sqrt(middle_x * middle_x + middle_y * middle_y) / (1.0 + total)
     most = np.log(np.maximum(np.where(exchange.sender >= 0, exchange.arrived, 1.0).max(axis=1, initial=1.0), 1.0)) / 8.0
-    came_of = exchange.arrived / np.maximum(exchange.allowed, 1.0)
-    part = np.where(exchange.sender >= 0, came_of, 0.0).max(axis=1, initial=0.0)
+    part = np.where(exchange.sender >= 0, allow, 0.0).max(axis=1, initial=0.0)
     own = looks.covariates[pairs.look]
     columns = (
         confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
