@@ -266,7 +266,7 @@ def is_tlog(data: bytes) -> bool:
 
 
 def read_tlog(data: bytes) -> RawLog:
-    """A telemetry log's messages as columns; `timestamp` is the ground's clock, µs since 1970.
+    """A telemetry log's messages as columns; `timestamp` is the ground's clock, µs since the first.
 
     The vehicle is the first system whose heartbeat names an autopilot; of other systems only RADIO_STATUS is kept,
     which the vehicle's radio sends in its own name. Parameters become the table PARM. A frame whose checksum is wrong,
@@ -303,12 +303,13 @@ def read_tlog(data: bytes) -> RawLog:
             boot_ms = values["time_boot_ms"]
         heard.setdefault(name, []).append((system, stamp_us, values))
     tables: dict[str, dict[str, Column]] = {}
+    begin_us = min((each[0][1] for each in heard.values()), default=0)
     for name, each in heard.items():
         own = [row for row in each if row[0] == vehicle or name in ("RADIO_STATUS", "RADIO")]
         if own and name != "PARAM_VALUE":
             numbers = [key for key, value in own[0][2].items() if isinstance(value, int | float)]
             tables[name] = {key: np.array([row[2][key] for row in own]) for key in numbers}
-            tables[name]["timestamp"] = np.array([row[1] for row in own])
+            tables[name]["timestamp"] = np.array([row[1] - begin_us for row in own])
     tables["PARM"] = {
         "Name": np.array([n.encode() for n in parameters], "S16"),
         "Value": np.array(list(parameters.values()), float),

@@ -11,7 +11,7 @@ One row a drone and time, CSV or Parquet. Names, units and frames are those of t
     vx_mps, vy_mps, vz_mps    velocity, ENU; left out, the slope of the positions
     soc                       state of charge by charge, 0 … 1; it never rises
     voltage_v, current_a      at the terminals
-    rssi_dbm                  what the drone's radio heard; kept for people, nothing reads it yet
+    rssi_dbm, rssi_percent    what the drone's radio heard; kept for people, nothing reads it
 
 Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. A drone without
 a pose or a charge keeps its model there.
@@ -41,7 +41,7 @@ VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 BATTERY = ("soc", "voltage_v", "current_a")
 ROUNDING = 1e-5
 """A charge that rises by less is rounding, and held."""
-COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm")
+COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm", "rssi_percent")
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "t_s": TIME_S,
     "drone": DRONE,
@@ -53,6 +53,7 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "voltage_v": (0.0, 200.0),
     "current_a": (-1000.0, 2000.0),
     "rssi_dbm": (-200.0, 50.0),
+    "rssi_percent": (0.0, 100.0),
 }
 
 

@@ -116,24 +116,17 @@ def test_a_wrong_checksum_is_counted(tmp_path: Path) -> None:
 
 
 def test_a_gap_is_told_with_its_place(tmp_path: Path) -> None:
-    begin = len(examples.dataflash()) - examples.STEPS * _step_bytes()
+    begin, step = len(examples.dataflash_begin()), len(examples.dataflash_step(0))
     data = WHOLE["bin"]
-    cut = data[: begin + 30 * _step_bytes()] + data[begin + 60 * _step_bytes() :]
+    cut = data[: begin + 30 * step] + data[begin + 60 * step :]
     log = read_log(written(tmp_path, "bin", cut))
     assert "battery: 1 gaps, the longest 3.1 s at 2.9 s" in log.problems
 
 
-def _step_bytes() -> int:
-    names = ("GPS", "XKF1", "XKF1", "ATT", "BAT", "RAD")
-    return sum(
-        3 + struct.calcsize("<" + "".join(examples._STRUCT[c] for c in examples._DATAFLASH[n][1])) for n in names
-    )
-
-
 def test_a_restart_keeps_the_longest_stretch(tmp_path: Path) -> None:
-    begin = len(WHOLE["bin"]) - examples.STEPS * _step_bytes()
+    begin, step = len(examples.dataflash_begin()), len(examples.dataflash_step(0))
     data = WHOLE["bin"]
-    twice = data[:begin] + data[begin + 70 * _step_bytes() :] + data[begin:]
+    twice = data[:begin] + data[begin + 70 * step :] + data[begin:]
     log = read_log(written(tmp_path, "bin", twice))
     assert any("the clock of battery restarts 1 times" in problem for problem in log.problems)
     assert log.battery is not None
@@ -141,11 +134,9 @@ def test_a_restart_keeps_the_longest_stretch(tmp_path: Path) -> None:
 
 
 def test_values_that_are_no_numbers_and_places_that_are_too_far(tmp_path: Path) -> None:
-    begin = len(WHOLE["bin"]) - examples.STEPS * _step_bytes()
     bad = examples.dataflash_message("XKF1", 15_000_000, 0, 0.0, 0.0, 0.0, 9e6, 0.0, 0.0, 0.0)
     worse = examples.dataflash_message("XKF1", 15_100_000, 0, float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     log = read_log(written(tmp_path, "bin", WHOLE["bin"] + bad + worse))
-    assert begin > 0
     assert "1 positions lie over 20 km off and are left out" in log.problems
     assert "1 rows of velocity are not finite and are left out" in log.problems
 

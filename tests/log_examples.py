@@ -58,24 +58,33 @@ def dataflash_message(name: str, *values: object) -> bytes:
     return b"\xa3\x95" + bytes([number]) + struct.pack("<" + "".join(_STRUCT[c] for c in form), *values)
 
 
-def dataflash() -> bytes:
-    """The flight as ArduPilot would log it, begun 5 s after boot."""
+def dataflash_begin() -> bytes:
+    """Formats and parameters, which come before the flight."""
     out = b""
     for name, (number, form, columns) in _DATAFLASH.items():
         length = 3 + struct.calcsize("<" + "".join(_STRUCT[c] for c in form))
         out += dataflash_message("FMT", number, length, name.encode(), form.encode(), columns.encode())
-    out += dataflash_message("PARM", 5_000_000, b"BATT_CAPACITY", 5000.0)
-    for k in range(STEPS):
-        s, us = state(k), 5_000_000 + k * 100_000
-        (east, north, up), (ve, vn, vu) = s.position_m, s.velocity_mps
-        lat, lon, alt = geodetic(s.position_m, ORIGIN)
-        out += dataflash_message("GPS", us, 3, round(lat * 1e7), round(lon * 1e7), round(alt * 100))
-        out += dataflash_message("XKF1", us, 0, vn, ve, -vu, north, east, -up, 0.0)
-        out += dataflash_message("XKF1", us, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0)  # another core
-        out += dataflash_message("ATT", us, 0, 0, 0)
-        out += dataflash_message("BAT", us, 0, s.voltage_v, s.current_a, 5000 * (1 - s.soc))
-        out += dataflash_message("RAD", us, 190, 150)
-    return out
+    return out + dataflash_message("PARM", 5_000_000, b"BATT_CAPACITY", 5000.0)
+
+
+def dataflash() -> bytes:
+    """The flight as ArduPilot would log it, begun 5 s after boot."""
+    return dataflash_begin() + b"".join(dataflash_step(k) for k in range(STEPS))
+
+
+def dataflash_step(k: int) -> bytes:
+    """What is logged at step k."""
+    s, us = state(k), 5_000_000 + k * 100_000
+    (east, north, up), (ve, vn, vu) = s.position_m, s.velocity_mps
+    lat, lon, alt = geodetic(s.position_m, ORIGIN)
+    return (
+        dataflash_message("GPS", us, 3, round(lat * 1e7), round(lon * 1e7), round(alt * 100))
+        + dataflash_message("XKF1", us, 0, vn, ve, -vu, north, east, -up, 0.0)
+        + dataflash_message("XKF1", us, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0)  # another core
+        + dataflash_message("ATT", us, 0, 0, 0)
+        + dataflash_message("BAT", us, 0, s.voltage_v, s.current_a, 5000 * (1 - s.soc))
+        + dataflash_message("RAD", us, 190, 150)
+    )
 
 
 _TOPICS = {

@@ -1,0 +1,127 @@
+"""`sortie import`: a real flight's log as a context trace, and a scenario that flies it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from fleet.cell import MEAN_CELL_V
+from scenarios.load import loads
+from sim.console import out, user_errors
+from sim.folders import RunError, ensure_folder, replacing, write_text
+
+Array = np.ndarray[Any, Any]
+
+TRACE, SCENARIO = "trace.parquet", "scenario.yaml"
+FULL_CELL_V = 4.25
+LONGEST_S = 7200.0
+LOWEST_M = 2.0
+"""Where the flight's lowest point is put above the flat ground of the simulator's town, unless told."""
+
+
+def import_log(
+    log: Annotated[Path, typer.Argument(help="ArduPilot's .bin, MAVLink telemetry (.tlog) or PX4's .ulg.")],
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="The folder of trace and scenario; left out, named after the log.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Rows a second of the trace.", min=0.1, max=1000)] = 10.0,
+    from_s: Annotated[float, typer.Option("--from", help="Begin, seconds of the log.", min=0)] = 0.0,
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="End, seconds of the log; left out, its end.")
+    ] = None,
+    lift: Annotated[
+        float | None, typer.Option(help="Metres added to every height; left out, the lowest point flies at 2 m.")
+    ] = None,
+) -> None:
+    """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it as one drone.
+
+    Gaps, restarts, damaged and missing messages are told and survived; gaps are empty cells of the trace.
+    """
+    from fleet.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
+    from fleet.logtrace import context_trace, write_trace
+
+    folder = out_dir or Path(slug(log))
+    ensure_folder(folder, SCENARIO, "flight")
+    with user_errors():
+        flight = read_log(log)
+        until = flight.duration_s if until_s is None else until_s
+        if until - from_s > LONGEST_S:
+            raise RunError(
+                f"{log}: {until - from_s:.0f} s to fly, must be at most {LONGEST_S:g}: name --from and --until"
+            )
+        columns = context_trace(flight, rate, from_s, until)
+        if "z_m" in columns:
+            columns["z_m"] += LOWEST_M - float(np.nanmin(columns["z_m"])) if lift is None else lift
+    text = scenario_text(slug(log), columns, flight.parameters, folder / TRACE, f"{flight.kind} log {log.name!r}")
+    loads(text, str(folder / SCENARIO))  # what a log makes impossible is told before anything is written
+    with replacing(folder) as new, user_errors():
+        write_trace(new / TRACE, columns)
+        write_text(new / SCENARIO, text)
+    rows = len(columns["t_s"])
+    out.print(
+        f"{flight.kind}, {flight.duration_s:.1f} s; {rows} rows at {rate:g} Hz of {told(columns)}", soft_wrap=True
+    )
+    for problem in flight.problems:
+        out.print(f"  [yellow]{problem}[/yellow]", soft_wrap=True)
+    for lacking, instead in LACKING.items():
+        if lacking not in columns:
+            out.print(f"  [yellow]no {instead}[/yellow]", soft_wrap=True)
+    out.print(f"sortie fly {folder / SCENARIO}", soft_wrap=True)
+
+
+LACKING = {
+    "x_m": "position in it: the drone flies the scenario's route",
+    "soc": "charge in it: the battery is the model's",
+}
+
+
+def slug(log: Path) -> str:
+    """A scenario's name from a file's."""
+    return re.sub(r"[^a-z0-9]+", "_", log.stem.lower()).strip("_")[:64] or "flight"
+
+
+def told(columns: Mapping[str, Array]) -> str:
+    """What a trace has, in words."""
+    names = {
+        "x_m": "position", "qx": "attitude", "vx_mps": "velocity", "soc": "charge", "voltage_v": "voltage",
+        "current_a": "current", "rssi_dbm": "RSSI (dBm)", "rssi_percent": "RSSI (percent)",
+    }  # fmt: skip
+    return ", ".join(word for name, word in names.items() if name in columns)
+
+
+def scenario_text(
+    name: str, columns: Mapping[str, Array], parameters: Mapping[str, float], trace: Path, source: str
+) -> str:
+    """One drone that flies the trace, without a detector: the simulator's town is not the flight's place.
+
+    A traced charge never lands it; capacity and cells, where the log tells them, are those of its pack.
+    """
+    battery = []
+    if "voltage_v" in columns:
+        cells = min(max(math.ceil(float(np.nanmax(columns["voltage_v"])) / FULL_CELL_V), 1), 24)
+        battery.append(f"cells: {cells}")
+        if (capacity_ah := parameters.get("BATT_CAPACITY", 0.0) / 1000) > 0:
+            battery.append(f"capacity_wh: {capacity_ah * cells * MEAN_CELL_V:.1f}")
+    if "soc" in columns:
+        battery.append("landing_soc: 0")
+    return f"""# A real flight, made by `sortie import` from the {source}.
+# The trace holds {told(columns)}; what it lacks is the models'.
+
+name: {name}
+duration_s: {columns["t_s"][-1]:g}
+
+fleet:
+  drones: 1
+  trace: {json.dumps(str(trace.absolute()), ensure_ascii=False)}
+  battery: {{{", ".join(battery)}}}
+
+perception:
+  detector: none # the simulator's town is not the place that was flown over
+"""

@@ -1,0 +1,116 @@
+"""`sortie import`: a log becomes a trace and a scenario, and that scenario flies what was logged."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import log_examples as examples
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from fleet.flightlog import read_log
+from fleet.logtrace import context_trace
+from fleet.traces import COLUMNS, read_traces
+from scenarios.load import load
+from sim.cli import app
+from sim.folders import RunError
+from sim.sortie import run_sortie
+
+LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
+needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")
+
+
+def imported(folder: Path, kind: str, *more: str) -> Path:
+    """The folder that `sortie import` makes of the example of a kind."""
+    log = folder / f"My Flight.{kind}"
+    log.write_bytes(examples.KINDS[kind]())
+    done = CliRunner().invoke(app, ["import", str(log), "--out", str(folder / "out"), *more], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return folder / "out"
+
+
+@pytest.mark.parametrize("kind", examples.KINDS)
+def test_a_log_flies_as_one_drone(kind: str, tmp_path: Path) -> None:
+    """3, 4 and 1 m/s from 2 m up, the charge from 90 % by 1 % a second."""
+    scenario = load(imported(tmp_path, kind) / "scenario.yaml")
+    assert (scenario.name, scenario.fleet.drones, scenario.duration_s) == ("my_flight", 1, 9.9)
+    assert scenario.fleet.battery.cells == 4
+    states = run_sortie(scenario).tables["states"]
+    t_s = states["t_s"].to_numpy()
+    wanted = np.stack([3 * t_s, 4 * t_s, 2 + t_s], axis=-1)
+    flown = np.stack([states[name].to_numpy() for name in ("x_m", "y_m", "z_m")], axis=-1)
+    np.testing.assert_allclose(flown, wanted, atol=0.02)
+    np.testing.assert_allclose(states["vx_mps"].to_numpy(), 3.0, atol=0.006)
+    np.testing.assert_allclose(states["soc"].to_numpy(), 0.9 - 0.01 * t_s, atol=0.0055)
+    np.testing.assert_allclose(states["voltage_v"].to_numpy()[1:], 16 - 0.1 * t_s[1:], atol=0.002)
+
+
+def test_a_stretch_of_the_log_begins_at_zero(tmp_path: Path) -> None:
+    folder = imported(tmp_path, "bin", "--from", "2", "--until", "5", "--rate", "20", "--lift", "50")
+    trace = pq.read_table(folder / "trace.parquet")
+    assert trace["t_s"].to_pylist() == pytest.approx([k / 20 for k in range(61)])
+    assert trace["z_m"][0].as_py() == pytest.approx(52.0, abs=1e-3)
+    assert set(trace.column_names) <= set(COLUMNS)
+
+
+def test_gaps_are_empty_cells(tmp_path: Path) -> None:
+    data = examples.dataflash()
+    begin, step = len(examples.dataflash_begin()), len(examples.dataflash_step(0))
+    (tmp_path / "gap.bin").write_bytes(data[: begin + 30 * step] + data[begin + 60 * step :])
+    columns = context_trace(read_log(tmp_path / "gap.bin"))
+    empty = np.isnan(columns["soc"])
+    assert columns["t_s"][empty].tolist() == pytest.approx([3 + k / 10 for k in range(30)])
+    assert empty.tolist() == np.isnan(columns["x_m"]).tolist() == np.isnan(columns["qw"]).tolist()
+
+
+def test_a_damaged_log_is_imported_and_its_damage_told(tmp_path: Path) -> None:
+    log = tmp_path / "damaged.ulg"
+    data = examples.ulog()
+    log.write_bytes(data[:5000] + b"\xff" * 60 + data[5000:-3])
+    done = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out")], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "are no message" in done.output
+    assert "cut off" in done.output
+    assert read_traces(tmp_path / "out/trace.parquet", 1)[0].battery is not None
+
+
+def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) -> None:
+    log = tmp_path / "short.bin"
+    log.write_bytes(examples.dataflash())
+    for arguments, said in (
+        ([str(tmp_path / "nowhere.bin")], "nowhere.bin: cannot be read"),
+        ([__file__], "is no DataFlash log"),
+        ([str(log), "--from", "9.5"], "0.4 s from 9.5 s on, must be 1 s at least"),
+        ([str(log), "--until", "9000"], "9000 s to fly, must be at most 7200"),
+    ):
+        with pytest.raises(RunError, match=said):
+            CliRunner().invoke(app, ["import", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("keep")
+    with pytest.raises(RunError, match=r"holds files but no scenario\.yaml"):
+        CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "mine")], catch_exceptions=False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "short.bin"]
+
+
+@needs_logs
+@pytest.mark.parametrize(
+    ("name", "seconds", "lacks"),
+    [("log171.bin", 242.5, []), ("fs-batt.tlog", 20.0, ["x_m"]), ("sample_log_small.ulg", 6.4, [])],
+)
+def test_three_real_logs_fly(name: str, seconds: float, lacks: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, ["import", str(LOGS / name), "--out", str(out)], catch_exceptions=False)
+    assert done.exit_code == 0
+    scenario = load(out / "scenario.yaml")
+    assert scenario.duration_s == pytest.approx(seconds)
+    names = pq.read_schema(out / "trace.parquet").names
+    assert [lack for lack in ("x_m", "qw", "soc", "voltage_v") if lack not in names] == lacks
+    record = run_sortie(scenario)
+    columns = context_trace(read_log(LOGS / name))
+    states = record.tables["states"]
+    known = ~np.isnan(columns["soc"][: states.num_rows])
+    flown, logged = states["soc"].to_numpy()[known], columns["soc"][: states.num_rows][known]
+    np.testing.assert_allclose(flown, logged, atol=2e-3)
