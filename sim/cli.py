@@ -29,6 +29,7 @@ from sim import (
     cli_import,
     cli_paper,
     cli_recording,
+    cli_report,
     cli_study,
     cli_train,
     cli_verify,
@@ -37,10 +38,8 @@ from sim import (
 )
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
-from sim.expect import check as check_expectations
 from sim.folders import RunError
 from sim.named import policy_overrides
-from sim.outcome import outcome
 from sim.sortie import VERSION, run_sortie
 from sim.watchers import Watcher, Watchers
 
@@ -173,17 +172,24 @@ def compare(
 def check(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario files or names; all: the whole library.")],
     set_: SetOption = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing.")
+    ] = False,
 ) -> None:
     """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
+    from sim.checking import check_scenario, flights
+
     names = list(library()) if scenarios == ["all"] else scenarios
-    loaded = [load(name, set_ or []) for name in names]
+    loaded = [(name, load(name, set_ or [])) for name in names]  # all of them, before the first one flies
     failed = 0
-    for flown in loaded:
+    for name, flown in loaded:
         with bars() as bar:
-            record = run_sortie(flown, progress=bar(flown.name, flown.duration_s))
-        verdicts = check_expectations(flown, record, outcome(record))
-        failed += sum(not v.holds for v in verdicts)
-        out.print(tables.verdict_table(flown.name, verdicts))
+            watch = bar(flown.name, flown.duration_s * flights(flown))
+            checked = check_scenario(name, set_ or [], update=update, progress=watch)
+        failed += len(checked.failed)
+        out.print(tables.verdict_table(flown.name, checked.verdicts))
+        if checked.failed:
+            out.print(f"see it with: {checked.replay}", soft_wrap=True)
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
         raise typer.Exit(1)
@@ -235,6 +241,7 @@ app.command()(cli_paper.paper)
 app.command()(cli_verify.verify)
 app.command()(cli_verify.overhead)
 app.command()(cli_export.export)
+app.command()(cli_report.report)
 app.command("import")(cli_import.import_log)
 
 

@@ -30,7 +30,7 @@ def size(count: float) -> str:
     return f"{count:.0f} B"
 
 
-def _percent(value: float | None) -> str:
+def percent(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.1f} %" if value >= 1e-3 else f"{100 * value:.2g} %"
 
 
@@ -52,11 +52,11 @@ def outcome_table(result: dict[str, Any]) -> Table:
             table.add_row(
                 f"  {phase['phase']} {phase['begin_s']:g}–{phase['end_s']:g} s",
                 f"{number(seen['full_scene'])} full, {number(seen['mission'])} mission, "
-                f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {_percent(phase['deadline_miss_rate'])} missed",
+                f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {percent(phase['deadline_miss_rate'])} missed",
             )
     table.add_row(
         "context plane",
-        f"{size(data['context_sent'])} ({_percent(result['context_share'])} of all bytes), "
+        f"{size(data['context_sent'])} ({percent(result['context_share'])} of all bytes), "
         f"age {number(result['age_s']['p50'])} s median, {number(result['age_s']['p99'])} s p99",
     )
     fates = ", ".join(
@@ -65,14 +65,12 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table.add_row("data plane", f"{size(data['data_sent'])} sent: {fates}")
     table.add_row(
         "deadlines",
-        f"{_percent(result['deadline_miss_rate'])} missed; medium busy {_percent(result['medium_busy_fraction'])}",
+        f"{percent(result['deadline_miss_rate'])} missed; medium busy {percent(result['medium_busy_fraction'])}",
     )
     energy = result["energy_j"]
     causes = ", ".join(f"{c} {energy[c] / 1e3:.1f}" for c in energy if c != "total" and energy[c] > 0)
     table.add_row("energy", f"{energy['total'] / 1e3:.1f} kJ ({causes})")
-    left = "  ".join(
-        f"{i}: {_percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["drones"].items()
-    )
+    left = "  ".join(f"{i}: {percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["drones"].items())
     table.add_row("charge left", left)
     if result["descriptor_drops"]:
         table.add_row("descriptors refused", ", ".join(f"{n} {r}" for r, n in result["descriptor_drops"].items()))
@@ -125,14 +123,14 @@ def comparison_table(rows: Sequence[Compared]) -> Table:
         "data sent": lambda r: size(r.outcome["bytes"]["data_sent"]),
         "data delivered": lambda r: size(r.outcome["bytes"]["data_delivered"]),
         "  handshakes": lambda r: size(r.outcome["bytes"]["handshakes_sent"]),
-        "deadlines missed": lambda r: _percent(r.outcome["deadline_miss_rate"]),
-        "medium busy": lambda r: _percent(r.outcome["medium_busy_fraction"]),
+        "deadlines missed": lambda r: percent(r.outcome["deadline_miss_rate"]),
+        "medium busy": lambda r: percent(r.outcome["medium_busy_fraction"]),
         "context sent": lambda r: size(r.outcome["bytes"]["context_sent"]),
         "data age, median": lambda r: number(r.outcome["data_age_s"]["p50"], ".2f", "s"),
         "energy": lambda r: f"{r.outcome['energy_j']['total'] / 1e3:.2f} kJ",
         "  radio": lambda r: f"{r.outcome['energy_j']['radio'] / 1e3:.2f} kJ",
         "  compute": lambda r: f"{r.outcome['energy_j']['compute'] / 1e3:.2f} kJ",
-        "charge left, least": lambda r: _percent(min(r.outcome["battery"].values(), default=None)),
+        "charge left, least": lambda r: percent(min(r.outcome["battery"].values(), default=None)),
     }
     for name, figure in figures.items():
         table.add_row(name, *(figure(r) for r in rows))
@@ -154,7 +152,7 @@ def explanations(rows: Sequence[Compared]) -> Iterator[str]:
         if not total:
             yield f"[bold]{r.policy}[/bold]: sent nothing; every drone saw with its own eyes only"
             continue
-        parts = ", ".join(f"{_percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
+        parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
         age = r.outcome["data_age_s"]["p50"]
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
         yield f"[bold]{r.policy}[/bold]: {total} payloads, {parts}; {fused}"
@@ -166,7 +164,8 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for column in ("", "expected", "got", "because"):
         table.add_column(column)
     for v in verdicts:
-        table.add_row("[green]ok[/green]" if v.holds else "[red]FAILED[/red]", v.expected, v.got, v.because)
+        because = v.because + (f"\n[dim]the record: {v.why}[/dim]" if v.why else "")
+        table.add_row("[green]ok[/green]" if v.holds else "[red]FAILED[/red]", v.expected, v.got, because)
     return table
 
 

@@ -1,0 +1,28 @@
+"""`sortie report`: a run as one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim import rundir
+from sim.console import out
+
+PAGE = "report.html"
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    out_path: Annotated[
+        Path | None, typer.Option("--out", help="The page; left out, report.html in the run's folder.")
+    ] = None,
+) -> None:
+    """Write a run as one HTML page that needs nothing else: figures, outcome, and the decisions in words."""
+    from sim.report_page import save_page
+
+    record = rundir.load(run)
+    path = out_path or run / PAGE
+    save_page(record, path)
+    out.print(f"kept in [bold]{path}[/bold]", soft_wrap=True)

@@ -1,0 +1,144 @@
+"""The page of results: whole, well-formed, needing nothing else, and true to the outcome."""
+
+from __future__ import annotations
+
+import builtins
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sim_examples import example
+from typer.testing import CliRunner
+
+from sim import rundir
+from sim.cli import app
+from sim.folders import RunError
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.report_page import page, save_page
+from sim.sortie import run_sortie
+from sim.tables import size
+from sim.words import decision_in_words
+
+VOID = {"meta", "br", "link", "img"}
+
+
+class Page(HTMLParser):
+    """Holds a page's text, its elements, and whatever it would fetch; fails where elements do not close."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.count: dict[str, int] = {}
+        self.text: list[str] = []
+        self.rows: list[list[str]] = []
+        self.fetched: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.count[tag] = self.count.get(tag, 0) + 1
+        self.fetched += [v for k, v in attrs if k in ("src", "href", "xlink:href") and v and not v.startswith("#")]
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+        if "td" in self.open or "th" in self.open:
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def record() -> SortieRecord:
+    event = "events=[{kind: link_drop, at_s: 4, drone: 2, loss_db: 60}]"
+    return run_sortie(example("duration_s=6", event, "description='Cars & <houses>'"))
+
+
+@pytest.fixture(scope="module")
+def html(record: SortieRecord) -> str:
+    return page(record)
+
+
+@pytest.fixture(scope="module")
+def read(html: str) -> Page:
+    return Page(html)
+
+
+def test_the_page_stands_alone(read: Page, html: str) -> None:
+    assert read.fetched == []
+    assert "script" not in read.count
+    assert "@import" not in html
+    assert not re.search(r"url\((?!#)", html)
+    assert read.count["svg"] == 6  # no accuracy: there was no detector
+    assert len(html) < 1_000_000
+
+
+def test_text_of_users_is_text(read: Page, html: str) -> None:
+    assert "Cars & <houses>" in read.text
+    assert "<houses>" not in html
+
+
+def test_every_decision_and_event_is_there_in_order(read: Page, record: SortieRecord) -> None:
+    result = outcome(record)
+    expected = [(t["t_s"], decision_in_words(t)) for t in result["transitions"]]
+    expected.append((4.0, "drone 2: links of 2 lose 60 dB"))
+    rows = [row for row in read.rows if len(row) == 2 and row[0].endswith(" s")]
+    assert len(expected) > 5
+    assert rows == [[f"{t_s:.2f} s", text] for t_s, text in sorted(expected, key=lambda e: e[0])]
+
+
+def test_figures_of_the_outcome_are_the_page_s(read: Page, record: SortieRecord) -> None:
+    result = outcome(record)
+    assert size(result["bytes"]["data_delivered"]) in read.text
+    assert f"{result['energy_j']['total'] / 1e3:.1f} kJ" in read.text
+    assert any(result["fingerprint"] in text for text in read.text)
+    drones = [row for row in read.rows if re.fullmatch(r"drone \d", row[0])]
+    assert [row[1] for row in drones] == [f"{100 * d['soc']:.1f} %" for d in result["drones"].values()]
+
+
+def test_the_same_run_gives_the_same_page(html: str, record: SortieRecord) -> None:
+    assert page(record) == html
+
+
+def test_a_run_in_which_nothing_was_sent_has_a_page() -> None:
+    read = Page(page(run_sortie(example("duration_s=2", "fleet.drones=1"), "silence")))
+    assert "Nobody ever sent anything, and nothing happened to the fleet." in read.text
+
+
+def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
+    rundir.save(record, tmp_path / "run")
+    said = CliRunner().invoke(app, ["report", str(tmp_path / "run")])
+    assert said.exit_code == 0, said.output
+    assert (tmp_path / "run" / "report.html").read_text("utf-8") == page(record)
+    rundir.save(record, tmp_path / "run")  # a run with a report is a run still
+    elsewhere = tmp_path / "gone" / "page.html"
+    with pytest.raises(RunError, match=r"gone/page\.html"):
+        save_page(record, elsewhere)
+
+
+def test_without_matplotlib_it_is_said_how_to_get_it(record: SortieRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(RunError, match=r"^matplotlib is missing: pip install 'sortie-sim\[report\]'$"):
+        page(record)
