@@ -1,0 +1,57 @@
+"""Tiles, bursts, traces and relays in a whole sortie: what arrives is fused, what is cut off is told."""
+
+from __future__ import annotations
+
+import pyarrow.compute as pc
+import pytest
+from sim_examples import example
+
+from scenarios.load import load
+from sim.expect import check
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+LOSSY = ("policy.name=all-4", "policy.params={rho: 0.1}", "radio.retry_limit=0", "radio.bursts.loss_good=0.05")
+
+
+@pytest.fixture(scope="module")
+def tiled() -> SortieRecord:
+    return run_sortie(example(*LOSSY, "radio.framing=tiles", "perception.detector=surrogate"))
+
+
+def test_payloads_arrive_in_part_and_bytes_add_up(tiled: SortieRecord) -> None:
+    sent = tiled.tables["transmissions"]
+    partial = sent.filter(pc.equal(sent["status"], "partial"))
+    assert partial.num_rows > 0.5 * sent.num_rows
+    assert pc.all(pc.less(partial["arrived_bytes"], partial["payload_bytes"])).as_py()
+    assert set(partial["representation"].to_pylist()) == {"features"}
+    of = outcome(tiled)["bytes"]
+    assert of["data_sent"] == sum(of[f"data_{s}"] for s in ("delivered", "lost", "expired", "in_flight"))
+    assert of["data_delivered"] == pc.sum(sent["arrived_bytes"]).as_py() == tiled.totals["data_delivered_bytes"]
+    assert of["data_lost"] == tiled.totals["data_lost_bytes"]
+
+
+def test_parts_are_fused_where_samples_are_lost(tiled: SortieRecord) -> None:
+    whole = run_sortie(example(*LOSSY, "perception.detector=surrogate"))
+    held = [pc.sum(pc.list_value_length(r.tables["fusions"]["peers"])).as_py() for r in (tiled, whole)]
+    assert held[0] > 2 * held[1]
+    assert outcome(tiled)["ap50"]["full_scene"] > outcome(whole)["ap50"]["full_scene"]
+
+
+def test_the_topology_is_told_where_payloads_are_relayed() -> None:
+    cut = "events=[{kind: link_drop, at_s: 3, drone: 1, loss_db: 60}]"
+    record = run_sortie(example(cut, "radio.relay_max_hops=3"))
+    rows = record.tables["topology"].to_pylist()
+    assert [round(r["t_s"]) for r in rows] == list(range(6))
+    assert all(r["connected"] and r["cut_drones"] == [] and r["bottleneck_mbps"] > 20 for r in rows[:3])
+    assert all(not r["connected"] and r["cut_drones"] == [1] for r in rows[4:])
+    assert run_sortie(example()).tables["topology"].num_rows == 0
+
+
+def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:
+    scenario = load("paper_context", ["perception.detector=none"])
+    record = run_sortie(scenario)
+    checks = check(scenario, record, outcome(record))
+    assert [c for c in checks if not c.holds] == []
+    assert len(checks) == 7
