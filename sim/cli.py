@@ -196,15 +196,27 @@ def check(
 
 
 @app.command()
-def view(run: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
+def view(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    picture: Annotated[
+        Path | None, typer.Option(help="Save a picture of the viewer here and open none; needs no screen.")
+    ] = None,
+    at_s: Annotated[float, typer.Option("--at", help="The picture's simulated time, s.", min=0)] = 0.0,
+) -> None:
     """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
     from sim.playback import open_viewer, save_rrd
 
-    record = rundir.load(run)
     path = run / rundir.RECORDING
     if not path.is_file():
-        save_rrd(record, path)
-    open_viewer(path)
+        save_rrd(rundir.load(run), path)
+    if picture is None:
+        open_viewer(path)
+        return
+    from sim.playback_picture import take_picture
+
+    for complaint in take_picture(path, picture, at_s):
+        err.print(complaint, soft_wrap=True)
+    out.print(f"kept in [bold]{picture}[/bold]", soft_wrap=True)
 
 
 @app.command("list")

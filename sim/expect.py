@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +22,10 @@ class Verdict:
     got: str
     holds: bool
     because: str
+    metric: str = ""
+    """The metric that it is about; empty for decisions and golden outcomes."""
+    why: str = ""
+    """What the record says about it, where it does not hold."""
 
 
 def metric(result: dict[str, Any], dotted: str) -> Any:
@@ -47,45 +53,95 @@ def metric(result: dict[str, Any], dotted: str) -> Any:
     return value
 
 
-def check(scenario: Scenario, record: SortieRecord, result: dict[str, Any]) -> list[Verdict]:
-    """Every expectation of the scenario, in its order."""
+def check(
+    scenario: Scenario, record: SortieRecord, result: dict[str, Any], replications: Sequence[dict[str, Any]] = ()
+) -> list[Verdict]:
+    """Every expectation of the scenario, in its order.
+
+    Args:
+        record, result: of the sortie.
+        replications: outcomes of replications 0, 1, …, as many as the expectations ask for.
+    """
     return [
-        *(_check_metric(e, result) for e in scenario.expect),
+        *(
+            _check_metric(e, result) if e.replications is None else _check_mean(e, replications)
+            for e in scenario.expect
+        ),
         *(_check_decision(e, record) for e in scenario.expect_decisions),
     ]
 
 
-def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
-    name = expectation.metric
+def in_words(e: Expectation) -> str:
+    """`ap50.mission ≥ 0.6 with 95 % over 20`."""
     bounds = []
-    if expectation.equals is not None:
-        bounds.append(f"= {expectation.equals}")
-    if expectation.at_least is not None:
-        bounds.append(f"≥ {expectation.at_least:g}")
-    if expectation.at_most is not None:
-        bounds.append(f"≤ {expectation.at_most:g}")
-    expected = f"{name} {' and '.join(bounds)}"
+    if e.equals is not None:
+        bounds.append(f"= {e.equals}")
+    if e.at_least is not None:
+        bounds.append(f"≥ {e.at_least:g}")
+    if e.at_most is not None:
+        bounds.append(f"≤ {e.at_most:g}")
+    off = f" (± {e.tolerance:g})" if e.tolerance else ""
+    sure = "" if e.confidence is None else f" with {100 * e.confidence:g} % over {e.replications}"
+    return f"{e.metric} {' and '.join(bounds)}{off}{sure}"
+
+
+def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
+    name, slack = expectation.metric, expectation.tolerance
+    expected = in_words(expectation)
     try:
         got = metric(result, name)
     except KeyError as error:
-        return Verdict(expected, error.args[0], False, expectation.because)
+        return Verdict(expected, error.args[0], False, expectation.because, name)
     holds = True
     if expectation.equals is not None:
         holds = got == expectation.equals or (
             isinstance(got, int | float)
             and isinstance(expectation.equals, int | float)
-            and abs(got - expectation.equals) <= TOLERANCE
+            and abs(got - expectation.equals) <= max(TOLERANCE, slack)
         )
     if expectation.at_least is not None or expectation.at_most is not None:
         number = isinstance(got, int | float) and not isinstance(got, bool)
         holds = (
             holds
             and number
-            and (expectation.at_least is None or got >= expectation.at_least)
-            and (expectation.at_most is None or got <= expectation.at_most)
+            and (expectation.at_least is None or got >= expectation.at_least - slack)
+            and (expectation.at_most is None or got <= expectation.at_most + slack)
         )
     shown = f"{got:.6g}" if isinstance(got, float) else str(got)
-    return Verdict(expected, shown, holds, expectation.because)
+    return Verdict(expected, shown, holds, expectation.because, name)
+
+
+def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
+    """The mean over replications lies within each bound with the confidence asked for: Student's one-sided limit.
+
+    An expectation holds where the replications show it; one that they leave open fails, and more of them may settle it.
+    """
+    assert e.replications is not None and e.confidence is not None  # noqa: S101, PT018
+    expected, values = in_words(e), []
+    for i, result in enumerate(results[: e.replications]):
+        try:
+            value = metric(result, e.metric)
+        except KeyError as error:
+            return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric)
+        values.append(float(value))
+    if len(values) < e.replications:
+        return Verdict(expected, f"{len(values)} replications flown", False, e.because, e.metric)
+    mean, off = limit(values, e.confidence)
+    holds = (e.at_least is None or mean - off >= e.at_least - e.tolerance) and (
+        e.at_most is None or mean + off <= e.at_most + e.tolerance
+    )
+    return Verdict(expected, f"{mean:.6g} ± {off:.2g} over {len(values)}", holds, e.because, e.metric)
+
+
+def limit(values: Sequence[float], confidence: float) -> tuple[float, float]:
+    """The mean of n ≥ 2 values, and how far its one-sided confidence limit is from it: t(n − 1) s / √n."""
+    from scipy.special import stdtrit
+
+    n, mean = len(values), math.fsum(values) / len(values)
+    s = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1))
+    return mean, float(stdtrit(n - 1, confidence)) * s / math.sqrt(n)
 
 
 def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:
@@ -114,10 +170,10 @@ def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:
             and (e.roi is None or (r["roi_radius_m"] == r["roi_radius_m"]) == e.roi)  # NaN is no ROI
             and e.reason in r["reason"]
         ):
-            return Verdict(expected, _in_words(r), True, e.because)
-    got = "; ".join(_in_words(r) for r in rows[:3]) or "no decision"
+            return Verdict(expected, _row_in_words(r), True, e.because)
+    got = "; ".join(_row_in_words(r) for r in rows[:3]) or "no decision"
     return Verdict(expected, got, False, e.because)
 
 
-def _in_words(row: dict[str, Any]) -> str:
+def _row_in_words(row: dict[str, Any]) -> str:
     return f"{row['t_s']:.2f} s: {row['drone']} → {row['peer']} {describe(row)} ({row['reason']})"

@@ -1,0 +1,101 @@
+"""Fly a scenario as often as its expectations ask for, and hold what comes out against them. For command line and pytest."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from scenarios.load import library, load
+from scenarios.schema import Scenario
+from sim.expect import Verdict, check
+from sim.golden import golden_path, moved, write_golden
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+from sim.why import why
+
+SHOWN = 4
+"""Moved golden figures that a verdict names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A scenario's verdicts, golden outcome included, each failed one with its reason from the record."""
+
+    scenario: Scenario
+    verdicts: tuple[Verdict, ...]
+    replay: str
+    """The command that shows the sortie."""
+
+    @property
+    def failed(self) -> list[Verdict]:
+        return [v for v in self.verdicts if not v.holds]
+
+
+def check_scenario(
+    path_or_name: str,
+    overrides: Sequence[str] = (),
+    *,
+    update: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Checked:
+    """Fly a scenario and its replications, and check them.
+
+    Args:
+        path_or_name: a file, or a library scenario's name.
+        update: write the golden outcome anew instead of comparing.
+        progress: called with simulated seconds over all replications.
+
+    Raises:
+        ScenarioError, PolicyError, RunError: what is wrong with the scenario, its policy or its golden outcome.
+    """
+    scenario = load(path_or_name, overrides)
+    record = run_sortie(scenario, progress=progress)
+    result = outcome(record)
+    results = [result, *_more(scenario, progress)]
+    verdicts = [_explained(v, record, result) for v in check(scenario, record, result, results)]
+    golden = golden_path(library().get(path_or_name, Path(path_or_name)))
+    if update:
+        write_golden(golden, result)
+    elif golden.is_file() and not overrides:
+        verdicts.append(_golden(golden, result))
+    return Checked(scenario, tuple(verdicts), _replay(path_or_name, overrides))
+
+
+def flights(scenario: Scenario) -> int:
+    """Sorties that its expectations ask for."""
+    return max([1, *(e.replications for e in scenario.expect if e.replications is not None)])
+
+
+def _more(scenario: Scenario, progress: Callable[[float], None] | None) -> list[dict[str, Any]]:
+    found = []
+    for replication in range(1, flights(scenario)):
+        begin_s = replication * scenario.duration_s
+        watch = None if progress is None else (lambda t_s, b=begin_s: progress(b + t_s))
+        found.append(outcome(run_sortie(scenario, replication=replication, progress=watch)))
+    return found
+
+
+def _explained(verdict: Verdict, record: SortieRecord, result: dict[str, Any]) -> Verdict:
+    if verdict.holds or not verdict.metric:
+        return verdict
+    return replace(verdict, why=why(verdict.metric, record, result))
+
+
+def _golden(path: Path, result: dict[str, Any]) -> Verdict:
+    found = moved(path, result)
+    shown = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(found.items())[:SHOWN])
+    more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    got = f"{len(found)} moved: {shown}{more}" if found else "the same"
+    return Verdict(f"the outcome in {path.name}", got, not found, "renew it with --update where it was meant to move")
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _replay(path_or_name: str, overrides: Sequence[str]) -> str:
+    return shlex.join(["sortie", "fly", path_or_name, *(x for o in overrides for x in ("--set", o)), "--view"])

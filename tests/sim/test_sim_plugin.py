@@ -1,0 +1,175 @@
+"""Outcomes as regression tests: expectations over replications, golden outcomes, and the pytest plugin in a new project."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from sim_examples import BASE, example
+
+from scenarios.load import load
+from sim.checking import check_scenario
+from sim.expect import check, limit
+from sim.folders import RunError
+from sim.golden import golden_path, moved, write_golden
+from sim.outcome import outcome
+from sim.sortie import run_sortie
+
+SHORT = BASE.replace("duration_s: 6", "duration_s: 1").replace("at_s: 3", "at_s: 0.5")
+EXPECT = """
+expect:
+  - {metric: deadline_miss_rate, at_most: 0.5, because: little is sent}
+  - {metric: bytes.data_sent, at_least: 1.0e12, because: it cannot}
+"""
+
+
+def test_the_limit_is_students() -> None:
+    values = np.random.default_rng(1).normal(3, 2, 12)
+    mean, off = limit(values.tolist(), 0.95)
+    low = stats.ttest_1samp(values, 0, alternative="greater").confidence_interval(0.95).low
+    assert mean == pytest.approx(values.mean())
+    assert mean - off == pytest.approx(low)
+
+
+@pytest.mark.slow
+def test_a_mean_at_its_bound_is_called_shown_as_seldom_as_asked() -> None:
+    """With a true mean of 0 the expectation `≥ 0 with 90 %` is wrongly called held in 10 % of cases, within 3 σ."""
+    rng, cases = np.random.default_rng(2), 4000
+    held = sum(m - off >= 0 for m, off in (limit(rng.normal(0, 1, 8).tolist(), 0.9) for _ in range(cases)))
+    assert abs(held / cases - 0.1) < 3 * math.sqrt(0.09 / cases)
+
+
+@pytest.mark.parametrize(
+    ("values", "holds"),
+    [((5.0, 5.0, 5.0), True), ((5.1, 5.3, 5.5), True), ((4.6, 5.2, 5.8), False), ((4.9, 5.0, 5.1), False)],
+)
+def test_an_expectation_over_replications(values: tuple[float, ...], holds: bool) -> None:
+    scenario = example("duration_s=4", "expect=[{metric: m, at_least: 5, replications: 3, confidence: 0.9}]")
+    record = run_sortie(example("duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]"))
+    (verdict,) = check(scenario, record, {}, [{"m": v} for v in values])
+    assert verdict.expected == "m ≥ 5 with 90 % over 3"
+    assert verdict.holds is holds
+
+
+@pytest.mark.parametrize(("metric", "got"), [("m", "replication 1: None, no number"), ("n", "replication 0: n: ")])
+def test_a_replication_without_the_metric_fails_it(metric: str, got: str) -> None:
+    scenario = example(f"expect=[{{metric: {metric}, at_least: 5, replications: 2, confidence: 0.9}}]")
+    record = run_sortie(example("duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]"))
+    (verdict,) = check(scenario, record, {}, [{"m": 6.0}, {"m": None}])
+    assert not verdict.holds
+    assert verdict.got.startswith(got)
+
+
+@pytest.mark.parametrize(
+    ("expectation", "holds"),
+    [
+        ("at_least: 5.2, tolerance: 0.3", True),
+        ("at_least: 5.4, tolerance: 0.3", False),
+        ("at_most: 4.8, tolerance: 0.3", True),
+        ("at_most: 4.8, tolerance: 0.1", False),
+        ("equals: 4.9, tolerance: 0.2", True),
+        ("equals: 4.9, tolerance: 0.05", False),
+    ],
+)
+def test_tolerances(expectation: str, holds: bool) -> None:
+    scenario = example(f"expect=[{{metric: m, {expectation}}}]")
+    record = run_sortie(example("duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]"))
+    assert [v.holds for v in check(scenario, record, {"m": 5.0})] == [holds]
+
+
+def test_a_failure_tells_why_and_how_to_see_it(tmp_path: Path) -> None:
+    path = tmp_path / "short one.yaml"
+    path.write_text(SHORT + EXPECT)
+    checked = check_scenario(str(path))
+    assert [v.holds for v in checked.verdicts] == [True, False]
+    (failed,) = checked.failed
+    assert "payloads: " in failed.why
+    assert "decided because of " in failed.why
+    assert checked.replay == f"sortie fly '{path}' --view"
+
+
+def test_replications_are_flown_once_each(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT + "expect:\n  - {metric: energy_j.total, at_least: 1, replications: 2, confidence: 0.9}\n")
+    (verdict,) = check_scenario(str(path)).verdicts
+    each = [outcome(run_sortie(load(path), replication=r))["energy_j"]["total"] for r in (0, 1)]
+    assert each[0] != each[1]
+    assert verdict.got.startswith(f"{sum(each) / 2:.6g} ± ")
+
+
+def test_a_golden_outcome_is_compared_and_only_renewed_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    golden = golden_path(path)
+    assert check_scenario(str(path)).verdicts == ()
+    assert not golden.exists()
+    check_scenario(str(path), update=True)
+    assert [v.holds for v in check_scenario(str(path)).verdicts] == [True]
+    path.write_text(SHORT.replace("rho: 0.25", "rho: 0.2"))
+    before = golden.read_text()
+    (verdict,) = check_scenario(str(path)).verdicts
+    assert not verdict.holds
+    assert "transitions." in verdict.got
+    assert golden.read_text() == before
+    check_scenario(str(path), update=True)
+    assert golden.read_text() != before
+
+
+def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
+    path = tmp_path / "x.golden.json"
+    result = {"a": 1.0, "b": {"c": [1, "x", None]}, "wall_s": 3.0}
+    write_golden(path, result)
+    assert moved(path, {**result, "wall_s": 4.0}) == {}
+    assert moved(path, {**result, "a": 1.0000001}) == {}
+    assert moved(path, {**result, "a": 1.00001}) == {"a": (1.0, 1.00001)}
+    assert moved(path, {"a": 1.0, "b": {"c": [1, "y"]}, "d": 2}) == {
+        "b.c.1": ("x", "y"),
+        "b.c.2": (None, "nothing"),
+        "d": ("nothing", 2),
+    }
+    text = json.loads(path.read_text())
+    text["tolerance"]["relative"] = 0.01
+    path.write_text(json.dumps(text))
+    assert moved(path, {**result, "a": 1.001}) == {}
+    write_golden(path, {**result, "a": 2.0})
+    assert json.loads(path.read_text())["tolerance"]["relative"] == 0.01
+    path.write_text("{}")
+    with pytest.raises(RunError, match=r"x.golden.json: no golden outcome: 'tolerance'"):
+        moved(path, result)
+
+
+def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:
+    """A user's project: pytest, the installed package, scenario files, one of them broken, and YAML of others."""
+    (tmp_path / "good.yaml").write_text(SHORT + EXPECT.splitlines()[1] + "\n" + EXPECT.splitlines()[2] + "\n")
+    (tmp_path / "compose.yaml").write_text("services: {web: {image: x}}\nexpect: 3\n")
+    assert _pytest(tmp_path) == (0, ["1 passed"])
+    (tmp_path / "bad.yaml").write_text(SHORT + EXPECT)
+    code, lines = _pytest(tmp_path)
+    assert code == 1
+    assert lines[-1] == "1 failed, 2 passed"
+    text = "\n".join(lines)
+    assert "  expected  bytes.data_sent ≥ 1e+12\n" in text
+    assert "       got  " in text
+    assert "   because  it cannot\n" in text
+    assert "the record  payloads: " in text
+    assert "    see it  sortie fly " in text
+    (tmp_path / "bad.yaml").write_text(SHORT.replace("duration_s", "duration") + EXPECT)
+    code, lines = _pytest(tmp_path)
+    assert code == 2
+    assert any("bad.yaml:3: duration: unknown key, did you mean duration_s?" in line for line in lines)
+
+
+def _pytest(folder: Path) -> tuple[int, list[str]]:
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "--color=no", "-p", "no:cacheprovider", "--rootdir", str(folder), str(folder)],
+        capture_output=True, text=True, cwd=folder,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    last = [line.partition(" in ")[0].strip("= ") for line in lines[-1:]]
+    return done.returncode, last if done.returncode == 0 else lines[:-1] + last
