@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from math import inf
 
 from radio.airtime import frame_bytes, group_frame_s
@@ -18,7 +18,7 @@ MAX_GROUP_PAYLOAD_BYTES = 2200
 
 _GROUP_OVERHEAD_BYTES = frame_bytes(0, unicast=False)
 
-OnHeard = Callable[[list[int]], None]
+OnHeard = Callable[[Sequence[int]], None]
 
 
 class Broadcast(GroupFrame):
@@ -67,7 +67,8 @@ class Broadcasts:
         self.phase_s = [
             float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
         ]
-        self._heard_frame = [(-1, 0)] * n
+        self._heard_in = [-1] * n  # the last frame in which each drone was on the air
+        self._heard_times = [0] * n  # how often in that frame before
 
     def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
         """One more frame of a drone, its luck drawn; arguments and errors as for `Air.broadcast`."""
@@ -96,15 +97,17 @@ class Broadcasts:
             counters.missed += living
             frame.on_heard([])
             return
-        index = self._channel.frame
-        seen, times = self._heard_frame[sender]
-        times = times + 1 if seen == index else 0
-        self._heard_frame[sender] = (index, times)
+        index, times = self._channel.frame, 0
+        if self._heard_in[sender] == index:
+            times = self._heard_times[sender] = self._heard_times[sender] + 1
+        else:
+            self._heard_in[sender], self._heard_times[sender] = index, 0
         heard = self._channel.heard(sender, frame.mpdu_bytes, times)
         if self._overrides is not None:
             heard = self._overrides.heard(sender, heard, frame.mpdu_bytes, times)
         if gone:
             heard = [i for i in heard if i not in gone]
-        counters.receptions += len(heard)
-        counters.missed += living - len(heard)
+        count = len(heard)
+        counters.receptions += count
+        counters.missed += living - count
         frame.on_heard(heard)

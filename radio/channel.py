@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log10
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from radio.antenna import antenna_loss_db
 from radio.crowd import EPOCH, Crowd
 from radio.draws import StreamDraws, fade_table_db
-from radio.links import Links, all_links
+from radio.links import IntArray, Links, all_links
 from radio.pathloss import path_loss_db, range_m
 from radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
 from radio.shadowing import ShadowField
@@ -33,6 +33,8 @@ SQUARE = 32
 """Fleets of up to so many drones work out every link; larger ones those within earshot."""
 OUT_OF_RANGE_DB = -100.0
 """SNR that is told of a link out of earshot."""
+SAFE_DB = 5.0
+"""Above s50 by this, fewer than one group frame in 10^12 is lost: for large fleets, none."""
 _EARSHOT_SIGMA = 5.0
 _BLOCK_NUMBERS = 1 << 18
 
@@ -159,11 +161,10 @@ class Channel:
         self._shadow_db: AnyFloats
         self._fades_db: AnyFloats
         self._luck: AnyFloats
-        self._reach_at_1: AnyFloats
         self._reach_bytes: AnyFloats
         # who hears whom in this frame, if every frame is of this length
         self._heard_bytes = -1
-        self._heard_ids: list[int] = []
+        self._heard_ids: Sequence[int] = []
         self._heard_from: list[int] = []
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
@@ -195,7 +196,8 @@ class Channel:
                 snr -= extra[links.sender, links.receiver]
             if jammers:
                 snr -= self.noise_rise_db(jammers)[links.receiver]
-            self.reach_bytes = self._reach(snr + self._fades_db[row], self._reach_at_1[row])
+            fades_db, luck = self._chance(row)
+            self.reach_bytes = self._reach(snr + fades_db, luck)
         self.before = self.now if self.frame else FrameLinks(links, snr)
         self.now = FrameLinks(links, snr)
 
@@ -207,7 +209,7 @@ class Channel:
     @property
     def fade_db(self) -> FloatArray:
         """[N, N] of this frame."""
-        return self.links.square(self._fades_db[self.frame % self._block], np.nan)
+        return self.links.square(self._chance(self.frame % self._block)[0], np.nan)
 
     @property
     def shadow_db(self) -> FloatArray:
@@ -219,8 +221,8 @@ class Channel:
         """[N, N] of this frame."""
         return self.links.square(self.reach_bytes, 0.0)
 
-    def heard(self, sender: int, length_bytes: int, times: int = 0) -> list[int]:
-        """Who receives a group-addressed frame, ascending.
+    def heard(self, sender: int, length_bytes: int, times: int = 0) -> Sequence[int]:
+        """Who receives a group-addressed frame, ascending; an array of integers in large fleets, else a list.
 
         Args:
             sender: whose frame.
@@ -230,19 +232,21 @@ class Channel:
         """
         links = self.links
         if times:
-            row, mine = self.frame % self._block, links.by_sender[links.begin[sender] : links.begin[sender + 1]]
-            luck = (self._luck[row, mine] + times * 0.6180339887498949) % 1.0
-            reach = self._reach(self.now.snr_db[mine] + self._fades_db[row, mine], _reach_at_1(luck))
-            again: list[int] = links.receiver[mine[reach >= length_bytes]].tolist()
-            return again
+            mine = links.by_sender[links.begin[sender] : links.begin[sender + 1]]
+            fades_db, luck = self._chance(self.frame % self._block, mine)
+            luck = (luck + times * 0.6180339887498949) % 1.0
+            reach = self._reach(self.now.snr_db[mine] + fades_db, luck)
+            again = links.receiver[mine[reach >= length_bytes]]
+            return cast(Sequence[int], again if self._crowd else again.tolist())
         if self._heard_bytes != length_bytes:  # most frames of a moment have one length: look at all links together
             through = (self.reach_bytes >= length_bytes)[links.by_sender]
-            self._heard_ids = links.receiver[links.by_sender[through]].tolist()
+            ids = links.receiver[links.by_sender[through]]
+            self._heard_ids = cast(Sequence[int], ids if self._crowd else ids.tolist())
             self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
             self._heard_bytes = length_bytes
         return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
 
-    def _reach(self, faded_db: AnyFloats, reach_at_1: AnyFloats) -> AnyFloats:
+    def _reach(self, faded_db: AnyFloats, luck: AnyFloats) -> AnyFloats:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
         x = faded_db + (self._group_gain_db - self._group_s50_db)
         x *= -self._group_slope
@@ -250,7 +254,7 @@ class Channel:
         np.minimum(x, 80.0 if is_single else 700.0, out=x)  # keeps the exponential finite
         minus_log_s: AnyFloats = np.log1p(np.exp(x, out=x), out=x)
         np.maximum(minus_log_s, 1e-30 if is_single else 1e-300, out=minus_log_s)
-        minus_log_s = np.divide(reach_at_1, minus_log_s, out=minus_log_s)
+        minus_log_s = np.divide(_reach_at_1(luck), minus_log_s, out=minus_log_s)
         return minus_log_s
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
@@ -275,18 +279,32 @@ class Channel:
         c, p = self.config, self._positions_m[self.frame : self.frame + self._block]
         up = None if self._up is None else self._up[self.frame : self.frame + self._block]
         if self._crowd is not None:
-            self.links, gain_db, self._shadow_db, self._fades_db, self._luck = self._crowd.block(self.frame, p, up)
+            self.links, gain_db, self._shadow_db = self._crowd.block(self.frame, p, up)
             self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
-        else:
-            loss_db = self._loss_db(p, up)
-            drawn = self._draws.block(self._block, len(p))
-            self._shadow_db, self._fades_db, self._luck = (x.reshape(len(p), -1) for x in drawn)
-            if self._field is not None:
-                at = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
-                self._shadow_db = np.stack(at).reshape(len(p), -1)
-            self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
-        self._reach_at_1 = _reach_at_1(self._luck)
-        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._reach_at_1)
+            safe_db = self._group_s50_db - self._group_gain_db + SAFE_DB - float(fade_table_db(c.rician_k_db)[0])
+            risky = np.flatnonzero(self._snr_db.min(axis=0) < safe_db)
+            fades_db, luck = self._crowd.chance(0, len(p), risky)
+            self._reach_bytes = np.full_like(self._snr_db, np.inf)
+            self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, luck)
+            return
+        loss_db = self._loss_db(p, up)
+        drawn = self._draws.block(self._block, len(p))
+        self._shadow_db, self._fades_db, self._luck = (x.reshape(len(p), -1) for x in drawn)
+        if self._field is not None:
+            at = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
+            self._shadow_db = np.stack(at).reshape(len(p), -1)
+        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
+        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._luck)
+
+    def _chance(self, row: int, links: IntArray | None = None) -> tuple[AnyFloats, AnyFloats]:
+        """Fades in dB and luck of some links, or all, in a frame of the block."""
+        if self._crowd is not None:
+            which = np.arange(len(self.links.sender)) if links is None else links
+            fades_db, luck = self._crowd.chance(row, 1, which)
+            return fades_db[0], luck[0]
+        if links is None:
+            return self._fades_db[row], self._luck[row]
+        return self._fades_db[row, links], self._luck[row, links]
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""

@@ -1,6 +1,7 @@
 """A block of frames of a large fleet: the links within earshot and what is drawn for them, in single precision.
 
-The work grows with drones × neighbours; links out of earshot cost nothing. Links between the first drones keep the
+The work grows with drones × neighbours; links out of earshot cost nothing, and fades and luck are drawn for those
+links alone whose frames may be lost. Links between the first drones keep the
 numbers that they have in a small fleet, so that one more drone changes none of the others'.
 """
 
@@ -25,14 +26,13 @@ EPOCH = 32
 
 
 class Block(NamedTuple):
-    """Links, and [frames, L] of each."""
+    """What a block of frames begins with."""
 
     links: Links
     gain_db: Array
-    """Path, antennas and shadowing."""
+    """[frames, L]: path, antennas and shadowing."""
     shadow_db: Array
-    fades_db: Array
-    luck: Array
+    """[frames, L]."""
 
 
 class Crowd:
@@ -57,6 +57,12 @@ class Crowd:
         self._fades = fade_table_db(config.rician_k_db)
         self._frame_s = frame_s
         self._keep = keep(frame_s, config.shadowing_time_s)
+        # the block
+        self._frame = self._pairs = self._early_count = 0
+        self._link_keys = self._keys[:0]
+        self._early_fades_db: Array
+        self._early_luck: Array
+        # where the shadowing stood at the end of the one before
         self._last_pairs: IntArray = np.empty(0, np.int64)
         self._last_db: Array = np.empty(0, np.float32)
 
@@ -68,12 +74,37 @@ class Crowd:
         if self._config.antenna != "isotropic":
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
         links = both_ways(self._n, low, high)
-        bits = numbers(link_keys(self._keys, links.sender, links.receiver), frame, len(p))
-        luck, fades_db = uniforms(bits), np.take(self._fades, levels(bits, 0))
-        shadow_db = self._shadowing(frame, positions_m, low, high, bits[:, : len(low)])
-        self._draw_early(low, high, len(p), luck, fades_db, shadow_db)
+        self._frame, self._pairs = frame, len(low)
+        self._link_keys = link_keys(self._keys, links.sender, links.receiver)
+        self._early_count = early = int(np.searchsorted(high, self._n_early))
+        n = self._n_early
+        places = np.concatenate([low[:early] * n + high[:early], high[:early] * n + low[:early]])
+        early_shadow_db, *chance = (x.reshape(len(p), -1) for x in self._early.block(EPOCH, len(p)))
+        self._early_fades_db, self._early_luck = (np.take(x, places, axis=1) for x in chance)
+        shadow_db: Array
+        if self._field is not None:
+            at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
+            shadow_db = np.stack([square[low, high] for square in at])
+        else:
+            shadow_db = self._shadowing(low, high, len(p))
+            shadow_db[:, :early] = np.take(early_shadow_db, places[:early], axis=1)
         gain_db = shadow_db - loss_db
-        return Block(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2), fades_db, luck)
+        return Block(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
+
+    def chance(self, first: int, frames: int, links: IntArray) -> tuple[Array, Array]:
+        """Fades in dB and luck, [frames, L'], of some links in the block's frames from `first` on."""
+        bits = numbers(self._link_keys[links], self._frame + first, frames)
+        fades_db, luck = np.take(self._fades, levels(bits, 0)), uniforms(bits)
+        # the first drones' own numbers in their places; their pairs are the first ones
+        back = links >= self._pairs
+        pair = np.where(back, links - self._pairs, links)
+        early = np.flatnonzero(pair < self._early_count)
+        if len(early):
+            there = pair[early] + self._early_count * back[early]
+            rows = slice(first, first + frames)
+            fades_db[:, early] = np.take(self._early_fades_db[rows], there, axis=1)
+            luck[:, early] = np.take(self._early_luck[rows], there, axis=1)
+        return fades_db, luck
 
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
@@ -82,31 +113,15 @@ class Crowd:
         ends = (np.einsum("tpk,tpk->tp", along, up[:, end]) for end in (low, high))
         return np.asarray(sum(antenna_loss_db(self._config.antenna, cosine) for cosine in ends))
 
-    def _shadowing(self, frame: int, positions_m: Array, low: IntArray, high: IntArray, bits: Any) -> Array:
-        """[frames, P] dB; a pair that has come into earshot begins anew."""
-        if self._field is not None:
-            at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
-            return np.stack([square[low, high] for square in at])
+    def _shadowing(self, low: IntArray, high: IntArray, flown: int) -> Array:
+        """[flown, P] dB; a pair that has come into earshot begins anew."""
         pairs = (high << 32) + low  # rising, and independent of how many drones there are
         begin_db = np.full(len(pairs), np.nan, np.float32)
         if len(self._last_pairs):
             where = np.minimum(np.searchsorted(self._last_pairs, pairs), len(self._last_pairs) - 1)
             known = self._last_pairs[where] == pairs
             begin_db[known] = self._last_db[where[known]]
-        z = np.take(normal_table(), levels(bits, 1))
+        z = np.take(normal_table(), levels(numbers(self._link_keys[: len(low)], self._frame, flown), 1))
         shadow_db = gauss_markov(z, self._config.shadowing_sigma_db, self._keep, begin_db)
-        self._last_pairs, self._last_db = pairs, shadow_db[-1]
+        self._last_pairs, self._last_db = pairs, shadow_db[-1].copy()
         return shadow_db
-
-    def _draw_early(
-        self, low: IntArray, high: IntArray, flown: int, luck: Array, fades_db: Array, shadow_db: Array
-    ) -> None:
-        """Put the first drones' own numbers in their places; their pairs are the first ones."""
-        count, n = int(np.searchsorted(high, self._n_early)), self._n_early
-        there, back = low[:count] * n + high[:count], high[:count] * n + low[:count]
-        drawn = [x.reshape(flown, -1) for x in self._early.block(EPOCH, flown)]
-        for mine, theirs in ((luck, drawn[2]), (fades_db, drawn[1])):
-            mine[:, :count] = np.take(theirs, there, axis=1)
-            mine[:, len(low) : len(low) + count] = np.take(theirs, back, axis=1)
-        if self._field is None:
-            shadow_db[:, :count] = np.take(drawn[0], there, axis=1)

@@ -372,10 +372,16 @@ class Medium(Generic[J, F]):
             return
         self._context_timer = None
         now, fire = self.sync(), self._context_fire_s
-        sent, self._waiting = self._waiting, []
-        if len(sent) > 1:
-            self._waiting = [f for f in sent if f.fire_s > fire + SLOT_S / 2]
-            sent = [f for f in sent if f.fire_s <= fire + SLOT_S / 2]
+        sent = self._waiting
+        if len(sent) == 1:
+            self._waiting = []
+            self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
+            (frame,) = sent
+            self.transmit_s[frame.sender] += frame.airtime_s
+            self._on_group_end(frame, False)
+            return
+        self._waiting = [f for f in sent if f.fire_s > fire + SLOT_S / 2]
+        sent = [f for f in sent if f.fire_s <= fire + SLOT_S / 2]
         for f in self._waiting:
             if f.fire_s < inf:  # it had counted down to the moment the winner sent
                 f.slots = max(1, round((f.fire_s - fire) / SLOT_S))

@@ -198,7 +198,7 @@ def test_a_large_fleet_works_out_just_the_links_within_earshot() -> None:
         assert 0.02 < near.mean() < 0.5
         if frame % 10 == 0:
             for i in range(0, 120, 13):
-                heard = channel.heard(i, 268)
+                heard = list(channel.heard(i, 268))
                 assert heard == sorted(heard)
                 assert near[i, heard].all()
         np.testing.assert_allclose(channel.shadow_db, channel.shadow_db.T, equal_nan=True)
