@@ -112,31 +112,30 @@ class FleetBatteries:
         landing_soc, falls below cutoff_cell_v, or empties, lands at the step's end.
         """
         config, left, soc, landed = self._config, self.energy_left_j, self.soc, self.landed
+        full_j, pack_ohm, pack_cells, traces = self._full_j, self._resistance_ohm, self.cells, self._traces
+        voltage_v, current_a_, polarised_v = self.voltage_v, self.current_a, self._polarised_v
         rotor_j, avionics_j, compute_j = self.energy_j["rotor"], self.energy_j["avionics"], self.energy_j["compute"]
         radio_j, ohmic_j = self.energy_j["radio"], self.energy_j["ohmic"]
         efficiency, avionics = config.drivetrain_efficiency, config.avionics_w
         idle, active = config.compute_idle_w, config.compute_active_w - config.compute_idle_w
         listen, send = config.radio_idle_w, config.radio_tx_w - config.radio_idle_w
-        thermal = config.ambient_c is not None
-        polarises = config.polarisation_mohm > 0
-        fades = math.exp(-dt_s / config.polarisation_time_s)
+        landing_soc, cutoff_cell_v = config.landing_soc, config.cutoff_cell_v
+        thermal, polarises, warmth = config.ambient_c is not None, config.polarisation_mohm > 0, 1.0
         self._now_s += dt_s
         for i, down in enumerate(landed):
             if down:
                 continue
-            if i in self._traces:
+            if traces and i in traces:
                 self._follow(i, dt_s)
                 continue
-            at = left[i] / self._full_j[i] * STEPS
+            full, cells, resistance = full_j[i], pack_cells[i], pack_ohm[i]
+            at = left[i] / full * STEPS
             k = int(at)
-            cells = self.cells[i]
             ocv = cells * (CELL_TABLE[k] + (at - k) * (CELL_TABLE[k + 1] - CELL_TABLE[k]))
-            resistance = self._resistance_ohm[i]
-            warmth = 1.0
             if thermal:
                 warmth = resistance_factor(self.temperature_c[i])
                 resistance *= warmth
-            lag = cells * self._polarised_v[i]
+            lag = cells * polarised_v[i]
             rotor = rotor_w[i] / efficiency
             compute = idle + duty[i] * active
             radio = listen + airtime_share[i] * send
@@ -156,17 +155,16 @@ class FleetBatteries:
             radio_j[i] += radio * lasts_s
             ohmic_j[i] += ohmic * lasts_s
             left[i] -= spent
-            self.current_a[i] = current
-            self.voltage_v[i] = voltage = ocv - lag - current * resistance
-            if polarises:  # one RC element a cell, exact for a constant current
-                towards = current * config.polarisation_mohm / 1000.0 * self._worn[i] * warmth
-                self._polarised_v[i] = towards + (self._polarised_v[i] - towards) * fades
+            current_a_[i] = current
+            voltage_v[i] = voltage = ocv - lag - current * resistance
+            if polarises:
+                self._polarise(i, current * warmth, dt_s)
             if thermal:
                 self._warm(i, ohmic, dt_s)
-            at = left[i] / self._full_j[i] * STEPS
+            at = left[i] / full * STEPS
             k = int(at)
             soc[i] = SOC_TABLE[k] + (at - k) * (SOC_TABLE[k + 1] - SOC_TABLE[k])
-            if soc[i] <= config.landing_soc or voltage < config.cutoff_cell_v * cells:
+            if soc[i] <= landing_soc or voltage < cutoff_cell_v * cells:
                 self.land(i)
 
     def fault(self, drone: int, lost_fraction: float) -> None:
@@ -208,6 +206,14 @@ class FleetBatteries:
         lost = self.energy_left_j[drone] * fraction
         self.energy_left_j[drone] -= lost
         self.energy_j["fault"][drone] += lost
+
+    def _polarise(self, drone: int, current_a: float, dt_s: float) -> None:
+        """One RC element a cell, exact for a constant current; its resistance ages with the rest, and `current_a` has
+        the cold in it."""
+        config = self._config
+        towards_v = current_a * config.polarisation_mohm / 1000.0 * self._worn[drone]
+        fades = math.exp(-dt_s / config.polarisation_time_s)
+        self._polarised_v[drone] = towards_v + (self._polarised_v[drone] - towards_v) * fades
 
     def _warm(self, drone: int, lost_w: float, dt_s: float) -> None:
         """What the resistance takes warms the pack, the air cools it."""
