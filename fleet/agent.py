@@ -6,8 +6,9 @@ heard: it holds no other drone and no world. One SimPy process a drone, one wake
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
@@ -19,6 +20,7 @@ from fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from fleet.gate import Gate, Payload, make_payload
 from fleet.senses import Sensed
 from fleet.staleness import LinkHealth, cap_by_age, health
+from fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge
 from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from perception.types import Capture
 from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
@@ -53,6 +55,8 @@ class PlaneRules:
     compute_delay_s: float
     tile_limit_bytes: int | None = None
     """Features go as tiles of at most so many bytes; None: as one sample."""
+    trust: bool = False
+    """Whether peers' claims are judged (`fleet.trust`)."""
 
 
 class Received(NamedTuple):
@@ -63,6 +67,8 @@ class Received(NamedTuple):
     t_done_s: float
     missing: tuple[int, ...] = ()
     """Ranks (0 the best) of its feature cells that did not come, ascending."""
+    phy_mbps: float = math.inf
+    """The data rate at which its frames came."""
 
 
 class Senses(Protocol):
@@ -88,6 +94,7 @@ class AgentLog(Protocol):
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None: ...
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None: ...
+    def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None: ...
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
 
 
@@ -127,6 +134,8 @@ class Agent:
         self.policy = policy  # may be replaced while the sortie flies
         self.clock_skew_s = 0.0
         self.airborne = True
+        self.lies: dict[int, Callable[[Descriptor], Descriptor]] = {}
+        """What it says against the truth; scenario events put them here."""
         self.sensed = False  # whether perception ran in the current frame
         self.latest: Capture | None = None
         self.held: dict[int, Received] = {}
@@ -141,6 +150,10 @@ class Agent:
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, _Link] = {}
+        self._standings: dict[int, Standing] = {}
+        self._doubted: frozenset[int] = frozenset()
+        self._arrivals: dict[int, list[Arrival]] = {}
+        self._judged_every = max(1, round(JUDGED_EVERY_S / rules.period_s))
         self.gate = Gate()
         self.handshake_bytes = handshake_bytes  # goes with the policy
 
@@ -177,6 +190,11 @@ class Agent:
         """A peer's payload arrived; the freshest capture is kept, late ones do not replace newer ones."""
         peer = received.capture.drone
         held = self.held.get(peer)
+        if self._rules.trust:
+            took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
+            self._arrivals.setdefault(peer, []).append(
+                Arrival(0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps)
+            )
         if self.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
             self.held[peer] = received
 
@@ -191,6 +209,8 @@ class Agent:
     def _tick(self, frame: int) -> None:
         sensed = self._senses.sense(frame)
         self._hold(self._publish(sensed))
+        if self._rules.trust and frame % self._judged_every == 0:
+            self._judge()
         self._decide()
         duty = self.gate.duty_percent
         self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
@@ -223,11 +243,15 @@ class Agent:
             region=region,
             priority_target_ids=target_ids,
         )
-        payload = encode_descriptor(descriptor)
+        told = descriptor
+        for lie in self.lies.values():
+            told = lie(told)
+        payload = encode_descriptor(told)
         datagram = payload if self._sealer is None else self._sealer.seal(payload)
         self._modem.broadcast(datagram)
-        self._log.descriptor(self.env.now, descriptor, len(datagram))
-        return decode_descriptor(payload)
+        self._log.descriptor(self.env.now, told, len(datagram))
+        # a liar decides by what is true
+        return decode_descriptor(payload if told is descriptor else encode_descriptor(descriptor))
 
     def _ages_s(self) -> dict[int, float]:
         """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
@@ -235,10 +259,28 @@ class Agent:
         clock_s, heard_at_s = now_s + self.clock_skew_s, self._heard_at_s
         return {i: max(clock_s - d.stamp_ns * 1e-9, now_s - heard_at_s[i]) for i, d in self._known.items()}
 
+    def trust_in(self, peer: int) -> float:
+        """What this drone thinks of a peer, 0 … 1; payloads are fused with their weight times this."""
+        return self._standings.get(peer, UNJUDGED).trust
+
+    def _judge(self) -> None:
+        """Hold what peers claimed in the last second against what is known otherwise."""
+        now_s, before = self.env.now, self._standings
+        heard = {i: d for i, d in self._known.items() if now_s - self._heard_at_s[i] <= self._fresh_s}
+        self._standings = after = judge(before, self.drone, heard, self._arrivals)
+        self._arrivals = {}
+        self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
+        for peer in heard:
+            if after[peer].trust != before.get(peer, UNJUDGED).trust:
+                self._log.trust(now_s, self.drone, peer, after[peer])
+
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self.env.now, self.drone, self._links, self._fresh_s
         ages_s = self._ages_s()
-        view = FleetView(me, self._rules.period_s, dict(self._known), ages_s)
+        known = dict(self._known)
+        for doubted in self._doubted:
+            known[doubted] = discounted(known[doubted])
+        view = FleetView(me, self._rules.period_s, known, ages_s)
         begin_ns = time.perf_counter_ns()
         directives = self.policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns

@@ -327,6 +327,10 @@ class Context(Section):
         10.0, gt=0, le=1000, description="A descriptor older than this marks the peer detached."
     )
     authentication: bool = Field(True, description="HMAC-SHA256 and a replay counter on every descriptor (28 B).")
+    trust: bool = Field(
+        True,
+        description="Drones hold each other's claims against poses, arrivals and the fleet, and discount whom they doubt.",
+    )
 
 
 # --- perception ----------------------------------------------------------------------------------
@@ -513,8 +517,19 @@ class Spoof(_Event):
     rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
 
 
+class Lie(_Event):
+    kind: Literal["lie"]
+    drone: DroneId = Field(description="Who lies, in its own descriptors.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    about: Literal["coverage", "goodput", "battery"] = Field("coverage", description="What is false.")
+    claim: Literal["much", "little"] = Field(
+        "much",
+        description="All cells new, 500 Mb/s to everyone, a full battery; or nothing seen, 0.1 Mb/s, an empty one.",
+    )
+
+
 Event = Annotated[
-    LinkDrop | Jam | DroneLost | BatteryFault | CellFailure | ClockSkew | Spoof, Field(discriminator="kind")
+    LinkDrop | Jam | DroneLost | BatteryFault | CellFailure | ClockSkew | Spoof | Lie, Field(discriminator="kind")
 ]
 
 

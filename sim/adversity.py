@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Generator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import simpy
 
 from fleet.auth import TRAILER_BYTES, Sealer
+from fleet.lies import falsified
 from fleet.wire import decode_descriptor, encode_descriptor
-from scenarios.schema import BatteryFault, CellFailure, ClockSkew, DroneLost, Event, Jam, LinkDrop, Scenario, Spoof
+from scenarios.schema import BatteryFault, CellFailure, ClockSkew, DroneLost, Event, Jam, Lie, LinkDrop, Scenario, Spoof
 from scenarios.streams import stream
 from sim.ether import Ether
 from sim.world import World, at
@@ -77,6 +79,18 @@ class _Begin:
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
+            case Lie():
+                world.note(event.drone, "lie", f"claims {event.claim} {event.about}")
+                lie = partial(falsified, about=event.about, claim=event.claim)
+                world.agents[event.drone].lies[self.index] = lie
+                if event.until_s is not None:
+                    at(env, event.until_s, self._end_lie)
+
+    def _end_lie(self) -> None:
+        event = self.event
+        assert isinstance(event, Lie)  # noqa: S101
+        del self.world.agents[event.drone].lies[self.index]
+        self.world.note(event.drone, "lie_over", "tells the truth again")
 
     def _end_link_drop(self) -> None:
         event = self.event

@@ -6,6 +6,7 @@ receivers, and where a transmission number is joined again with the payload it s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -23,8 +24,11 @@ from sim.record import HANDSHAKE, REPRESENTATIONS, Recorder
 class Ether:
     """Joins every agent's modem to the one air."""
 
-    def __init__(self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None) -> None:
-        """Args: `keys` by key id, None where descriptors go unauthenticated."""
+    def __init__(
+        self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None, rates_mbps: Sequence[float]
+    ) -> None:
+        """Args: `keys` by key id, None where descriptors go unauthenticated; `rates_mbps` of the channel by MCS."""
+        self._rates_mbps = rates_mbps
         self.agents: Sequence[Agent] = ()
         self.air = air
         self.last_datagram: dict[int, bytes] = {}
@@ -88,7 +92,13 @@ class Ether:
         self._write(transmission, payload, capture)
         if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
             missing = cells_of(transmission.missing, payload.cells, payload.tile_cells)
-            self.agents[transmission.receiver].receive(Received(capture, payload, transmission.t_done_s, missing))
+            phy_mbps = self._phy_mbps(transmission.mcs)
+            self.agents[transmission.receiver].receive(
+                Received(capture, payload, transmission.t_done_s, missing, phy_mbps)
+            )
+
+    def _phy_mbps(self, mcs: int) -> float:
+        return self._rates_mbps[mcs] if 0 <= mcs < len(self._rates_mbps) else math.inf
 
     def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
         self._recorder.rows["transmissions"].append((transmission, payload, capture.t_s))

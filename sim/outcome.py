@@ -82,6 +82,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "switches": len(changes) / (links * minutes) if links else None,
         "transitions": changes,
         "phases": [_phase(record, both, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
+        "distrusted_by": _distrusted_by(tables["trust"]),
         "events": tables["events"].to_pylist(),
         "policy_eval_us": {
             "p50": record.wall.get("policy_eval_us_p50"),
@@ -180,6 +181,12 @@ def _percentiles(column: Any) -> dict[str, float | None]:
 
 def _counts(column: pa.ChunkedArray) -> dict[str, int]:
     return {str(v["values"]): int(v["counts"]) for v in pc.value_counts(column).to_pylist()}
+
+
+def _distrusted_by(trust: pa.Table) -> dict[str, int]:
+    """How many drones came to doubt each drone that anyone did."""
+    pairs = {(r["peer"], r["drone"]) for r in trust.to_pylist() if r["trust"] < 1.0}
+    return {str(peer): sum(p == peer for p, _ in pairs) for peer in sorted({p for p, _ in pairs})}
 
 
 def _miss_rate(sent: pa.Table) -> float | None:

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet.staleness import LinkHealth
+from fleet.trust import Standing
 from fleet.wire import DIRECTIVE_BYTES
 from policies.contract import Descriptor, Directive, Representation, TaskPhase
 from scenarios.schema import Scenario
@@ -82,6 +83,8 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     "energy": dict(drone=I, cause=S, energy_j=F),
     # what happened to the fleet: scenario events, landings
     "events": dict(t_s=F, drone=I, kind=S, text=S),
+    # one row a change of what a drone thinks of a peer (fleet.trust): 1 is undoubted
+    "trust": dict(t_s=F, drone=I, peer=I, trust=F, reason=S),
     # age of each peer's descriptor whenever a policy read it
     "ages": dict(t_s=F, drone=I, age_s=F),
 }  # fmt: skip
@@ -215,6 +218,10 @@ class AgentNotes:
                 self._deciding(enforced.source),
             )
         )  # fmt: skip
+
+    def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:
+        """A drone thinks otherwise of a peer than before."""
+        self._rows["trust"].append((t_s, drone, peer, standing.trust, standing.reason))
 
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
         """A policy decided, reading peers' descriptors of these ages."""

@@ -29,12 +29,12 @@ def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
     return math.floor(frame * share + 1e-9) > math.floor((frame - 1) * share + 1e-9)
 
 
-def as_share(received: Received) -> Share:
-    """A held payload as the detector takes it."""
+def as_share(received: Received, trust: float = 1.0) -> Share:
+    """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
     payload, roi = received.payload, received.payload.roi
     disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-    name = payload.representation.name.lower()
-    return Share(received.capture, name, payload.rho, disc, payload.fusion_weight, received.missing)
+    name, weight = payload.representation.name.lower(), payload.fusion_weight * trust
+    return Share(received.capture, name, payload.rho, disc, weight, received.missing)
 
 
 Moment = tuple[float, list[tuple[Capture, list[Share]]]]
@@ -77,7 +77,7 @@ class Scorer:
         egos = [a for a in self._agents if a.airborne and a.latest is not None]
         held = [self._fresh(a, now_s) for a in egos]
         jobs = [
-            (a.latest, [as_share(r) for r in received])
+            (a.latest, [as_share(r, a.trust_in(r.capture.drone)) for r in received])
             for a, received in zip(egos, held, strict=True)
             if a.latest is not None
         ]

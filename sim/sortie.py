@@ -24,6 +24,7 @@ from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
 from radio import Air
+from radio.rates import STANDARDS
 from scenarios.schema import Scenario
 from scenarios.streams import stream
 from sim.adversity import group_key, schedule
@@ -87,7 +88,7 @@ def run_sortie(
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
     name, flight_plan = _policy(scenario, policy)
-    n, config = scenario.fleet.drones, scenario.perception
+    n, config, air_of = scenario.fleet.drones, scenario.perception, scenario.radio
     env, recorder = simpy.Environment(), Recorder()
 
     motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
@@ -108,7 +109,7 @@ def run_sortie(
     plan = MissionPlan(scenario.mission)
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
     keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
-    ether = Ether(air, recorder, keys=keys)
+    ether = Ether(air, recorder, keys=keys, rates_mbps=STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz])
     detector = make_detector(scene, config, seed, replication)
 
     def count_boxes(capture: Capture, roi: Disc | None) -> int:
@@ -123,6 +124,7 @@ def run_sortie(
         dwell_s=scenario.policy.dwell_s,
         compute_delay_s=config.compute_delay_s,
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
+        trust=scenario.context.trust,
     )
     audit = Audit(env, recorder)
     pilots = [Pilot(i, flight_plan, audit) for i in range(n)]

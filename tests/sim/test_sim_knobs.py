@@ -27,6 +27,7 @@ NOT_KNOBS = ("name", "description", "expect", "expect_decisions")
 JAM = "events=[{kind: jam, at_s: 1, position_m: [0, 0, 60], power_dbm: 0, until_s: 4}]"
 DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"
 SPOOF = "events=[{kind: spoof, at_s: 1, drone: 1, until_s: 4}]"
+LIE = "events=[{kind: lie, at_s: 1, drone: 1, until_s: 4}]"
 LOST = "events=[{kind: drone_lost, at_s: 1, drone: 1}]"
 FAULT = "events=[{kind: battery_fault, at_s: 1, drone: 1, lost_fraction: 0.5}]"
 CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
@@ -152,6 +153,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "context.degraded_after_periods": ("5", (LOST, "policy.name=all-4", "policy.params={rho: 0.02}")),
     "context.detached_after_periods": ("15", (LOST,)),
     "context.authentication": ("false", ()),
+    "context.trust": ("false", (LIE,)),
     "perception.detector": ("torch", ("duration_s=4",)),
     "perception.compute_delay_s": ("0.05", ()),
     "policy.name": ("worst-2", ()),
@@ -180,6 +182,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "events.power_dbm": ("20", (JAM,)),
     "events.lost_fraction": ("0.2", (FAULT,)),
     "events.skew_s": ("-2", (SKEW,)),
+    "events.about": ("battery", (LIE,)),
+    "events.claim": ("little", (LIE,)),
     "events.attack": ("oversized", (SPOOF,)),
     "events.rate_hz": ("30", (SPOOF,)),
 }
@@ -266,7 +270,7 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     assert after.fingerprint != before.fingerprint
 
 
-@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LOST, FAULT, CELL, SKEW])
+@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, FAULT, CELL, SKEW])
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
     assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
 

@@ -1,0 +1,202 @@
+"""Trust in what peers claim: each claim is held against what the listener can check for itself.
+
+Coverage is held against the pose beside it (how far can it see from there, given how far others see from their
+heights), goodput against the payloads that arrived, and battery against the fleet's: in flight no charge comes back,
+and no drone flies for nothing. Doubts have to last: a judgement is made once a second, and only the second in a row
+that finds something lowers trust. Without a doubt trust is exactly 1.
+
+All of it is pure: `judge` takes what is known and gives what is thought of a peer next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.coverage import RANGE_M, unpack_grid
+from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
+
+JUDGED_EVERY_S = 1.0
+
+# --- coverage
+MISPLACED_M = COVERAGE_CELL_M * 2**0.5 + 1.0
+"""A grid stands for a second while its pose moves on, so that it may be read a cell off along both axes."""
+FALSE_CELLS = 4
+"""So many cells that cannot be so are a doubt."""
+
+# --- goodput
+LARGE_BYTES = 10_000
+"""Smaller payloads say too little about a link."""
+UNDERSTATED, OVERSTATED = 0.1, 1.5
+"""A claim is a doubt below the first times what was seen to arrive (an estimate rises by 0.3 of the gap at each
+sample), or above the second times the data rate at which it came: no link carries more than that."""
+
+# --- battery
+JUMP = 0.05
+"""A fall by so much within a second is a fault, or a lie that begins; either way the charge is watched anew."""
+RISE = 0.03
+"""Charge that may come back: estimators of real drones correct themselves by a few percent."""
+FALL, FALL_SHARE = 0.005, 0.1
+"""When the fleet's charge fell by so much in the median, who fell by less than this share of it is doubted: even a
+battery of ten times the others' capacity falls that far."""
+
+STRIKES_TO_DOUBT, MOST_STRIKES = 2, 6
+UNKNOWN_GRID = bytes(64)
+
+
+class Arrival(NamedTuple):
+    """A payload as its receiver saw it come in."""
+
+    size_bytes: int
+    took_s: float
+    """From its capture, compute delay taken off, to its last byte."""
+    phy_mbps: float
+    """The data rate of its frames, as its receiver's radio knows it; infinite where it does not."""
+
+    @property
+    def mbps(self) -> float:
+        """What the link carried at the least: waiting counts as transfer."""
+        return self.size_bytes * 8e-6 / max(self.took_s, 1e-4)
+
+
+class Standing(NamedTuple):
+    """What one drone thinks of another."""
+
+    strikes: int = 0
+    reason: str = ""
+    """The latest doubt."""
+    seconds: int = 0
+    """How often it was judged."""
+    first_soc: float = 0.0
+    """Its charge when it was first judged."""
+    least_soc: float = 1.0
+
+    @property
+    def trust(self) -> float:
+        """1 until a doubt was found twice in a row, then halved by each further one; 0 from the sixth."""
+        if self.strikes < STRIKES_TO_DOUBT:
+            return 1.0
+        return 0.0 if self.strikes >= MOST_STRIKES else 0.5 ** (self.strikes - STRIKES_TO_DOUBT + 1)
+
+
+UNJUDGED = Standing()
+
+
+def judge(
+    standings: Mapping[int, Standing],
+    ego: int,
+    known: Mapping[int, Descriptor],
+    arrivals: Mapping[int, Sequence[Arrival]],
+) -> dict[int, Standing]:
+    """What `ego` thinks of everyone after one more second.
+
+    Args:
+        standings: what it thought, itself included; empty at first.
+        known: the latest descriptor of every drone that it heard lately, and its own.
+        arrivals: payloads that reached it in this second, by sender.
+
+    Returns:
+        Standings of all in `known`, and of others unchanged: one strike more where a claim cannot be so, one less
+        where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
+    """
+    seen_per_metre = _metres_seen_per_metre_up(known)
+    before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
+    fell_per_s = {i: (s.first_soc - known[i].battery_soc) / s.seconds for i, s in before.items()}
+    after = dict(standings)
+    for peer, claim in known.items():
+        standing = before[peer]
+        others = [rate for i, rate in fell_per_s.items() if i != peer]
+        others_fell = median(others) * standing.seconds if others else 0.0
+        doubt = peer != ego and (
+            coverage_doubt(claim, seen_per_metre)
+            or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
+            or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell)
+        )
+        if doubt:
+            standing = standing._replace(strikes=min(standing.strikes + 1, MOST_STRIKES), reason=doubt)
+        else:
+            standing = standing._replace(strikes=max(standing.strikes - 1, 0))
+        after[peer] = standing._replace(least_soc=min(standing.least_soc, claim.battery_soc))
+    return after
+
+
+def _aged(standing: Standing, soc: float) -> Standing:
+    """The standing a second later; who is judged for the first time, or fell at once, begins with its charge."""
+    if standing.seconds == 0 or soc < standing.least_soc - JUMP:
+        return standing._replace(seconds=1, first_soc=soc, least_soc=soc)
+    return standing._replace(seconds=standing.seconds + 1)
+
+
+def discounted(d: Descriptor) -> Descriptor:
+    """A doubted drone's descriptor as policies get to read it: where it is, and nothing of what it says of itself."""
+    return d._replace(
+        coverage_grid=UNKNOWN_GRID, novelty_flags=0, battery_soc=0.0,
+        peer_goodput_mbps=(0.0,) * len(d.peer_goodput_mbps),
+    )  # fmt: skip
+
+
+# --- the three checks ----------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1024)  # a claim is judged by everyone who heard it
+def coverage_doubt(d: Descriptor, seen_per_metre: float) -> str:
+    """What a coverage grid says that its pose forbids; empty where it may be so.
+
+    Args:
+        d: the claim.
+        seen_per_metre: footprint radius over height, as the fleet's cameras have it.
+    """
+    x_m, y_m, z_m = d.position_m
+    radius_m = min(d.footprint_radius_m, max(0.0, z_m) * seen_per_metre * 1.1)
+    margin_m = MISPLACED_M + float(np.hypot(*d.velocity_mps[:2])) * 0.1
+    row, column = d.coverage_corner
+    along = np.arange(COVERAGE_CELLS) + 0.5
+    away_m = np.hypot((column + along) * COVERAGE_CELL_M - x_m, ((row + along) * COVERAGE_CELL_M - y_m)[:, None])
+    states = unpack_grid(d.coverage_grid)
+    well = states >= Coverage.WELL
+    too_far = int(np.count_nonzero(well & (away_m > radius_m + margin_m)))
+    if too_far >= FALSE_CELLS:
+        return f"coverage: {too_far} cells seen well beyond {radius_m + margin_m:.0f} m"
+    kept_back = (~well & (away_m < radius_m - margin_m)) | (
+        (states == Coverage.UNSEEN) & (away_m < RANGE_M - margin_m)
+    )  # fmt: skip
+    missing = int(np.count_nonzero(kept_back))
+    return f"coverage: {missing} cells unseen that it must see" if missing >= FALSE_CELLS else ""
+
+
+def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival]) -> str:
+    """What a goodput claim says against the payloads that came over the link; empty where it may be so."""
+    if not arrivals:
+        return ""
+    fastest_mbps = max(a.phy_mbps for a in arrivals)
+    if claimed_mbps > OVERSTATED * fastest_mbps:
+        return f"goodput: {claimed_mbps:.0f} Mb/s claimed, frames came at {fastest_mbps:.0f}"
+    rates = [a.mbps for a in arrivals if a.size_bytes >= LARGE_BYTES]
+    if rates and claimed_mbps < UNDERSTATED * median(rates):
+        return f"goodput: {claimed_mbps:.1f} Mb/s claimed, {median(rates):.0f} arrived"
+    return ""
+
+
+def battery_doubt(claimed_soc: float, least_soc: float, first_soc: float, others_fell: float) -> str:
+    """What a charge says against the past and the fleet's; empty where it may be so.
+
+    Args:
+        claimed_soc: the claim.
+        least_soc, first_soc: the least that it claimed before, and the first.
+        others_fell: by how much the fleet's charge fell since the first, in the median.
+    """
+    if claimed_soc > least_soc + RISE:
+        return f"battery: {claimed_soc:.0%} after {least_soc:.0%}"
+    fell = first_soc - claimed_soc
+    if others_fell >= FALL and fell < FALL_SHARE * others_fell:
+        return f"battery: fell by {fell:.1%} while the fleet's fell by {others_fell:.1%}"
+    return ""
+
+
+def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:
+    """Footprint radius over height, the median over the fleet, to a percent."""
+    return round(median([d.footprint_radius_m / max(d.position_m[2], 1.0) for d in known.values()]), 2)

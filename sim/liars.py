@@ -1,0 +1,124 @@
+"""What one liar costs, with and without trust, and whom trust doubts where nobody lies: `python -m sim.liars`.
+
+Each row flies the same sorties three times: everyone honest, one drone lying from the tenth second on, and the same
+with trust. AP is of the honest drones alone, from the moment of the lie, and scored by the surrogate detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from perception.ap import Matched
+from perception.harness.statistics import Difference, compare
+from scenarios.load import library, load
+from scenarios.schema import Scenario
+from sim.outcome import matched, outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+SCENARIO, LIAR, SINCE_S = "search_grid", 2, 10.0
+POLICIES = ("worked", "who2com", "deputies")
+LIES = (("coverage", "much"), ("coverage", "little"), ("goodput", "little"), ("battery", "much"))
+
+
+@dataclass(frozen=True, slots=True)
+class LiarRow:
+    """One policy and one lie; differences are in AP@0.5 of the honest drones, paired, by whole instants."""
+
+    policy: str
+    lie: str
+    untrusting: Difference
+    """Everyone honest (a), one liar and no trust (b)."""
+    trusting: Difference
+    """Everyone honest (a), one liar and trust (b)."""
+    doubting: int
+    """How many (sortie, drone) came to doubt the liar, of 4 a sortie."""
+    wronged: int
+    """How many came to doubt somebody else."""
+
+
+def measure(seeds: Sequence[int], duration_s: float, policies: Sequence[str] = POLICIES) -> Iterator[LiarRow]:
+    """One row a policy and lie."""
+    for policy in policies:
+        honest = {seed: _flown(policy, seed, duration_s, "true") for seed in seeds}
+        for about, claim in LIES:
+            lie = f"events=[{{kind: lie, at_s: {SINCE_S}, drone: {LIAR}, about: {about}, claim: {claim}}}]"
+            without, trusting = (
+                {seed: _flown(policy, seed, duration_s, trust, lie) for seed in seeds} for trust in ("false", "true")
+            )
+            doubts = [outcome(r)["distrusted_by"] for r in trusting.values()]
+            yield LiarRow(
+                policy,
+                f"{about}: {claim}",
+                _difference(honest, without),
+                _difference(honest, trusting),
+                sum(d.get(str(LIAR), 0) for d in doubts),
+                sum(n for d in doubts for peer, n in d.items() if peer != str(LIAR)),
+            )
+
+
+def false_alarms(seeds: Sequence[int], duration_s: float) -> tuple[int, int]:
+    """Doubts among honest drones over the library's scenarios, and drone-pair-minutes flown."""
+    alarms, minutes = 0, 0.0
+    for name in library():
+        for policy in POLICIES:
+            for seed in seeds:
+                scenario = load(name, ["perception.detector=none", f"duration_s={duration_s:g}", "events=[]"])
+                alarms += sum(outcome(run_sortie(scenario, policy, seed))["distrusted_by"].values())
+                minutes += scenario.fleet.drones * (scenario.fleet.drones - 1) * duration_s / 60
+    return alarms, round(minutes)
+
+
+def _flown(policy: str, seed: int, duration_s: float, trust: str, *more: str) -> SortieRecord:
+    settings = [f"duration_s={duration_s:g}", "perception.detector=surrogate", f"context.trust={trust}", *more]
+    return run_sortie(_scenario(settings), policy, seed)
+
+
+def _scenario(settings: Sequence[str]) -> Scenario:
+    return load(SCENARIO, ["fleet.formation.shape=line", "events=[]", "expect=[]", "expect_decisions=[]", *settings])
+
+
+def _difference(a: dict[int, SortieRecord], b: dict[int, SortieRecord]) -> Difference:
+    pairs: list[tuple[Matched, Matched]] = []
+    groups: list[int] = []
+    instants: dict[tuple[int, float], int] = {}
+    for seed, first in a.items():
+        ours, theirs = matched(first, mission=False, begin_s=SINCE_S), matched(b[seed], mission=False, begin_s=SINCE_S)
+        for t_s, drone in ours:
+            if drone != LIAR and (t_s, drone) in theirs:
+                pairs.append((ours[t_s, drone], theirs[t_s, drone]))
+                groups.append(instants.setdefault((seed, t_s), len(instants)))
+    return compare([p for p, _ in pairs], [p for _, p in pairs], groups)
+
+
+def table(rows: Sequence[LiarRow], sorties: int) -> str:
+    """Markdown; differences in AP points with 95 % intervals."""
+
+    def points(d: Difference) -> str:
+        return f"{100 * d.delta:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]"
+
+    lines = [
+        "| policy | drone 2 claims | AP honest | lost, no trust | lost, trust | doubt it | doubt others |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {r.policy} | {r.lie} | {r.untrusting.ap_a:.3f} | {points(r.untrusting)} | {points(r.trusting)} "
+        f"| {r.doubting} of {4 * sorties} | {r.wronged} |"
+        for r in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    import argparse
+    import sys
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--duration-s", type=float, default=40.0)
+    args = parser.parse_args()
+    seeds = range(1, args.seeds + 1)
+    sys.stdout.write(table(list(measure(seeds, args.duration_s)), args.seeds))
+    alarms, minutes = false_alarms(seeds, args.duration_s)
+    sys.stdout.write(f"\nNobody lying: {alarms} false alarms in {minutes} minutes of one drone judging another.\n")

@@ -1,0 +1,174 @@
+"""Trust: honest claims are never doubted, false ones are, each by its own check, and trust follows doubts that last."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.coverage import survey
+from fleet.lies import falsified
+from fleet.trust import (
+    Arrival,
+    Standing,
+    battery_doubt,
+    coverage_doubt,
+    discounted,
+    goodput_doubt,
+    judge,
+)
+from policies.contract import COVERAGE_CELL_M, Descriptor, TaskPhase
+
+SEEN_PER_METRE = 0.7
+
+
+def honest(drone: int, x_m: float = 0.0, y_m: float = 0.0, soc: float = 0.9, goodput: float = 100.0) -> Descriptor:
+    """A drone at 60 m that says what it sees."""
+    ((grid, novel),) = survey([x_m], [y_m], [42.0])
+    return Descriptor(
+        0, drone, (x_m, y_m, 60.0), (0, 0, 0, 1), (0, 0, 0), 42.0, soc, 1, 1, (goodput,) * 4, grid, int(novel),
+        TaskPhase.SEARCH, None,
+    )  # fmt: skip
+
+
+def fleet(second: int, liar: Descriptor | None = None) -> dict[int, Descriptor]:
+    """Five drones that lose 0.05 % a second, 20 m apart; drone 1 may be another."""
+    drones = {i: honest(i, 20.0 * i, 0.0, 0.9 - 0.0005 * second) for i in range(5)}
+    return drones if liar is None else drones | {1: liar}
+
+
+def after(seconds: int, lie: tuple[str, str] | None = None, since: int = 0) -> dict[int, Standing]:
+    """What drone 0 thinks after so many seconds, drone 1 lying from `since` on."""
+    standings: dict[int, Standing] = {}
+    for second in range(seconds):
+        known = fleet(second)
+        if lie is not None and second >= since:
+            known[1] = falsified(known[1], *lie)  # type: ignore[arg-type]
+        standings = judge(standings, 0, known, {1: [Arrival(160_000, 0.02, 600.0)]})
+    return standings
+
+
+@pytest.mark.parametrize("lie", [None, ("coverage", "much"), ("coverage", "little"), ("goodput", "little")])
+def test_trust_falls_for_the_liar_alone(lie: tuple[str, str] | None) -> None:
+    trust = {i: s.trust for i, s in after(20, lie, since=5).items()}
+    assert trust == {0: 1.0, 1: 1.0 if lie is None else 0.0, 2: 1.0, 3: 1.0, 4: 1.0}
+
+
+@pytest.mark.parametrize("claim", ["much", "little"])
+def test_a_false_battery_is_found_out(claim: str) -> None:
+    """Too much comes back at once; too little does not fall, which shows once the fleet lost half a percent."""
+    found = after(40, ("battery", claim), since=5)[1]
+    assert found.trust == 0.0
+    assert found.reason.startswith("battery: ")
+    assert after(8, ("battery", "little"), since=5)[1].trust == 1.0
+
+
+def test_trust_takes_two_doubts_in_a_row_and_comes_back() -> None:
+    assert [Standing(strikes=k).trust for k in range(7)] == [1.0, 1.0, 0.5, 0.25, 0.125, 0.0625, 0.0]
+    lying = fleet(0) | {1: falsified(fleet(0)[1], "coverage", "much")}
+    standings: dict[int, Standing] = {}
+    seen = []
+    for second in range(12):
+        standings = judge(standings, 0, lying if second < 3 else fleet(second), {})
+        seen.append(standings[1].trust)
+    assert seen == [1.0, 0.5, 0.25, 0.5, *[1.0] * 8]
+
+
+def test_nobody_doubts_itself() -> None:
+    liar = falsified(honest(1), "coverage", "much")
+    standings: dict[int, Standing] = {}
+    for _ in range(5):
+        standings = judge(standings, 1, fleet(0, liar), {})
+    assert standings[1].trust == 1.0
+
+
+def test_who_left_is_remembered_as_it_was() -> None:
+    standings = after(20, ("coverage", "much"))
+    gone = {i: d for i, d in fleet(20).items() if i != 1}
+    assert judge(standings, 0, gone, {})[1] == standings[1]
+
+
+# --- coverage ------------------------------------------------------------------------------------
+
+metres = st.floats(-2000, 2000)
+
+
+@given(metres, metres, st.floats(0, 2 * math.pi), st.floats(0, 12), st.floats(0, 1), st.floats(20, 120))
+def test_an_honest_grid_is_never_doubted(
+    x_m: float, y_m: float, heading: float, speed_mps: float, since_s: float, height_m: float
+) -> None:
+    """A grid of up to a second ago beside the pose of now, at any place, height and speed up to 12 m/s."""
+    radius_m = SEEN_PER_METRE * height_m
+    vx, vy = speed_mps * math.cos(heading), speed_mps * math.sin(heading)
+    ((grid, _),) = survey([x_m - since_s * vx], [y_m - since_s * vy], [radius_m])
+    d = honest(1)._replace(
+        position_m=(x_m, y_m, height_m), velocity_mps=(vx, vy, 0.0), footprint_radius_m=radius_m, coverage_grid=grid
+    )
+    assert coverage_doubt(d, SEEN_PER_METRE) == ""
+
+
+def test_a_footprint_that_no_camera_of_the_fleet_has_does_not_excuse_a_grid() -> None:
+    d = falsified(honest(1), "coverage", "much")._replace(footprint_radius_m=500.0)
+    assert coverage_doubt(d, SEEN_PER_METRE).startswith("coverage: ")
+
+
+def test_the_check_counts_cells_that_cannot_be() -> None:
+    away = np.hypot(*np.meshgrid(*[(np.arange(16) - 8 + 0.5) * COVERAGE_CELL_M] * 2))
+    limit_m = 42.0 + COVERAGE_CELL_M * 2**0.5 + 1.0
+    lie = falsified(honest(1), "coverage", "much")
+    expected = f"coverage: {int((away > limit_m).sum())} cells seen well beyond {limit_m:.0f} m"
+    assert coverage_doubt(lie, SEEN_PER_METRE) == expected
+
+
+# --- goodput and battery -------------------------------------------------------------------------
+
+
+def test_goodput_against_what_arrived() -> None:
+    came = [Arrival(160_000, 0.02, 100.0)]  # at 64 Mb/s at the least
+    assert goodput_doubt(80.0, came) == ""
+    assert goodput_doubt(6.5, came) == ""
+    assert goodput_doubt(6.3, came) == "goodput: 6.3 Mb/s claimed, 64 arrived"
+    assert goodput_doubt(150.0, came) == ""
+    assert goodput_doubt(151.0, came) == "goodput: 151 Mb/s claimed, frames came at 100"
+    assert goodput_doubt(0.1, [Arrival(500, 0.001, 600.0)]) == "", "a small payload says too little"
+    assert goodput_doubt(500.0, []) == "", "nothing came, nothing is known"
+
+
+def test_battery_against_the_past_and_the_fleet() -> None:
+    assert battery_doubt(0.92, 0.90, 0.95, 0.0) == ""
+    assert battery_doubt(0.94, 0.90, 0.95, 0.0) == "battery: 94% after 90%"
+    assert battery_doubt(0.95, 0.95, 0.95, 0.004) == "", "too early to say"
+    assert battery_doubt(0.95, 0.95, 0.95, 0.02) == "battery: fell by 0.0% while the fleet's fell by 2.0%"
+    assert battery_doubt(0.945, 0.945, 0.95, 0.02) == "", "a battery four times as large"
+
+
+def test_a_fault_is_no_lie() -> None:
+    """Half the energy gone at once, then falling as all do."""
+    standings: dict[int, Standing] = {}
+    for second in range(60):
+        known = fleet(second)
+        if second >= 10:
+            known[1] = known[1]._replace(battery_soc=known[1].battery_soc / 2)
+        standings = judge(standings, 0, known, {})
+        assert standings[1].trust == 1.0
+
+
+def test_the_loss_of_a_strong_drone_brings_nobody_into_doubt() -> None:
+    """Charges of 0.9 and 0.3; when one is gone the median charge jumps, falls do not."""
+    standings: dict[int, Standing] = {}
+    for second in range(60):
+        known = {i: honest(i, 20.0 * i, soc=(0.9 if i < 3 else 0.3) - 0.0005 * second) for i in range(5)}
+        if second >= 30:
+            del known[1]
+        standings = judge(standings, 0, known, {})
+        assert all(s.trust == 1.0 for s in standings.values())
+
+
+def test_a_doubted_drone_stays_where_it_is_and_says_nothing() -> None:
+    d = honest(3, 10.0, 20.0)
+    small = discounted(d)
+    assert (small.position_m, small.footprint_radius_m, small.agent_id) == (d.position_m, 42.0, 3)
+    assert (set(small.coverage_grid), small.battery_soc, small.peer_goodput_mbps) == ({0}, 0.0, (0.0,) * 4)

@@ -1,0 +1,84 @@
+"""Drones that lie, in flight: they are found out, lose weight and say, and honest fleets are left alone."""
+
+from __future__ import annotations
+
+import pytest
+from sim_examples import example
+
+from scenarios.load import load
+from sim.outcome import outcome
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+SEARCH = "mission.phases=[{at_s: 0, phase: search}]"
+
+
+def lie(about: str = "coverage", claim: str = "much", until_s: str = "") -> str:
+    return f"events=[{{kind: lie, at_s: 1, drone: 1, about: {about}, claim: {claim}{until_s}}}]"
+
+
+def flown(*overrides: str, policy: str = "who2com") -> SortieRecord:
+    settings = (f"policy.name={policy}", "policy.params={rho: 0.05}", SEARCH)
+    return run_sortie(example(*settings, *overrides))
+
+
+def links(record: SortieRecord, since_s: float) -> set[tuple[int, int]]:
+    """Who sent features to whom."""
+    sent = record.tables["transmissions"].to_pylist()
+    return {(t["drone"], t["peer"]) for t in sent if t["t_sent_s"] >= since_s and t["representation"] == "features"}
+
+
+def test_a_liar_takes_everyones_place_until_it_is_found_out() -> None:
+    """Under Who2com each drone is served by one other. All believe that drone 1 is it, which serves where it truly is."""
+    honest, fooled, trusting = (
+        flown(*more, "duration_s=10") for more in ((), (lie(), "context.trust=false"), (lie(),))
+    )  # fmt: skip
+    assert {sender for sender, peer in links(fooled, 5.0) if peer != 1} == {1}
+    assert {sender for sender, peer in links(honest, 5.0) if peer != 1} == {1, 2, 3, 4}
+    assert {sender for sender, peer in links(trusting, 5.0) if peer != 1} >= {2, 3, 4}
+    served = [sum(r.tables["transmissions"]["cells"].to_pylist()) for r in (honest, fooled)]
+    assert served[1] < 0.8 * served[0]
+
+
+def test_a_liar_loses_its_fusion_weight() -> None:
+    record = flown(lie(), "duration_s=12", "perception.detector=surrogate", policy="all-4")
+    late = [f for f in record.tables["fusions"].to_pylist() if f["t_s"] > 9.0 and f["drone"] != 1]
+    weights = [dict(zip(f["peers"], f["weights"], strict=True)) for f in late]
+    assert all(w[1] == 0.0 for w in weights)
+    assert all(w[p] == 1.0 for w in weights for p in w if p != 1)
+
+
+@pytest.mark.parametrize("about", ["coverage", "goodput", "battery"])
+@pytest.mark.parametrize("claim", ["much", "little"])
+def test_a_lie_stands_in_the_descriptors(about: str, claim: str) -> None:
+    honest, lying = (r.tables["descriptors"].to_pylist() for r in (flown(), flown(lie(about, claim))))
+    field = {"coverage": "coverage_grid", "goodput": "goodput_mbps", "battery": "soc"}[about]
+    said = [d for d in lying if d["drone"] == 1 and d["t_s"] >= 1.0]
+    truth = [d for d in honest if d["drone"] == 1 and d["t_s"] >= 1.0]
+    assert len({str(d[field]) for d in said}) == 1
+    assert all(d[field] != t[field] for d, t in zip(said, truth, strict=True))
+
+
+def test_trust_comes_back_after_the_lie() -> None:
+    record = flown(lie(until_s=", until_s: 4"), "duration_s=15")
+    last = {(r["drone"], r["peer"]): r["trust"] for r in record.tables["trust"].to_pylist()}
+    assert last == {(i, 1): 1.0 for i in (0, 2, 3, 4)}
+    assert outcome(record)["distrusted_by"] == {"1": 4}
+
+
+@pytest.mark.parametrize("policy", ["worked", "all-4", "deputies", "where2comm"])
+def test_honest_fleets_doubt_nobody_and_fly_as_without_trust(policy: str) -> None:
+    """With a jammer, a lost drone, a battery fault and links that break: none of it is a lie."""
+    events = (
+        "events=[{kind: jam, at_s: 5, position_m: [-180, 0, 60], power_dbm: 0, until_s: 10},"
+        "{kind: link_drop, at_s: 12, drone: 2, loss_db: 40, until_s: 18},"
+        "{kind: battery_fault, at_s: 8, drone: 3, lost_fraction: 0.4}, {kind: drone_lost, at_s: 20, drone: 4}]"
+    )
+    trusting, without = (
+        run_sortie(
+            load("track_target", ["perception.detector=none", "duration_s=30", f"context.trust={on}", events]), policy
+        )
+        for on in ("true", "false")
+    )
+    assert outcome(trusting)["distrusted_by"] == {}
+    assert trusting.fingerprint == without.fingerprint
