@@ -1,0 +1,219 @@
+"""The same rows in the process, on one worker, on two, and on a cluster that is joined; workers that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from campaign_examples import CAMPAIGN, plan, table_bytes
+from typer.testing import CliRunner
+
+from sim.campaign import engine as engines
+from sim.campaign.drive import Progress, run_campaign
+from sim.campaign.engine import Dask, InProcess, open_engine
+from sim.campaign.plan import Plan
+from sim.campaign.work import Task, fly_batch
+from sim.cli import app
+from sim.folders import RunError
+
+pytest.importorskip("distributed")
+
+FAULTY = """
+import os
+from policies.contract import Directive
+
+def decide(view, *, how="fail"):
+    if view.me.battery_soc < 0.5:
+        {what}
+    return [Directive(view.ego, p, reason="nothing") for p in view.peers]
+"""
+
+
+@pytest.mark.slow
+def test_zero_one_and_two_workers_give_the_same_bytes(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    for workers in (0, 1, 2):
+        with open_engine(workers) as engine:
+            assert engine.workers == max(1, workers)
+            done = run_campaign(p, tmp_path / str(workers), engine)
+            assert (done.finished, done.failed) == (48, 0)
+    tables = [table_bytes(tmp_path / str(w)) for w in (0, 1, 2)]
+    assert tables[0] == tables[1] == tables[2]
+    assert len(tables[0]) == 2
+
+
+@pytest.mark.slow
+def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
+    """The scheduler is joined by its address; two worker processes get SIGKILL while runs are in flight."""
+    import dask
+    from distributed import LocalCluster
+
+    p = plan(tmp_path, CAMPAIGN.replace("replications: 2", "replications: 4"))
+    run_campaign(p, tmp_path / "alone", InProcess())
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 10}),
+        LocalCluster(
+            n_workers=4, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs="CRITICAL"
+        ) as cluster,
+        open_engine(scheduler=cluster.scheduler_address) as engine,
+    ):
+        victims = [w.pid for w in cluster.workers.values()][:2]
+
+        def progress(done: Progress) -> None:
+            if victims and done.flown >= 5 * (3 - len(victims)):
+                os.kill(victims.pop(), signal.SIGKILL)
+
+        done = run_campaign(p, tmp_path / "cluster", engine, progress=progress)
+    assert not victims
+    assert (done.finished, done.failed) == (96, 0)
+    assert table_bytes(tmp_path / "cluster") == table_bytes(tmp_path / "alone")
+
+
+class _Future:
+    """What dask gives for a task, here at once or as the death of its worker."""
+
+    def __init__(self, call: Any, error: BaseException | None) -> None:
+        self.call, self.error = call, error
+        self.status = "finished" if error is None else "error"
+
+    def result(self) -> Any:
+        return self.call()
+
+    def exception(self) -> BaseException | None:
+        return self.error
+
+
+class _Client:
+    """A cluster whose workers die of one run; it counts what is in flight."""
+
+    loop = None
+
+    def __init__(self, deadly: int) -> None:
+        self.deadly, self.batches, self.waiting, self.most = deadly, list[int](), list[_Future](), 0
+
+    def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
+        return {"workers": {"a": {"nthreads": 1}, "b": {"nthreads": 1}}}
+
+    def submit(self, function: Any, code: str, batch: list[Task], **_: Any) -> _Future:
+        from distributed import KilledWorker
+
+        self.batches.append(len(batch))
+        dies = any(run == self.deadly for run, _ in batch)
+        return _Future(lambda: function(code, batch), KilledWorker("x", "y", 4) if dies else None)
+
+
+class _AsCompleted:
+    def __init__(self, client: _Client) -> None:
+        self.client, self.queue = client, list[_Future]()
+
+    def add(self, future: _Future) -> None:
+        self.queue.append(future)
+        self.client.most = max(self.client.most, len(self.queue))
+
+    def __iter__(self) -> Iterator[_Future]:
+        while self.queue:
+            yield self.queue.pop(0)
+
+
+def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import distributed
+
+    p, client = plan(tmp_path), _Client(deadly=17)
+    monkeypatch.setattr(distributed, "as_completed", lambda loop: _AsCompleted(client))
+    done = run_campaign(p, tmp_path / "a", Dask(client))
+    assert (done.finished, done.failed) == (48, 1)
+    table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
+    assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
+    assert all(r["key"] == p.key(r["run"]) for r in table)
+    assert max(client.batches) > 1  # short runs are batched
+    assert client.most <= engines.AHEAD * 2 + max(client.batches)  # no more than what is in flight
+
+
+def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    with pytest.raises(RunError, match=r"this worker runs Sortie 0.1.0\+[0-9a-f]+, the campaign is of other"):
+        run_campaign(Plan({**p.spec, "code": "other"}), tmp_path / "a", InProcess())
+
+
+def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) -> None:
+    policy = tmp_path / "mine.py"
+    policy.write_text(FAULTY.format(what="pass"))
+    p = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide"))
+    policy.write_text(FAULTY.format(what="pass # edited"))
+    with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
+        fly_batch(p.code, [(0, p.task(0))])
+
+
+def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+    policy = tmp_path / "faulty.py"
+    policy.write_text(FAULTY.format(what="raise RuntimeError('planted\\nin two lines')"))
+    p, folder = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide")), tmp_path / "a"
+    done = run_campaign(p, folder, InProcess())
+    table = pq.read_table(folder / "runs").to_pylist()
+    low = [r for r in table if r["fleet.battery.initial_soc"] < 0.5 and r["policy"].endswith(":decide")]
+    failed = [r for r in table if r["status"] == "failed"]
+    assert [r["run"] for r in failed] == [r["run"] for r in low]
+    assert done.failed == len(low) > 0
+    assert "planted" in failed[0]["error"]
+    assert "\n" not in failed[0]["error"]
+    assert failed[0]["energy_j.total"] is None
+    again = CliRunner().invoke(app, ["fly", "--from-campaign", str(folder), "--run", str(failed[0]["run"])])
+    assert "planted" in str(again.exception)
+    good = next(r for r in table if r["status"] == "done")
+    out = tmp_path / "again"
+    command = ["fly", "--from-campaign", str(folder), "--run", str(good["run"]), "--no-recording", "--out", str(out)]
+    result = CliRunner().invoke(app, command)
+    assert "the record is the campaign's" in result.stdout
+    assert (out / "outcome.json").is_file()
+
+
+def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -> None:
+    text = CAMPAIGN.replace("{kind: uniform, low: 0.2, high: 1}", "{kind: normal, mean: 0.9, sd: 0.2}")
+    p = plan(tmp_path, text)
+    above = {r for r in range(p.runs) if p.varied(p.at(r).cell)["fleet.battery.initial_soc"] > 1}
+    assert 0 < len(above) < p.runs
+    run_campaign(p, tmp_path / "a", InProcess())
+    table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
+    assert {r["run"] for r in table if r["status"] == "failed"} == above
+    assert "initial_soc" in table[min(above)]["error"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--workers", "1", "--scheduler", "tcp://localhost:1"], "--workers and --scheduler: name one of them"),
+        (["--workers", "0", "--resume"], "no campaign there to resume (campaign.json is missing)"),
+        (["--workers", "0", "--out", "/proc/nothing/here"], "/proc/nothing/here: its folder /proc is not writable"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+    from campaign_examples import write
+
+    path = write(tmp_path)
+    if "--out" not in arguments:
+        arguments = [*arguments, "--out", str(tmp_path / "a")]
+    result = CliRunner().invoke(app, ["campaign", str(path), *arguments])
+    assert isinstance(result.exception, RunError)  # sim.cli.main prints it in one line and exits with 2
+    assert message in str(result.exception)
+
+
+def test_the_driver_keeps_only_what_is_in_flight() -> None:
+    """An engine pulls tasks as it can use them."""
+    pulled = []
+
+    def tasks() -> Iterator[Task]:
+        for run in range(1000):
+            pulled.append(run)
+            yield run, "{}"
+
+    stream = InProcess().results("other code", tasks())
+    with pytest.raises(RunError):
+        next(stream)
+    assert pulled == [0]

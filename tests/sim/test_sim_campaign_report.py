@@ -1,0 +1,200 @@
+"""What a campaign's report is made of, against closed forms and planted truths."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from campaign_examples import CAMPAIGN, Pretended, plan
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from scenarios.campaign import Sample
+from sim.campaign.contexts import contexts, rule, winner
+from sim.campaign.drive import run_campaign
+from sim.campaign.figures import on_front
+from sim.campaign.rows import Rows, find_row, read_rows
+from sim.campaign.sensitivity import _morris, _saltelli, sensitivity
+from sim.campaign.spread import design
+from sim.campaign.statistics import Mean, estimate, paired, t_interval
+from sim.campaign.work import Result
+from sim.folders import RunError
+
+TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
+    "replications: 2", "replications: 1"
+)
+
+
+def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> Rows:
+    """A campaign whose metric is a function of (fields' values, policy number)."""
+    p = plan(tmp_path, text)
+    columns: dict[str, list[object]] = {}
+    for run in range(p.runs):
+        at = p.at(run)
+        fields = p.varied(at.cell)
+        row = {**at._asdict(), "policy": p.policies[at.policy], "status": "done", **fields}
+        row[metric] = value(fields, at.policy)  # type: ignore[operator]
+        for name, v in row.items():
+            columns.setdefault(name, []).append(v)
+    table = pa.table(columns)
+    return Rows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40))
+def test_running_means_are_numpys(values: list[float]) -> None:
+    mean = Mean()
+    for v in values:
+        mean.add(v)
+    assert mean.mean == pytest.approx(np.mean(values), abs=1e-9)
+    assert mean.variance == pytest.approx(np.var(values, ddof=1), rel=1e-6, abs=1e-6)
+
+
+def test_intervals_are_students() -> None:
+    values = np.random.default_rng(0).normal(5, 2, 23)
+    low, high = stats.t.interval(0.95, 22, values.mean(), stats.sem(values))
+    found = estimate(values)
+    assert (found.low, found.high) == pytest.approx((low, high))
+    assert math.isinf(t_interval(Mean()))
+    assert estimate([math.nan, 3.0]).count == 1
+
+
+def test_pairing_saves_what_the_common_part_was() -> None:
+    """With a = c + x, b = c + y the difference has Var x + Var y, unpaired Var x + Var y + 2 Var c: here 1 + 2·25/2 = 26."""
+    rng = np.random.default_rng(1)
+    c, x, y = rng.normal(0, 5, 20_000), rng.normal(0, 1, 20_000), rng.normal(1, 1, 20_000)
+    found = paired(c + x, c + y)
+    assert found.saved == pytest.approx(26, rel=0.05)
+    assert found.difference.low < 1 < found.difference.high
+    assert found.difference.half_width == pytest.approx(1.96 * math.sqrt(2 / 20_000), rel=0.05)
+
+
+def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
+    """Policy 0 wins by 1 above a charge of 0.4, policy 1 by 1 below: three quarters of the draws are above."""
+    text = TWO.replace("{count: 6}", "{count: 80}")
+    noise = np.random.default_rng(3).normal(0, 0.3, 10_000).tolist()
+
+    def value(fields: dict[str, float], policy: int) -> float:
+        gain = 1 if fields["fleet.battery.initial_soc"] > 0.4 else -1
+        return -(fields["fleet.battery.initial_soc"] * 50 + gain * (policy == 0) + noise.pop())  # bytes: less is better
+
+    rows = rows_of(tmp_path, text, value)
+    assert winner(rows, "bytes.data_sent") == "worked"
+    (found,) = contexts(rows, "bytes.data_sent")
+    assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", True)
+    assert found.part.startswith("0.2")
+    made = rule(rows, "bytes.data_sent")
+    assert made is not None
+    assert (made.field, made.below, made.above) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", "worked")
+    assert made.threshold == pytest.approx(0.4, abs=0.03)
+    assert made.gain.low > 0
+
+
+def test_where_nothing_flips_no_rule_gains(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    rows = rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 80}"), lambda f, p: p + rng.normal(0, 0.1))
+    assert contexts(rows, "bytes.data_sent") == []
+    made = rule(rows, "bytes.data_sent")
+    assert made is None or made.gain.low <= 0
+
+
+def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
+    """Ishigami and Homma 1990, a = 7, b = 0.1: S = 0.3139, 0.4424, 0; ST = 0.5576, 0.4424, 0.2437."""
+    x = 2 * math.pi * design(Sample(method="saltelli", count=2048), 3, seed=0) - math.pi
+    y = np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+    figures = _saltelli(3, y)
+    assert figures[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.03)
+    assert figures[:, 2] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.03)
+
+
+def test_morris_of_a_plane_is_its_slopes() -> None:
+    x = design(Sample(method="morris", count=12), 3, seed=1)
+    assert x.shape == (48, 3)
+    figures = _morris(x, x @ [3.0, -2.0, 0.0])
+    assert figures[:, 0] == pytest.approx([3, 2, 0], abs=1e-9)
+    assert figures[:, 2] == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+def test_rows_out_of_the_designs_order_are_refused(tmp_path: Path) -> None:
+    text = TWO.replace("{count: 6}", "{count: 8, method: saltelli}")
+    rows = rows_of(tmp_path, text, lambda f, p: f["fleet.battery.initial_soc"] * (p + 1))
+    found = sensitivity(rows, "bytes.data_sent", 0)
+    assert found is not None
+    assert found.figures[0, 2] == pytest.approx(1, abs=0.2)
+    back = rows.table.take(pa.array(range(rows.table.num_rows - 1, -1, -1)))
+    shuffled = Rows(rows.plan, back, back["unit"].to_numpy(), rows.policy[::-1])
+    with pytest.raises(RunError, match="the rows are not in the order of the design"):
+        sensitivity(shuffled, "bytes.data_sent", 0)
+    other = Rows(plan(tmp_path, text.replace("seed: 5", "seed: 6")), rows.table, rows.unit, rows.policy)
+    with pytest.raises(RunError, match="is not the design's"):
+        sensitivity(other, "bytes.data_sent", 0)
+
+
+def test_a_failed_run_takes_its_whole_block_with_it(tmp_path: Path) -> None:
+    text = TWO.replace("{count: 6}", "{count: 8, method: saltelli}")
+    calls = [0]
+
+    def value(fields: dict[str, float], policy: int) -> float:
+        calls[0] += 1
+        return math.nan if calls[0] == 5 else fields["fleet.battery.initial_soc"]
+
+    rows = rows_of(tmp_path, text, value)
+    found = [sensitivity(rows, "bytes.data_sent", p) for p in (0, 1)]
+    assert [f.used for f in found if f is not None] == [21, 24]
+
+
+def test_the_front_holds_whom_nobody_beats() -> None:
+    assert on_front([1, 2, 3, 3], [1, 3, 3, 2]) == [True, True, False, False]
+    assert on_front([1, 1], [2, 2]) == [True, True]
+
+
+class Failing(Pretended):
+    """Run 3 fails."""
+
+    def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
+        for rows in super().results(code, tasks):  # type: ignore[arg-type]
+            yield [
+                Result(r.run, r.key, "failed", "ValueError: planted", "", (None, None)) if r.run == 3 else r
+                for r in rows
+            ]
+
+
+def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from sim.campaign.report import write_report
+
+    p, folder = plan(tmp_path), tmp_path / "a"
+    run_campaign(p, folder, Failing())  # type: ignore[arg-type]
+    text = write_report(folder).read_text()
+    assert text == write_report(folder).read_text()
+    for part in (
+        "48 of 48 runs: 6 draws at 2 grid points, 2 replication(s), 2 policies on the same draws; 1 failed.",
+        "- run 3 (best-2(rho=0.1), seed ",
+        "ValueError: planted",
+        f"sortie fly --from-campaign {folder} --run 3",
+        "## Metrics by policy",
+        "## By varied field",
+        "## Sensitivity",
+        "## Where the winner changes",
+    ):
+        assert part in text
+    assert (folder / "varied.png").stat().st_size > 10_000
+    means = read_rows(folder).by_unit("bytes.data_sent")
+    soc = [p.varied(2 * u)["fleet.battery.initial_soc"] for u in range(6)]
+    assert means[:, 0] == pytest.approx([10 + s for s in soc])
+    assert means[:, 1] == pytest.approx(soc)
+    assert find_row(folder, 3)["error"] == "ValueError: planted"
+    with pytest.raises(RunError, match=r"--run 48: .* has runs 0 … 47"):
+        find_row(folder, 48)
+    assert pq.read_table(folder / "runs").num_rows == 48
+
+
+def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(plan(tmp_path), tmp_path / "a", Pretended(stop_after=3))
+    with pytest.raises(RunError, match="a: no part is finished yet, go on with the campaign"):
+        read_rows(tmp_path / "a")
