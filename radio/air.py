@@ -13,7 +13,6 @@ sender, receiver and kind replaces an older one that is not through (history dep
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import pairwise
 from math import nan
 from typing import cast
@@ -144,16 +143,7 @@ class Air:
         if sender in self._gone:
             return
         frame = self._broadcasts.frame(sender, payload_bytes, on_heard)
-        phase_s = self._broadcasts.phase_s[sender]
-        if phase_s > 0.0:
-            self._env.timeout(phase_s, frame).callbacks.append(self._announce)
-        else:
-            self.medium.announce(frame, frame.residual)
-
-    def _announce(self, event: simpy.Event) -> None:
-        frame = cast(Broadcast, event.value)
-        if frame.sender not in self._gone:
-            self.medium.announce(frame, frame.residual)
+        self.medium.announce(frame, frame.residual, self._broadcasts.phase_s[sender])
 
     # --- data ------------------------------------------------------------------------------------
 
@@ -205,6 +195,7 @@ class Air:
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
             *sample_wire(payload_bytes, piece_bytes or self._config.fragment_bytes, piece_bytes is not None),
             self._luck.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
+            self._order,
         )  # fmt: skip
         s.receiver = hop
         self._in_flight[number] = s
@@ -281,7 +272,7 @@ class Air:
             return
         if s.reliable:
             s.wire_bytes += repair_wire_bytes(s.left)
-        lost = s.lose(partial(self._order, s))
+        lost = s.lose()
         if lost and s.reliable:
             s.left = lost
             wait_s = self._config.heartbeat_s + self._config.nack_delay_s
@@ -333,7 +324,7 @@ class Air:
         self._forget(s)
         if s.pieces is not None and s.remaining < 1.0:  # cut short: its first pieces are there
             self._book(s)
-            s.lose(partial(self._order, s))
+            s.lose()
         row = s.row(status, reason, self._env.now)
         c = self.counters
         c.data_wire_bytes += row.wire_bytes

@@ -29,7 +29,8 @@ class Broadcast(GroupFrame):
     def __init__(
         self, sender: int, airtime_s: float, slots: int, residual: float, mpdu_bytes: int, on_heard: OnHeard
     ) -> None:
-        self.sender, self.airtime_s, self.slots, self.fire_s = sender, airtime_s, slots, inf  # as GroupFrame, in one go
+        self.sender, self.airtime_s, self.slots = sender, airtime_s, slots  # as GroupFrame, in one go
+        self.fire_s, self.joined = inf, False
         self.residual = residual
         self.mpdu_bytes = mpdu_bytes
         self.on_heard = on_heard

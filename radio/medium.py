@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import Enum
-from heapq import heappop, heappush
-from math import inf, nan
+from heapq import heapify, heappop, heappush
+from math import inf, nan, nextafter
 from typing import Generic, TypeVar
 
 import simpy
@@ -90,13 +90,14 @@ _IDLE_ALONE_S = contention(1).idle_s
 class GroupFrame:
     """One group-addressed frame; subclassed by what knows its content."""
 
-    __slots__ = ("airtime_s", "fire_s", "sender", "slots")
+    __slots__ = ("airtime_s", "fire_s", "joined", "sender", "slots")
 
     def __init__(self, sender: int, airtime_s: float, slots: int) -> None:
         self.sender = sender
         self.airtime_s = airtime_s
         self.slots = slots
         self.fire_s = inf
+        self.joined = False
 
 
 J = TypeVar("J", bound=Job)
@@ -142,7 +143,11 @@ class Medium(Generic[J, F]):
         self._context_from_s = inf
         self._context_until_s = -inf
         self._context_fire_s = inf
+        self._context_target_s = inf  # when the frame that is to win ends, as the clock will say it
+        self._context_due_s = inf
         self._context_timer: simpy.Event | None = None
+        self._coming: list[tuple[float, int, F, float]] = []  # by when they will contend
+        self._soonest: list[tuple[float, int, F]] = []  # by when they end if nothing holds them up
         self.transmit_s = [0.0] * n_drones
         """Seconds each drone has transmitted: data with retries and collisions, and context frames."""
         self.data_busy_s = 0.0
@@ -226,21 +231,37 @@ class Medium(Generic[J, F]):
             queue.remove(job)
 
     def sync(self) -> float:
-        """Bring every account up to now, and return it."""
+        """Bring every account up to now, and return it; frames whose time has come contend."""
         now: float = self._env.now
+        if self._coming:
+            self._admit(now)
+        self._account(now)
+        return now
+
+    def _admit(self, now: float) -> None:
+        """Let the frames contend whose time has come."""
+        coming = self._coming
+        while coming and coming[0][0] <= now:
+            at_s, _, frame, residual = heappop(coming)
+            self._join(frame, residual, at_s)
+
+    def _account(self, now: float) -> None:
         dt = now - self._last_s
         if dt <= 0.0:
-            return now
+            return
+        heads = self._heads
+        if not heads and not self._waiting:
+            self._last_s = now
+            return
         if self._waiting:
             blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
             if blocked > 0.0:
                 self.context_busy_s += blocked
                 dt -= blocked
         self._last_s = now
-        heads = self._heads
         n = len(heads)
         if n == 0 or dt <= 0.0:
-            return now
+            return
         self.data_busy_s += dt
         share, sends, transmit_s = dt / n, self._sends[n], self.transmit_s
         for sender, job in heads.items():
@@ -249,7 +270,6 @@ class Medium(Generic[J, F]):
             job.remaining = left - done
             job.granted_s += share
             transmit_s[sender] += done * job.ppdu_s * sends
-        return now
 
     def _arm(self, now: float) -> None:
         """Who is served has changed, or at what cost: set the timer to the earliest thing that can happen."""
@@ -306,21 +326,37 @@ class Medium(Generic[J, F]):
 
     # --- context ---------------------------------------------------------------------------------
 
-    def announce(self, frame: F, residual: float) -> None:
+    def announce(self, frame: F, residual: float, in_s: float = 0.0) -> None:
         """Contend for the air with a context frame.
 
         Args:
             frame: its `slots` drawn, 0 … CW_CONTEXT.
             residual: uniform in [0, 1): how much of a running data exchange is still to come.
+            in_s: how long from now, ≥ 0. No event of its own marks the begin: it is looked back at from the next one,
+                which is at the latest the end that the frame would have if nothing held it up.
         """
+        if in_s <= 0.0:
+            now = self.sync()
+            self._join(frame, residual, now)
+            self._aim(now)
+            return
+        now = self._env.now
+        at_s = now + in_s
+        until = at_s + AIFS_CONTEXT_S + frame.slots * SLOT_S + frame.airtime_s
+        end_s = at_s + (until - at_s)
+        self._pushes += 1
+        heappush(self._coming, (at_s, self._pushes, frame, residual))
+        heappush(self._soonest, (end_s, self._pushes, frame))
+        if end_s < self._context_due_s:
+            self._aim(now)
+
+    def _join(self, frame: F, residual: float, now: float) -> None:
+        """A frame begins to contend."""
+        self._account(now)
+        frame.joined = True
         waiting = self._waiting
-        if waiting:
-            now = self.sync()
-        elif self._heads:
-            now = self.sync()
-            self._context_from_s = now + residual * self._mean_exchange_s()
-        else:
-            self._context_from_s = self._last_s = now = self._env.now
+        if not waiting:
+            self._context_from_s = now + residual * self._mean_exchange_s() if self._heads else now
         waiting.append(frame)
         if now >= self._context_fire_s:
             return  # heard the frame that is on the air; counts down after it
@@ -328,8 +364,12 @@ class Medium(Generic[J, F]):
         self._plan_context(now)
 
     def drop_context(self, sender: int) -> None:
-        """Forget a drone's waiting context frames; one that is on the air ends."""
+        """Forget a drone's context frames, waiting or to come; one that is on the air ends."""
         now = self.sync()
+        for _, _, frame, _ in self._coming:
+            frame.joined |= frame.sender == sender
+        self._coming = [entry for entry in self._coming if entry[2].sender != sender]
+        heapify(self._coming)
         kept = [
             f
             for f in self._waiting
@@ -340,6 +380,7 @@ class Medium(Generic[J, F]):
         self._waiting = kept
         if now < self._context_fire_s:
             self._plan_context(now)
+            self._aim(now)
             self._arm(now)
 
     def _mean_exchange_s(self) -> float:
@@ -349,10 +390,11 @@ class Medium(Generic[J, F]):
         return sum(j.ppdu_s / j.count for j in jobs) / len(jobs) if jobs else 0.0
 
     def _plan_context(self, now: float) -> None:
+        """Who of the waiting frames is to win, and when its turn is over."""
         waiting = self._waiting
         if not waiting:
-            self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
-            self._context_timer = None
+            self._context_from_s, self._context_until_s = inf, -inf
+            self._context_fire_s = self._context_target_s = inf
             return
         if len(waiting) == 1:
             fire, longest_s = waiting[0].fire_s, waiting[0].airtime_s
@@ -361,21 +403,44 @@ class Medium(Generic[J, F]):
             longest_s = max([f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2])
         until = fire + longest_s
         self._context_fire_s = fire
-        if until != self._context_until_s or self._context_timer is None:
+        if until != self._context_until_s:
             self._context_until_s = until
-            timer = self._env.timeout(max(0.0, until - now))
-            timer.callbacks.append(self._on_context_timer)
-            self._context_timer = timer
+            self._context_target_s = now + max(0.0, until - now)
+
+    def _aim(self, now: float) -> None:
+        """Set the timer to the earliest end of a context frame."""
+        soonest = self._soonest
+        while soonest and soonest[0][2].joined:
+            heappop(soonest)
+        due = self._context_target_s
+        if soonest and soonest[0][0] < due:
+            due = soonest[0][0]
+        if due == self._context_due_s or due == inf:
+            return
+        delay = due - now
+        if now + delay != due:  # so that the clock says it to the last digit
+            near = (nextafter(delay, inf), nextafter(delay, -inf))
+            delay = next((d for d in near if now + d == due), delay)
+        self._context_due_s = due
+        self._context_timer = timer = self._env.timeout(max(0.0, delay))
+        timer.callbacks.append(self._on_context_timer)
 
     def _on_context_timer(self, event: simpy.Event) -> None:
         if event is not self._context_timer:
             return
-        self._context_timer = None
-        now, fire = self.sync(), self._context_fire_s
-        sent = self._waiting
+        self._context_due_s = inf
+        now: float = self._env.now
+        self._admit(now)
+        if now < self._context_target_s:  # something holds it up
+            self._aim(now)
+            return
+        self._account(now)
+        fire, sent = self._context_fire_s, self._waiting
         if len(sent) == 1:
             self._waiting = []
-            self._context_from_s, self._context_until_s, self._context_fire_s = inf, -inf, inf
+            self._context_from_s, self._context_until_s = inf, -inf
+            self._context_fire_s = self._context_target_s = inf
+            self._aim(now)
             (frame,) = sent
             self.transmit_s[frame.sender] += frame.airtime_s
             self._on_group_end(frame, False)
@@ -388,6 +453,7 @@ class Medium(Generic[J, F]):
             f.fire_s = now + AIFS_CONTEXT_S + f.slots * SLOT_S
             self._context_from_s = now
         self._plan_context(now)
+        self._aim(now)
         for f in sent:
             self.transmit_s[f.sender] += f.airtime_s
             self._on_group_end(f, len(sent) > 1)
