@@ -137,11 +137,8 @@ class Eyes:
         parked = np.flatnonzero(((traffic.parked_xy > low) & (traffic.parked_xy < high)).all(axis=1))
         times, which = np.unique(fleet.t_s, return_inverse=True)
         xy, yaw, there = traffic.at(times, parked)
-        # single precision a few hundred metres from the middle keeps a tenth of a millimetre
-        middle = where.mean(axis=0) if len(where) else np.zeros(2)
-        x, y = ((xy[..., k] - middle[k]).astype(np.float32)[which] for k in (0, 1))
-        x -= (where[:, :1] - middle[0]).astype(np.float32)
-        y -= (where[:, 1:] - middle[1]).astype(np.float32)
+        # differences in double precision: where a car lies must not hang on what else is asked
+        x, y = ((xy[which, :, k] - where[:, k, None]).astype(np.float32) for k in (0, 1))
         c, s = np.cos(fleet.yaw_rad).astype(np.float32)[:, None], np.sin(fleet.yaw_rad).astype(np.float32)[:, None]
         near = np.abs(c * x + s * y) < half
         near &= np.abs(c * y - s * x) < half
