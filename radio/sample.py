@@ -53,6 +53,7 @@ class Sample(Job):
         "mark_s",
         "mcs",
         "on_done",
+        "order",
         "origin",
         "pass_bytes",
         "pass_frames",
@@ -88,7 +89,8 @@ class Sample(Job):
         luck: list[float],
         snr_db: float,
         drained_bits: float,
-        piece_bytes: int = 0,
+        piece_bytes: int,
+        order: Callable[[Sample, int], IntArray],
     ) -> None:
         """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
         the sender had got through when this was written; the rest as in `Air.send`."""
@@ -100,6 +102,7 @@ class Sample(Job):
         self.payload_bytes = payload_bytes
         self.reliable = reliable
         self.on_done = on_done
+        self.order = order  # a random one of so many pieces, for which of them are lost
         self.t_sent_s = self.t_queued_s = t_sent_s
         self.t_first_s = nan
         self.fragments = fragments
@@ -145,26 +148,25 @@ class Sample(Job):
         extra = self.passes - len(self.luck) + 1
         return self.luck[self.passes] if extra <= 0 else (self.luck[-1] + extra * _GOLDEN) % 1.0
 
-    def lose(self, draw: Callable[[int], IntArray]) -> int:
+    def lose(self) -> int:
         """What of this pass did not get through, its progress being booked; returns how many fragments.
 
         Pieces go in their order, so that a pass that was cut short has brought the first of them.
-
-        Args:
-            draw: a random order of so many, for which of the pieces are lost.
         """
         done = 1.0 - self.remaining
         sent = self.left if done >= 1.0 else int(done * self.left + 1e-9)
         if self.unreachable or sent == 0:
             return self.left
         lost = losses(self.round_luck(), sent, min(1.0, self.loss_share / done))
+        missing = lost + self.left - sent
         if self.pieces is not None:
-            which = np.sort(draw(sent)[:lost]) if lost else np.arange(0)
+            which = np.sort(self.order(self, sent)[:lost]) if lost else np.arange(0)
             self.arrived.append(np.delete(self.pieces[:sent], which))
             self.pieces = np.concatenate([self.pieces[which], self.pieces[sent:]])
+            self.left = len(self.pieces)
         self.lost += lost
         self.restart()  # told; a second call finds nothing sent
-        return lost + self.left - sent
+        return missing
 
     def forward(self, sender: int, receiver: int, now_s: float, luck: list[float], drained_bits: float) -> None:
         """Begin the next hop with what the last one brought."""
@@ -255,6 +257,10 @@ class Service:
             s.mark_s, s.mark_bits = now_s, 0.0
         if reason:
             if fresh or not s.unreachable:
+                if s.pieces is not None and not fresh:  # those that went before the link did are there
+                    s.lose()
+                    s.passes += 1
+                    s.pass_bytes = self.wire_bytes(s)
                 s.restart()
                 s.demand(self._probe)
                 s.full_mbps = 0.0

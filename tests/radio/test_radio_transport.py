@@ -94,6 +94,17 @@ def test_a_deadline_cuts_pieces_short_and_the_first_are_there(tmp_path: Path) ->
         assert came == pytest.approx(20e6 * 0.065 / 8 / 1344, rel=0.05)  # as many as go in that time
 
 
+def test_pieces_sent_before_the_link_went_are_there(tmp_path: Path) -> None:
+    links = trace(tmp_path, "0,0,1,,,20", "0.19,0,1,,,20", "0.2,0,1,,,0")
+    flight = Hover(Radio(trace=links))
+    flight.fly(1.0, lambda frame: flight.send(0, 1, 400 * 1336, piece_bytes=1336, deadline_s=1.0) if frame == 1 else 0)
+    (row,) = flight.rows
+    assert (row.status, row.reason) == (Status.PARTIAL, "no_link")
+    came = 400 - len(row.missing)
+    assert row.missing == tuple(range(came, 400))
+    assert came == pytest.approx(20e6 * 0.1 / 8 / 1344, rel=0.05)
+
+
 def test_samples_that_are_cut_short_bring_nothing(tmp_path: Path) -> None:
     flight = Hover(lossy(tmp_path, 0.0, goodput_mbps=20.0))
     flight.fly(3.0, lambda frame: flight.send(0, 1, 400 * 1336, deadline_s=0.065))

@@ -98,7 +98,27 @@ def test_units_stand_in_names() -> None:
         "cycles",
         "life_cycles",
     }
-    units = {"m", "s", "hz", "mps", "db", "dbm", "ghz", "mhz", "mbps", "w", "wh", "mohm", "deg", "bytes", "kg", "m2", "kgpm3", "v", "c"}
+    units = {
+        "m",
+        "s",
+        "hz",
+        "mps",
+        "db",
+        "dbm",
+        "ghz",
+        "mhz",
+        "mbps",
+        "w",
+        "wh",
+        "mohm",
+        "deg",
+        "bytes",
+        "kg",
+        "m2",
+        "kgpm3",
+        "v",
+        "c",
+    }
     schema = Scenario.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         for name, field in section["properties"].items():
