@@ -6,10 +6,10 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
 
-.PHONY: help sortie test quick lint check format bench clean
+.PHONY: help sortie screenshot test quick lint check format bench clean
 
 help: ## show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -20,6 +20,10 @@ $(STAMP): pyproject.toml constraints.txt
 
 sortie: $(STAMP) ## fly the main scenario and print its outcome (SCENARIO=... for another)
 	$(BIN)/sortie fly $(SCENARIO)
+
+screenshot: $(STAMP) ## fly the paper's replay and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
+	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot
+	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 
 test: $(STAMP) ## run the whole test suite, a worker a core
 	$(BIN)/python -m pytest -n auto

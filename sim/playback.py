@@ -164,7 +164,7 @@ def open_viewer(path: Path) -> None:
     """
     if not path.is_file():
         raise RunError(f"{path}: no recording there")
-    command = [_viewer_binary(), "--bind", "127.0.0.1", str(path)]
+    command = [viewer_binary(), "--bind", "127.0.0.1", str(path)]
     _need_display(f"open {path} elsewhere, or in a browser: {command[0]} --web-viewer {path}")
     try:
         ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)  # noqa: S603
@@ -180,7 +180,7 @@ def to_new_viewer(recording: rr.RecordingStream, scenario: Scenario) -> None:
     Raises:
         RunError: no viewer, no display, or one that does not come up.
     """
-    binary = _viewer_binary()
+    binary = viewer_binary()
     _need_display("--live needs one; fly without it and see the recording elsewhere")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -191,7 +191,7 @@ def to_new_viewer(recording: rr.RecordingStream, scenario: Scenario) -> None:
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         except OSError as error:
             raise RunError(f"{binary}: the viewer cannot be started: {error.strerror}") from error
-        up = _listens(port, viewer)
+        up = listens(port, viewer)
         if viewer.poll() is not None or not up:
             viewer.kill()
             said.seek(0)
@@ -204,7 +204,7 @@ def to_file(path: Path) -> Sink:
     return lambda recording, scenario: recording.save(path, default_blueprint=blueprint(scenario))
 
 
-def _listens(port: int, viewer: subprocess.Popen[bytes]) -> bool:
+def listens(port: int, viewer: subprocess.Popen[bytes]) -> bool:
     """Wait until the viewer takes connections, and half a second more, in which one without a window dies."""
     until = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < until and viewer.poll() is None:
@@ -217,7 +217,7 @@ def _listens(port: int, viewer: subprocess.Popen[bytes]) -> bool:
     return False
 
 
-def _viewer_binary() -> str:
+def viewer_binary() -> str:
     """The `rerun` command beside this Python, or else on the path."""
     binary = shutil.which("rerun", path=str(Path(sys.executable).parent)) or shutil.which("rerun")
     if binary is None:

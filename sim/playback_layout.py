@@ -62,13 +62,13 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     if scenario.perception.detector != "none":
         plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
         shares.insert(0, 1.2)
-    lanes_height = 0.05 + 0.042 * (
+    lanes_height = 0.07 + 0.048 * (
         min(scenario.fleet.drones, MAX_LANES) + 2
     )  # part of the window that shows every lane
     shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
     about = rrb.TextDocumentView(name="how to read this", contents=["/about"])
     left = rrb.Vertical(
-        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[1, 1]), row_shares=[3, 1]
+        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[5, 4]), row_shares=[3, 1]
     )
     body = rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2])
     return sheet(body, live=live)

@@ -56,7 +56,7 @@ def figures(record: SortieRecord) -> dict[str, str]:
     ]
     if record.scenario.perception.detector == "none":
         del plots[1]
-    style = {
+    style: dict[Any, Any] = {
         "svg.hashsalt": "sortie", "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9.0,
         "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888", "axes.grid": True,
         "grid.color": "#e6e6e6", "axes.axisbelow": True, "legend.frameon": False, "legend.fontsize": 8.0,
