@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
 
-.PHONY: help sortie screenshot test quick lint check format bench validate clean
+.PHONY: help sortie screenshot test quick lint check format bench validate clean scenarios notebooks
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -35,6 +35,12 @@ lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+scenarios: $(STAMP) ## hold the library's scenarios to their own expectations (minutes each)
+	$(BIN)/python -m pytest scenarios/library
+
+notebooks: $(STAMP) ## execute the notebooks
+	$(BIN)/python -m pytest --nbmake --nbmake-timeout=1200 notebooks
 
 check: lint test ## lint, types, tests
 

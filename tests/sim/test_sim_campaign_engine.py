@@ -127,13 +127,24 @@ def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
 
     p, client = plan(tmp_path), _Client(deadly=17)
     monkeypatch.setattr(distributed, "as_completed", lambda loop: _AsCompleted(client))
+    monkeypatch.setattr(engines, "BATCH_S", 1e9)  # as many a batch as there may be
+    monkeypatch.setattr(engines, "MAX_BATCH", 5)
     done = run_campaign(p, tmp_path / "a", Dask(client))
     assert (done.finished, done.failed) == (48, 1)
     table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
     assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
     assert all(r["key"] == p.key(r["run"]) for r in table)
-    assert max(client.batches) > 1  # short runs are batched
+    assert max(client.batches) == 5
     assert client.most <= engines.AHEAD * 2 + max(client.batches)  # no more than what is in flight
+
+
+def test_batches_are_about_a_second_long() -> None:
+    engine = Dask(_Client(deadly=-1))
+    assert engine._batch() == 1  # until it is known how long a run takes
+    engine._learn(0.3)
+    assert engine._batch() == 3
+    engine._learn(300)
+    assert engine._batch() == 1
 
 
 def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
@@ -190,7 +201,8 @@ def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -
     [
         (["--workers", "1", "--scheduler", "tcp://localhost:1"], "--workers and --scheduler: name one of them"),
         (["--workers", "0", "--resume"], "no campaign there to resume (campaign.json is missing)"),
-        (["--workers", "0", "--out", "/proc/nothing/here"], "/proc/nothing/here: its folder /proc is not writable"),
+        (["--workers", "0", "--out", __file__ + "/a"], "/a: cannot make its folder: "),
+        (["--workers", "0", "--out", "/proc/nothing/here"], "/proc/nothing/here: "),
     ],
 )
 def test_what_cannot_be_done_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
