@@ -18,7 +18,7 @@ from perception.errors import InputError
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from policies.registry import own_fusion as own_fusion_of
-from scenarios.load import ScenarioError, library, load
+from scenarios.load import ScenarioError, campaigns, library, load
 from scenarios.schema import Scenario, json_schema
 from scenarios.traces import TraceError
 from sim import (
@@ -221,7 +221,9 @@ def view(
 
 @app.command("list")
 def list_(
-    what: Annotated[str, typer.Argument(help="policies, scenarios, detectors, fusions or schema (JSON Schema).")],
+    what: Annotated[
+        str, typer.Argument(help="policies, scenarios, campaigns, detectors, fusions or schema (JSON Schema).")
+    ],
 ) -> None:
     """List what there is."""
     if what == "policies":
@@ -232,6 +234,11 @@ def list_(
     elif what == "scenarios":
         for name, path in library().items():
             out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
+    elif what == "campaigns":
+        from scenarios.load_campaign import load_campaign
+
+        for name in campaigns():
+            out.print(f"[bold]{name}[/bold]  {load_campaign(name).campaign.description}", soft_wrap=True)
     elif what == "detectors":
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
@@ -243,7 +250,7 @@ def list_(
     elif what == "schema":
         out.print_json(data=json_schema())
     else:
-        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, detectors, fusions or schema")
+        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, campaigns, detectors, fusions or schema")
 
 
 app.command()(cli_train.train)

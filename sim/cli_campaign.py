@@ -59,13 +59,13 @@ def run(
         raise RunError("--workers and --scheduler: name one of them")
     study = load_campaign(campaign)
     folder = out_dir or Path("runs") / f"campaign-{study.campaign.campaign}"
-    with user_errors():
-        plan = make_plan(study)
     count = len(os.sched_getaffinity(0)) if workers is None else workers
-    _ensure_usable(folder, plan)
     try:
-        with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
-            done = run_campaign(plan, folder, engine, resume_only=resume, progress=show)
+        with user_errors():
+            plan = make_plan(study)
+            _ensure_usable(folder, plan)
+            with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
+                done = run_campaign(plan, folder, engine, resume_only=resume, progress=show)
     except KeyboardInterrupt:
         err.print(f"interrupted; what is finished is kept in {folder}, the same command goes on")
         raise typer.Exit(130) from None

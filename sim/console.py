@@ -12,6 +12,8 @@ from sim.folders import RunError
 
 out = Console()
 err = Console(stderr=True, highlight=False)
+EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign"}
+"""Which extra brings a library that not everybody needs."""
 
 
 @contextmanager
@@ -47,9 +49,10 @@ def user_errors() -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        if error.name != "matplotlib":
+        name = (error.name or "").partition(".")[0]
+        if name not in EXTRAS:
             raise
-        raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
+        raise RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") from error
     except OSError as error:
         raise RunError(f"{error.filename}: {error.strerror}") from error
     except ValueError as error:

@@ -31,6 +31,9 @@ HOMES = {
     "rerun": ("sim/playback.py", "sim/playback_*.py"),
     "pymavlink": ("fleet/mavlink.py",),
     "yaml": ("scenarios/load.py",),
+    "distributed": ("sim/campaign/engine.py",),
+    "dask": ("sim/campaign/engine.py",),
+    "SALib": ("sim/campaign/*",),
 }
 """Third-party libraries with one home each."""
 
