@@ -1,9 +1,9 @@
 """What the data plane does on bad links: every figure of transport, bursts, age and relay in radio/README.md.
 
-    python tests/validation/transport.py [--quick] [--torch] [--out FOLDER]
+    python tests/validation/transport.py [--quick] [--only PART …] [--out FOLDER]
 
-Prints Markdown, writes transport.json and, with matplotlib, transport_*.png into FOLDER. `--torch` also flies a few
-frames with the network (minutes); without it accuracy is the surrogate's.
+Prints Markdown, writes transport.json (four digits, part by part) and, with matplotlib, transport_framing.png into
+FOLDER. Accuracy is the surrogate's, but for a few frames with the network (`network`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,11 @@ def fragments_table(samples: int) -> list[dict[str, float]]:
 
 def shared(scenario: Scenario, seeds: tuple[int, ...]) -> dict[str, float]:
     """AP@0.5, feature cells at the receivers and goodput, over the seeds."""
-    results = [outcome(run_sortie(scenario, seed=seed)) for seed in seeds]
+    return means([outcome(run_sortie(scenario, seed=seed)) for seed in seeds], scenario)
+
+
+def means(results: list[dict[str, Any]], scenario: Scenario) -> dict[str, float]:
+    """The same of outcomes."""
     ap = [r["ap50"]["full_scene"] for r in results]
     delivered = [r["bytes"]["data_delivered"] for r in results]
     sent = [r["bytes"]["data_sent"] for r in results]
@@ -197,15 +202,16 @@ def relayed(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
             "policy.params={rho: 0.02}", f"radio.relay_max_hops={hops}", "context.detached_after_periods=100",
             "context.degraded_after_periods=50",
         )  # fmt: skip
-        row: dict[str, Any] = {"hops": hops, **shared(scenario, seeds)}
-        sent = run_sortie(scenario, seed=seeds[0]).tables
-        moved = sent["transmissions"]
-        row["airtime_share"] = float(pc.sum(moved["airtime_s"]).as_py()) / scenario.duration_s
-        row["over_others"] = float(pc.mean(pc.greater(moved["hops"], 1)).as_py())
-        whole = sent["topology"]
-        if whole.num_rows:
-            row["connected_share"] = float(pc.mean(whole["connected"]).as_py())
-            row["bottleneck_mbps"] = float(np.nanmedian(whole["bottleneck_mbps"].to_numpy()))
+        records = [run_sortie(scenario, seed=seed) for seed in seeds]
+        row: dict[str, Any] = {"hops": hops, **means([outcome(r) for r in records], scenario)}
+        moved = [r.tables["transmissions"] for r in records]
+        airtime_s = sum(float(pc.sum(m["airtime_s"]).as_py()) for m in moved)
+        row["airtime_share"] = airtime_s / scenario.duration_s / len(seeds)
+        row["over_others"] = float(np.mean(np.concatenate([m["hops"].to_numpy() for m in moved]) > 1))
+        whole = [r.tables["topology"] for r in records]
+        if whole[0].num_rows:
+            row["connected_share"] = float(np.mean([pc.mean(t["connected"]).as_py() for t in whole]))
+            row["bottleneck_mbps"] = float(np.nanmedian([t["bottleneck_mbps"].to_numpy() for t in whole]))
         found.append(row)
     return found
 
@@ -246,34 +252,39 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Fly it all."""
+    """Fly what is asked for."""
+    parts: dict[str, tuple[str, Callable[[bool, tuple[int, ...]], list[dict[str, Any]]]]] = {
+        "fragments": ("(1 − q)^k, q = 0.001", lambda quick, _: fragments_table(2_000 if quick else 20_000)),
+        "framings": ("Framing over the loss of frames", lambda _, seeds: framings(LOSSES, seeds, "surrogate")),
+        "crowded": ("Framing where the channel is full", lambda _, seeds: crowded(seeds)),
+        "closed_ages": ("Ages in closed form", lambda _, seeds: closed_ages()),
+        "staleness": ("Ages as policies read them", lambda quick, seeds: staleness(seeds, 60 if quick else 120)),
+        "relay": ("Hops allowed", lambda _, seeds: relayed(seeds)),
+        "network": (
+            "Framing with the network",
+            lambda _, seeds: framings((0.0, 0.01, 0.1), seeds[:1], "torch", "duration_s=3"),
+        ),
+    }
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer samples and seeds")
-    parser.add_argument("--torch", action="store_true", help="a few frames with the network too")
+    parser.add_argument("--quick", action="store_true", help="fewer samples and one seed")
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--out", type=Path, default=OUT)
     asked = parser.parse_args()
-    seeds = (1,) if asked.quick else (1, 2, 3)
-    found: dict[str, Any] = {}
-
-    def tell(name: str, title: str, rows: list[dict[str, Any]]) -> None:
-        found[name] = rows
-        sys.stdout.write(markdown(title, rows) + "\n")
-        sys.stdout.flush()
-
-    tell("fragments", "(1 − q)^k, q = 0.001", fragments_table(2_000 if asked.quick else 20_000))
-    tell("framings", "Framing over the loss of frames (surrogate)", framings(LOSSES, seeds, "surrogate"))
-    tell("crowded", "Framing where the channel is full (surrogate)", crowded(seeds))
-    tell("closed_ages", "Ages in closed form", closed_ages())
-    tell("staleness", "Ages as policies read them", staleness(seeds, 60 if asked.quick else 300))
-    tell("relay", "Hops allowed", relayed(seeds))
-    if asked.torch:
-        tell("torch", "Framing with the network", framings((0.0, 0.01, 0.1), (1,), "torch", "duration_s=5"))
     asked.out.mkdir(parents=True, exist_ok=True)
-    new = asked.out / ".transport.json.new"
-    new.write_text(json.dumps(found, indent=1) + "\n")
-    new.replace(asked.out / "transport.json")
+    kept = asked.out / "transport.json"
+    found: dict[str, Any] = json.loads(kept.read_text()) if kept.is_file() else {}
+    for name in asked.only:
+        title, fly = parts[name]
+        rows = fly(asked.quick, (1,) if asked.quick else (1, 2, 3))
+        found[name] = [{k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+        sys.stdout.write(markdown(title, found[name]) + "\n")
+        sys.stdout.flush()
+        new = asked.out / ".transport.json.new"
+        new.write_text(json.dumps(found, indent=1) + "\n")
+        new.replace(kept)
     try:
-        figure(found["framings"], asked.out / "transport_framing.png")
+        if "framings" in found:
+            figure(found["framings"], asked.out / "transport_framing.png")
     except ImportError:
         sys.stdout.write("no matplotlib, no figure\n")
 
