@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from policies import baselines
+from policies import adaptive, baselines
 from policies.contract import Directive, FleetView, Policy, PolicyError
 from policies.deputies import deputies
 from policies.prior import METHODS
@@ -21,7 +21,10 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worst-2": baselines.worst_k,
     "random-2": baselines.random_k,
     "silence": baselines.silence,
+    "boxes": adaptive.boxes,
     "deputies": deputies,
+    "adaptive": adaptive.adaptive,
+    "learned": adaptive.learned,
     **{name: method.policy for name, method in METHODS.items()},
 }
 """One line a policy. Keyword-only arguments are its parameters."""

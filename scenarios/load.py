@@ -20,8 +20,9 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from scenarios.contexts import Contexts
 from scenarios.explain import explain
-from scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, nearest, plain, problems
+from scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, child, nearest, plain, problems
 from scenarios.schema import Scenario
 
 __all__ = ["ScenarioError", "dump", "library", "load", "loads"]
@@ -62,7 +63,7 @@ def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> S
 
 def read(path_or_name: str | Path) -> tuple[str, str]:
     """A file's text and its path; a bare name is looked up in the library first. Raises ScenarioError."""
-    path = {**library(), **campaigns()}.get(str(path_or_name), Path(path_or_name))
+    path = {**library(), **campaigns(), **context_sets()}.get(str(path_or_name), Path(path_or_name))
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -116,14 +117,36 @@ def dump(scenario: Scenario) -> str:
 
 def library() -> dict[str, Path]:
     """The shipped scenarios by name."""
-    return {path.stem: path for path in sorted(_LIBRARY.glob("*.yaml")) if path.stem not in campaigns()}
+    others = campaigns().keys() | context_sets().keys()
+    return {path.stem: path for path in sorted(_LIBRARY.glob("*.yaml")) if path.stem not in others}
 
 
 @functools.cache
 def campaigns() -> dict[str, Path]:
     """The shipped campaigns by name: files with `campaign` on top."""
+    return _with_on_top("campaign")
+
+
+@functools.cache
+def context_sets() -> dict[str, Path]:
+    """The shipped sets of contexts by name: files with `contexts` on top."""
+    return _with_on_top("contexts")
+
+
+def _with_on_top(key: str) -> dict[str, Path]:
     texts = {path: path.read_text("utf-8") for path in sorted(_LIBRARY.glob("*.yaml"))}
-    return {path.stem: path for path, text in texts.items() if re.search("^campaign:", text, re.MULTILINE)}
+    return {path.stem: path for path, text in texts.items() if re.search(f"^{key}:", text, re.MULTILINE)}
+
+
+def load_contexts(path_or_name: str | Path) -> Contexts | None:
+    """A set of contexts; None where the file holds something else, a scenario say.
+
+    Raises:
+        ScenarioError: as `load` does.
+    """
+    text, source = read(path_or_name)
+    root = tree(text, source)
+    return validated(root, Contexts) if child(root, "contexts") is not None else None
 
 
 # --- overrides and errors ------------------------------------------------------------------------

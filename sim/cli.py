@@ -18,13 +18,14 @@ from perception.errors import InputError
 from policies.contract import PolicyError
 from policies.registry import POLICIES, parameters
 from policies.registry import own_fusion as own_fusion_of
-from scenarios.load import ScenarioError, campaigns, library, load
+from scenarios.load import ScenarioError, campaigns, library, load, load_contexts
 from scenarios.schema import Scenario, json_schema
 from scenarios.traces import TraceError
 from sim import (
     cli_bench,
     cli_calibrate,
     cli_campaign,
+    cli_contexts,
     cli_export,
     cli_import,
     cli_paper,
@@ -139,7 +140,9 @@ def fly(
 @app.command()
 def compare(
     scenario: ScenarioArgument,
-    policies: Annotated[str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence.")],
+    policies: Annotated[
+        str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence; all: every one, over contexts.")
+    ],
     seed: SeedOption = None,
     set_: SetOption = None,
     own_fusion: Annotated[
@@ -148,7 +151,11 @@ def compare(
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
     recording: Annotated[Path | None, typer.Option(help="Save all of them side by side as a Rerun recording.")] = None,
 ) -> None:
-    """Fly a scenario under several policies, same seed and draws, and print them side by side."""
+    """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
+    contexts = load_contexts(scenario)
+    if contexts is not None:
+        chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
+        return cli_contexts.compare_contexts(contexts, chosen, set_ or [], out_file)
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
     if own_fusion:
         flown = [(p, _with_own_fusion(s)) for p, s in flown]
@@ -257,6 +264,7 @@ app.command()(cli_train.train)
 app.command()(cli_calibrate.calibrate)
 app.add_typer(cli_study.study, name="study")
 app.command()(cli_paper.paper)
+app.command()(cli_contexts.learn)
 app.command()(cli_verify.verify)
 app.command()(cli_verify.overhead)
 app.command()(cli_export.export)

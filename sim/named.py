@@ -18,4 +18,6 @@ def policy_overrides(text: str, own: str) -> list[str]:
     overrides = [f"policy.name={name}"]
     if bracket or name != own:
         overrides.append("policy.params={}")
+    if name != own:
+        overrides += ["policy.commands=[]", "policy.changes=[]"]  # it flies to the end
     return overrides + [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]

@@ -10,6 +10,7 @@ from sim_examples import example
 
 from policies.contract import PolicyError
 from scenarios.load import ScenarioError
+from sim.named import policy_overrides
 from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
@@ -108,6 +109,9 @@ def test_a_method_takes_its_handshakes_along() -> None:
 def test_a_policy_named_at_take_off_flies_to_the_end() -> None:
     changing = example("policy.changes=[{at_s: 1, name: silence}]")
     assert outcome(run_sortie(changing, "best-2"))["policies"]["changes"] == 0
+    assert (
+        example("policy.changes=[{at_s: 1, name: silence}]", *policy_overrides("best-2", "worked")).policy.changes == ()
+    )
 
 
 def test_the_worse_for_wear_is_refused_before_the_flight() -> None:

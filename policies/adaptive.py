@@ -1,0 +1,170 @@
+"""Adaptive policies: one byte budget, spent by what mission, link, battery and geometry ask for.
+
+Each decision picks an arm, a way to spend the budget: to how many peers, features or boxes, all that is seen or the
+mission's region alone. `adaptive` picks by rules that read budget, mission and coverage jointly; `learned` asks a
+small network that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
+
+`rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies: at equal
+`rho` no arm sends more bytes than they do.
+"""
+
+from __future__ import annotations
+
+import json
+from math import isfinite, log10
+from pathlib import Path
+from typing import NamedTuple
+
+from policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
+from policies.geometry import footprint_overlap, peers_by_overlap
+
+RATE_HZ, WEAK_RATE_HZ = 10.0, 2.0
+MIN_GOODPUT_MBPS = 5.0
+EVERYONE = 255
+LEARNED = Path(__file__).with_name("learned.json")
+
+
+class Arm(NamedTuple):
+    """A way to spend the budget."""
+
+    peers: int
+    """How many of the most overlapping peers get features and share the budget; more than there are is all."""
+    boxes: bool
+    """Whether the others get boxes; otherwise nothing."""
+    region: bool
+    """Features of the mission's region alone, where there is one."""
+
+    @property
+    def words(self) -> str:
+        """As it stands in a reason."""
+        who = "all" if self.peers >= EVERYONE else f"{self.peers}"
+        rest = ", boxes to the rest" if self.boxes and self.peers < EVERYONE else ""
+        return f"features{' of the region' if self.region else ''} to {who}{rest}" if self.peers else "boxes to all"
+
+
+ARMS: tuple[Arm, ...] = (
+    Arm(EVERYONE, True, False),
+    Arm(2, False, False),
+    Arm(2, True, False),
+    Arm(1, True, False),
+    Arm(0, True, False),
+    Arm(EVERYONE, True, True),
+    Arm(2, True, True),
+)
+"""What the adaptive policies choose from."""
+MAPS, BOXES = ARMS[0], ARMS[4]
+ENOUGH_TRACKING, ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.3, 0.03, 0.06
+"""Budgets from which on feature cells find more than boxes, as `sortie learn`'s training contexts had it."""
+MUCH_OVERLAP = 0.65
+
+
+def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
+    """The directives of an arm: the budget shared evenly by the chosen peers; a weak link carries boxes at 2 Hz.
+
+    Args:
+        view: the fleet's latest descriptors.
+        arm: how to spend.
+        rho: the budget, 0 … 1 of full sharing over all links.
+        why: the reason, before the arm's own words.
+    """
+    me = view.me
+    if me is None:
+        return []
+    ego, peers = view.ego, view.peers
+    chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
+    per_link = min(1.0, rho * len(peers) / len(chosen)) if chosen else 0.0
+    roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
+    reason = f"{why}: {arm.words}"
+    directives = []
+    for peer in peers:
+        weak = me.goodput_to(peer) < MIN_GOODPUT_MBPS
+        if peer in chosen and not weak:
+            directives.append(Directive(ego, peer, Representation.FEATURES, per_link, roi, RATE_HZ, reason=reason))
+        elif peer in chosen or arm.boxes:
+            rate_hz = WEAK_RATE_HZ if weak else RATE_HZ
+            directives.append(Directive(ego, peer, Representation.DETECTIONS, 0.0, None, rate_hz, reason=reason))
+        else:
+            directives.append(nothing(ego, peer, reason))
+    return directives
+
+
+def arm(view: FleetView, *, index: int = 0, rho: float = 0.25) -> list[Directive]:
+    """One arm, always: what the adaptive policies choose from, for `sortie learn` and comparisons."""
+    return spend(view, ARMS[index % len(ARMS)], rho, "fixed arm")
+
+
+FEATURES = ("log10 of the budget", "tracking a region", "mean overlap of peers", "log10 of 1 + mean goodput", "charge")
+
+
+def features(view: FleetView, rho: float) -> tuple[float, ...]:
+    """What the learned policy reads, in the order of `FEATURES`: budget, mission, coverage, links, battery."""
+    me = view.me
+    if me is None:
+        return (0.0,) * len(FEATURES)
+    peers = view.peers
+    overlap = sum(footprint_overlap(me, view.descriptors[p]) for p in peers) / len(peers) if peers else 0.0
+    goodput_mbps = sum(me.goodput_to(p) for p in peers) / len(peers) if peers else 0.0
+    tracking = me.task_phase == TaskPhase.TRACK and me.region is not None
+    return log10(max(rho, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
+
+
+def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """Boxes to every peer, whatever the context and the budget: the cheapest sharing that there is."""
+    return spend(view, BOXES, rho, "fixed")
+
+
+def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """Rules over budget, mission and coverage: cells where the budget carries enough of them, boxes where it does not.
+
+    A starved budget sends so few cells that boxes, at a fraction of the bytes, find more. A drone that tracks has to
+    find what stands in one small region, which boxes tell as well; one that searches gains by cells sooner, and later
+    where its peers see much the same as it does.
+    """
+    if view.me is None:
+        return []
+    _, tracking, overlap, _, _ = features(view, rho)
+    if tracking:
+        enough, why = ENOUGH_TRACKING, "track"
+    elif overlap >= MUCH_OVERLAP:
+        enough, why = ENOUGH_OVERLAPPING, "search, much overlap"
+    else:
+        enough, why = ENOUGH_SEARCHING, "search"
+    if rho < enough:
+        return spend(view, BOXES, rho, f"{why}, budget {rho:g} < {enough:g}")
+    return spend(view, MAPS, rho, f"{why}, budget {rho:g} ≥ {enough:g}")
+
+
+def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """The arm that promises most by what simulated sorties taught (`sortie learn`); ties go to the earlier arm."""
+    seen = features(view, rho)
+    z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
+    gains = [w[0] + sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
+    best = max(range(len(ARMS)), key=lambda k: gains[k])
+    return spend(view, ARMS[best], rho, "learned")
+
+
+class Model(NamedTuple):
+    """What `sortie learn` stores: per arm, the AP gained over the first arm as a linear function of `FEATURES`."""
+
+    mean: tuple[float, ...]
+    scale: tuple[float, ...]
+    weights: tuple[tuple[float, ...], ...]
+    """[arms][1 + features], intercept first."""
+
+
+def read_model(path: Path) -> Model:
+    """A stored model.
+
+    Raises:
+        ValueError: its shapes do not fit `FEATURES` and `ARMS`, or a number is not finite.
+    """
+    data = json.loads(path.read_text("utf-8"))
+    model = Model(tuple(data["mean"]), tuple(data["scale"]), tuple(tuple(w) for w in data["weights"]))
+    numbers = [*model.mean, *model.scale, *(x for w in model.weights for x in w)]
+    shapes = {len(model.mean), len(model.scale), *(len(w) - 1 for w in model.weights)}
+    if shapes != {len(FEATURES)} or len(model.weights) != len(ARMS) or not all(map(isfinite, numbers)):
+        raise ValueError(f"{path}: must hold {len(ARMS)} arms of 1 + {len(FEATURES)} finite weights")
+    return model
+
+
+_MODEL = read_model(LEARNED)  # once, when the policy is loaded: a decision reads no file

@@ -1,0 +1,75 @@
+"""`sortie compare` over a set of contexts, and `sortie learn`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from policies.adaptive import ARMS, LEARNED
+from policies.registry import resolve
+from scenarios.contexts import Contexts
+from sim.console import bars, out
+from sim.contexts import best_fixed, fly_all, summarise
+from sim.folders import write_text
+from sim.tables import size
+
+
+def compare_contexts(contexts: Contexts, policies: Sequence[str], sets: Sequence[str], out_file: Path | None) -> None:
+    """Fly every policy in every context, print AP by context and the sums, keep both as JSON."""
+    for policy in policies:
+        resolve(policy)
+    contexts = contexts.model_copy(update={"set": (*contexts.set, *sets)})
+    with bars() as bar:
+        each = {p: bar(p, len(contexts.contexts)) for p in policies}
+        cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k))
+    rows = summarise(cells)
+    at = {(c.policy, c.context): c for c in cells}
+    table = Table("AP@0.5", "rho", *policies, title="by context; mission AP where the fleet tracks")
+    for c in contexts.contexts:
+        best = max(at[p, c.name].ap for p in policies)
+        figures = [at[p, c.name].ap for p in policies]
+        table.add_row(c.name, f"{c.rho:g}", *(f"[bold]{a:.3f}[/bold]" if a == best else f"{a:.3f}" for a in figures))
+    out.print(table)
+    fixed = best_fixed(rows)
+    over = f"over {fixed}, AP points, 95 %"
+    table = Table("policy", "mean AP", over, "of the oracle", "data a sortie", "energy", "missed", title="all contexts")
+    for r in rows:
+        gain, low, high = (100 * g for g in r.gain)
+        table.add_row(
+            r.policy, f"{r.ap:.3f}", "–" if r.policy == fixed else f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]",
+            f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f} kJ", f"{r.miss_rate:.1%}",
+        )  # fmt: skip
+    out.print(table)
+    out.print("[dim]the oracle takes the best fixed policy of each context; intervals resample contexts in pairs[/dim]")
+    if out_file is not None:
+        found = {"summary": [asdict(r) for r in rows], "cells": [asdict(c) for c in cells]}
+        write_text(out_file, json.dumps(found, indent=1) + "\n")
+        out.print(f"kept in [bold]{out_file}[/bold]")
+
+
+def learn(
+    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 48,
+    seed: Annotated[int, typer.Option(help="Of the training contexts.", min=0)] = 0,
+    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
+    out_file: Annotated[
+        Path, typer.Option("--out", help="Where the fit is kept; left out, the policy's own.")
+    ] = LEARNED,
+) -> None:
+    """Fit the policy `learned`: fly every arm in drawn contexts with the surrogate detector, and regress AP on what a policy sees."""
+    from sim.learn import fly_lessons, save
+
+    with bars() as bar:
+        lessons = fly_lessons(seed, contexts, workers=workers, progress=bar("contexts", contexts))
+    save(out_file, lessons, seed)
+    table = Table("arm", "mean AP", "best in")
+    for k, arm in enumerate(ARMS):
+        wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
+        table.add_row(arm.words, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
+    out.print(table)
+    out.print(f"kept in [bold]{out_file}[/bold]")

@@ -1,0 +1,139 @@
+"""Policies over a set of contexts: each flown in each, at the same budget, seeds and draws; summed up in pairs."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.ap import average_precision
+from policies.registry import POLICIES, parameters, resolve
+from scenarios.contexts import Context, Contexts
+from scenarios.load import load
+from scenarios.schema import Scenario
+from sim.outcome import matched, outcome
+from sim.sortie import run_sortie
+
+FIXED = ("all-4", "best-2", "worst-2", "random-2", "fixed-compression", "silence")
+"""Policies that do the same whatever the context; the best of them, and the best of them in each context, are the
+paper's two yardsticks."""
+DRAWS = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One policy in one context, over all seeds."""
+
+    policy: str
+    context: str
+    ap: float
+    """AP@0.5 by the context's metric."""
+    data_bytes: float
+    """Sent, a sortie."""
+    energy_j: float
+    miss_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """One policy over all contexts."""
+
+    policy: str
+    ap: float
+    gain: tuple[float, float, float]
+    """Mean AP over that of the best fixed policy, with its 95 % interval: contexts resampled in pairs."""
+    of_oracle: float
+    """Mean AP over that of the best fixed policy of each context."""
+    data_bytes: float
+    energy_j: float
+    miss_rate: float
+
+
+def fly_all(
+    contexts: Contexts, policies: Sequence[str], *, progress: Callable[[str, int], None] | None = None
+) -> list[Cell]:
+    """Every policy in every context; the budget goes to every policy that takes one.
+
+    Args:
+        progress: called with the policy and how many of its contexts are flown.
+
+    Raises:
+        ScenarioError, PolicyError: a context or policy that cannot be flown, before anything is.
+    """
+    planned = [(p, c, [scenario_of(contexts, c, p)] * len(contexts.seeds)) for p in policies for c in contexts.contexts]
+    cells: list[Cell] = []
+    for k, (policy, context, scenarios) in enumerate(planned):
+        cells.append(_fly(policy, context, scenarios, contexts.seeds))
+        if progress is not None:
+            progress(policy, k % len(contexts.contexts) + 1)
+    return cells
+
+
+def scenario_of(contexts: Contexts, context: Context, policy: str) -> Scenario:
+    """A context's scenario under a policy, within the context's budget."""
+    scenario = load(contexts.base, [*contexts.set, *context.set, f"policy.name={policy}", "policy.params={}"])
+    function = resolve(policy)
+    inner = function.func if isinstance(function, functools.partial) else function
+    budget = {"rho": context.rho} if "rho" in parameters(inner) else {}
+    return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"params": budget})})
+
+
+def _fly(policy: str, context: Context, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> Cell:
+    frames, results = [], []
+    for scenario, seed in zip(scenarios, seeds, strict=True):
+        record = run_sortie(scenario, None, seed)
+        frames += list(matched(record, mission=context.metric == "mission").values())
+        results.append(outcome(record))
+    ap = average_precision(frames) if frames else float("nan")
+    return Cell(
+        policy,
+        context.name,
+        float(ap),
+        float(np.mean([r["bytes"]["data_sent"] + r["bytes"]["handshakes_sent"] for r in results])),
+        float(np.mean([r["energy_j"]["total"] for r in results])),
+        float(np.mean([r["deadline_miss_rate"] or 0.0 for r in results])),
+    )
+
+
+def summarise(cells: Sequence[Cell]) -> list[Summary]:
+    """Every policy's means over the contexts, against the best fixed policy flown and each context's best fixed one."""
+    policies = list(dict.fromkeys(c.policy for c in cells))
+    contexts = list(dict.fromkeys(c.context for c in cells))
+    at = {(c.policy, c.context): c for c in cells}
+    ap = {p: np.array([at[p, c].ap for c in contexts]) for p in policies}
+    fixed = [p for p in policies if p in FIXED] or policies[:1]
+    best = max(fixed, key=lambda p: float(np.nanmean(ap[p])))
+    oracle = np.nanmean(np.max([ap[p] for p in fixed], axis=0))
+    rows = []
+    for p in policies:
+        mine = [at[p, c] for c in contexts]
+        low, high = paired_interval(ap[p] - ap[best])
+        mean = float(np.nanmean(ap[p]))
+        rows.append(
+            Summary(
+                p, mean, (mean - float(np.nanmean(ap[best])), low, high), mean / float(oracle),
+                float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
+                float(np.mean([c.miss_rate for c in mine])),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def best_fixed(rows: Sequence[Summary]) -> str:
+    """The fixed policy that the gains are over."""
+    return next(r.policy for r in rows if r.gain == (0.0, 0.0, 0.0))
+
+
+def paired_interval(differences: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean difference over contexts [n]."""
+    rng = np.random.default_rng(seed)
+    means = differences[rng.integers(0, len(differences), (DRAWS, len(differences)))].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def all_policies() -> list[str]:
+    """Every registered policy."""
+    return list(POLICIES)

@@ -1,0 +1,125 @@
+"""Learning to spend a budget: simulated sorties under every arm of `policies.adaptive`, and what they teach.
+
+An offline contextual bandit. Training contexts are drawn from ranges that the held-out set
+(`scenarios/library/contexts.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that
+arms differ by nothing but themselves. Per arm, ridge regression predicts the AP gained over the first arm from what a
+policy sees (`policies.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perception.ap import average_precision
+from policies.adaptive import ARMS, features, spend
+from policies.contract import Directive, FleetView
+from scenarios.load import load
+from scenarios.schema import Scenario
+from scenarios.streams import stream
+from sim.folders import write_text
+from sim.outcome import matched
+from sim.sortie import run_sortie
+
+BUDGETS = (0.01, 0.04, 0.2)
+SPACINGS_M = (15, 20, 30)
+SHAPES, STYLES = ("cross", "grid"), ("town", "old_town")
+CHARGES = (0.95, 0.5)
+RADII_M = (28, 36)
+SECONDS = 12
+RIDGE = 3.0
+"""Shrinkage of the slopes towards none; the mean gain of an arm is not shrunk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """One training context: what a policy saw in it, and every arm's AP."""
+
+    features: tuple[float, ...]
+    ap: tuple[float, ...]
+    context: str
+
+
+def draw_context(seed: int, number: int) -> tuple[Scenario, float]:
+    """Training context `number` of a seed: a scenario and its budget."""
+    rng = stream(seed, number, (), "learn.context")
+    rho = float(rng.choice(BUDGETS))
+    tracking = bool(rng.random() < 0.5)
+    region = f", region: {{radius_m: {rng.choice(RADII_M)}}}"
+    phase = f"{{at_s: 0, phase: {'track' if tracking else 'search'}{region if tracking else ''}}}"
+    sets = [
+        "perception.detector=surrogate",
+        f"duration_s={SECONDS}",
+        "fleet.route.waypoints_m=[[-60, 0], [20, 0]]",
+        "mission.target.waypoints_m=[[-60, -1.75], [200, -1.75]]",
+        f"mission.phases=[{phase}]",
+        f"fleet.formation.shape={rng.choice(SHAPES)}",
+        f"fleet.formation.spacing_m={rng.choice(SPACINGS_M)}",
+        f"perception.scene.style={rng.choice(STYLES)}",
+        f"perception.scene.seed={int(rng.integers(1000, 10**6))}",
+        f"fleet.battery.initial_soc={rng.choice(CHARGES)}",
+        f"seed={int(rng.integers(1, 10**6))}",
+    ]
+    return load("track_target", sets), rho
+
+
+def fly_lesson(seed: int, number: int) -> Lesson:
+    """Fly every arm in a training context."""
+    scenario, rho = draw_context(seed, number)
+    mission = scenario.mission.phases[0].phase == "track"
+    seen: list[tuple[float, ...]] = []
+    aps = []
+    for index, arm in enumerate(ARMS):
+
+        def decide(view: FleetView, index: int = index, arm: object = arm) -> list[Directive]:
+            if index == 0:
+                seen.append(features(view, rho))
+            return spend(view, ARMS[index], rho, "lesson")
+
+        record = run_sortie(scenario, decide)
+        frames = list(matched(record, mission=mission).values())
+        aps.append(average_precision(frames))
+    settled = np.mean(seen[len(seen) // 2 :], axis=0)
+    about = f"rho {rho:g}, {'track' if mission else 'search'}, {scenario.fleet.formation.shape}"
+    return Lesson(tuple(float(x) for x in settled), tuple(float(a) for a in aps), about)
+
+
+def fly_lessons(
+    seed: int, count: int, *, workers: int = 1, progress: Callable[[int], None] | None = None
+) -> list[Lesson]:
+    """Lessons of so many contexts; those in which AP is undefined are left out."""
+    with ProcessPoolExecutor(max_workers=workers) as pool:
+        lessons = []
+        for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count))):
+            if progress is not None:
+                progress(k + 1)
+            if np.isfinite(lesson.ap).all():
+                lessons.append(lesson)
+    return lessons
+
+
+def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
+    """Per arm, the gain over the first arm as a linear function of the features, by ridge regression.
+
+    Returns:
+        `mean` and `scale` [F] of the features, and `weights` [arms][1 + F], intercept first.
+    """
+    x = np.array([lesson.features for lesson in lessons])
+    gain = np.array([np.array(lesson.ap) - lesson.ap[0] for lesson in lessons])
+    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+    z = (x - mean) / scale
+    slopes = np.linalg.solve(z.T @ z + RIDGE * np.eye(z.shape[1]), z.T @ (gain - gain.mean(axis=0)))
+    weights = np.vstack([gain.mean(axis=0), slopes]).T
+    return {"mean": mean.tolist(), "scale": scale.tolist(), "weights": weights.tolist()}
+
+
+def save(path: Path, lessons: list[Lesson], seed: int) -> None:
+    """Write the fit, with how it was made."""
+    fitted = fit(lessons)
+    about = f"sortie learn, {len(lessons)} contexts of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
+    write_text(path, json.dumps({"about": about, **fitted}, indent=1) + "\n")

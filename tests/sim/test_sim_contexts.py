@@ -1,0 +1,147 @@
+"""Policies over sets of contexts, and learning from training contexts."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from policies.adaptive import ARMS, FEATURES, read_model
+from policies.registry import POLICIES
+from scenarios.contexts import Contexts
+from scenarios.load import ScenarioError, context_sets, library, load_contexts
+from sim import learn
+from sim.cli import main
+from sim.contexts import Cell, best_fixed, paired_interval, scenario_of, summarise
+from sim.learn import Lesson, draw_context, fit, save
+
+SMALL = """
+base: track_target
+set: [perception.detector=surrogate, duration_s=3, "mission.phases=[{at_s: 0, phase: search}]", policy.dwell_s=0.3]
+contexts:
+  - {name: poor, rho: 0.02}
+  - {name: rich, rho: 0.25, set: [fleet.formation.shape=line]}
+"""
+
+
+def held_out() -> Contexts:
+    contexts = load_contexts("contexts")
+    assert contexts is not None
+    return contexts
+
+
+def test_the_held_out_contexts_load_under_every_policy_at_their_budget() -> None:
+    assert "contexts" in context_sets()
+    assert "contexts" not in library()
+    contexts = held_out()
+    for context in contexts.contexts:
+        for policy in POLICIES:
+            scenario = scenario_of(contexts, context, policy)
+            assert scenario.policy.params.get("rho", context.rho) == context.rho
+        assert (context.metric == "mission") == (scenario.mission.phases[0].phase == "track")
+
+
+def test_no_held_out_context_is_one_of_training() -> None:
+    for context in held_out().contexts:
+        scenario = scenario_of(held_out(), context, "all-4")
+        assert context.rho not in learn.BUDGETS
+        assert scenario.fleet.formation.shape not in learn.SHAPES
+        assert scenario.perception.scene.seed not in range(1000, 10**6)
+
+
+def test_an_unknown_field_of_a_context_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(SMALL.replace("rho: 0.02", "rho: 2"))
+    with pytest.raises(ScenarioError, match=r"contexts\.0\.rho"):
+        load_contexts(path)
+    path.write_text(SMALL.replace("name: rich", "name: poor"))
+    with pytest.raises(ScenarioError, match="'poor', must be named once"):
+        load_contexts(path)
+
+
+def cell(policy: str, context: str, ap: float) -> Cell:
+    return Cell(policy, context, ap, 1e6, 1e3, 0.0)
+
+
+def test_gains_are_over_the_best_fixed_policy_and_the_oracle_takes_the_best_of_each_context() -> None:
+    ap = {"all-4": (0.4, 0.2, 0.3), "best-2": (0.2, 0.3, 0.3), "learned": (0.5, 0.3, 0.4)}
+    rows = summarise([cell(p, f"c{k}", a) for p, values in ap.items() for k, a in enumerate(values)])
+    by_name = {r.policy: r for r in rows}
+    assert best_fixed(rows) == "all-4"
+    assert by_name["all-4"].gain == (0.0, 0.0, 0.0)
+    assert by_name["learned"].gain[0] == pytest.approx(0.1)
+    assert by_name["learned"].gain[1:] == pytest.approx((0.1, 0.1)), "the same gain in every context"
+    assert by_name["learned"].of_oracle == pytest.approx(1.2 / 1.0)
+    assert by_name["best-2"].gain[1] < 0 < by_name["best-2"].gain[2]
+
+
+def test_the_interval_of_a_known_mean() -> None:
+    differences = np.array([-1.0, 1.0] * 50)
+    low, high = paired_interval(differences)
+    assert low == pytest.approx(-0.196, abs=0.03), "1.96 standard errors of a tenth"
+    assert high == pytest.approx(0.196, abs=0.03)
+
+
+def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = tmp_path / "small.yaml", tmp_path / "out.json"
+    path.write_text(SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", "all-4,boxes", "--out", str(out)])
+        patch.setenv("COLUMNS", "200")
+        with pytest.raises(SystemExit) as stop:
+            main()
+    assert not stop.value.code
+    printed = capsys.readouterr().out
+    assert "over all-4" in printed
+    kept = json.loads(out.read_text())
+    assert [r["policy"] for r in kept["summary"]] == ["all-4", "boxes"]
+    assert len(kept["cells"]) == 4
+    assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
+
+
+# --- learning ------------------------------------------------------------------------------------
+
+
+def test_training_contexts_are_drawn_from_their_streams() -> None:
+    first, rho = draw_context(0, 3)
+    again, same_rho = draw_context(0, 3)
+    other, _ = draw_context(0, 4)
+    assert (first, rho) == (again, same_rho)
+    assert other != first
+    assert rho in learn.BUDGETS
+
+
+def planted(rng: np.random.Generator, noise: float) -> Lesson:
+    """Arm 4 gains below a log-budget of −1.4, arm 1 loses always."""
+    x = rng.normal(size=len(FEATURES))
+    ap = np.full(len(ARMS), 0.3)
+    ap[4] -= 0.05 * x[0]
+    ap[1] -= 0.1
+    return Lesson(tuple(x), tuple(ap + noise * rng.normal(size=len(ARMS))), "")
+
+
+def test_the_fit_finds_planted_gains(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    lessons = [planted(rng, 0.002) for _ in range(200)]
+    save(tmp_path / "model.json", lessons, 0)
+    model = read_model(tmp_path / "model.json")
+    assert model.weights[1][0] == pytest.approx(-0.1, abs=0.002)
+    slope = model.weights[4][1] / model.scale[0]
+    assert slope == pytest.approx(-0.05, abs=0.003)
+    assert np.abs(np.array(model.weights[2])).max() < 0.002, "an arm without effect has none"
+    assert model.weights[0] == (0.0,) * 6, "gains are over the first arm"
+
+
+def test_one_lesson_leaves_no_slope() -> None:
+    fitted = fit([planted(np.random.default_rng(1), 0.0)])
+    assert np.allclose(np.array(fitted["weights"])[:, 1:], 0)
+
+
+def test_a_model_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps({"mean": [0] * 5, "scale": [1] * 5, "weights": [[0] * 6] * 3}))
+    with pytest.raises(ValueError, match=r"must hold 7 arms of 1 \+ 5 finite weights"):
+        read_model(path)
