@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, cast
 import simpy
 
 from fleet.auth import Dropped, DropReason, Inbox, Opened, Sealer
+from fleet.compact import FULL, Form, encode_compact
 from fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from fleet.gate import Gate, Payload, make_payload
 from fleet.senses import Sensed
@@ -57,6 +58,15 @@ class PlaneRules:
     """Features go as tiles of at most so many bytes; None: as one sample."""
     trust: bool = False
     """Whether peers' claims are judged (`fleet.trust`)."""
+    publish_every: int = 1
+    """A descriptor every so many frames; staleness counts in periods of that length."""
+    form: Form = FULL
+    """How finely descriptors are written."""
+
+    @property
+    def descriptor_period_s(self) -> float:
+        """From one descriptor of a drone to its next."""
+        return self.period_s * self.publish_every
 
 
 class Received(NamedTuple):
@@ -146,7 +156,9 @@ class Agent:
         self._log = log
         self._sealer = sealer
         self._phase_s = phase_s
-        self._fresh_s = rules.period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
+        self._period_s = rules.descriptor_period_s
+        self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
+        self._fresh_s = self._period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, _Link] = {}
@@ -208,7 +220,7 @@ class Agent:
 
     def _tick(self, frame: int) -> None:
         sensed = self._senses.sense(frame)
-        self._hold(self._publish(sensed))
+        self._hold(self._publish(sensed, due=frame % self._rules.publish_every == 0))
         if self._rules.trust and frame % self._judged_every == 0:
             self._judge()
         self._decide()
@@ -220,8 +232,8 @@ class Agent:
 
     # --- the context plane ---------------------------------------------------------------------
 
-    def _publish(self, sensed: Sensed) -> Descriptor:
-        """Publish this frame's descriptor; returns it as every peer reads it, rounded by the wire."""
+    def _publish(self, sensed: Sensed, due: bool) -> Descriptor:
+        """Publish this frame's descriptor, where one is due; returns it as every peer reads it, rounded by the wire."""
         capture, velocity_mps, footprint_m, grid, novel = sensed
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids = self._senses.task()
@@ -243,15 +255,17 @@ class Agent:
             region=region,
             priority_target_ids=target_ids,
         )
+        if not due:
+            return decode_descriptor(self._encode(descriptor))
         told = descriptor
         for lie in self.lies.values():
             told = lie(told)
-        payload = encode_descriptor(told)
+        payload = self._encode(told)
         datagram = payload if self._sealer is None else self._sealer.seal(payload)
         self._modem.broadcast(datagram)
         self._log.descriptor(self.env.now, told, len(datagram))
         # a liar decides by what is true
-        return decode_descriptor(payload if told is descriptor else encode_descriptor(descriptor))
+        return decode_descriptor(payload if told is descriptor else self._encode(descriptor))
 
     def _ages_s(self) -> dict[int, float]:
         """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
@@ -267,7 +281,7 @@ class Agent:
         """Hold what peers claimed in the last second against what is known otherwise."""
         now_s, before = self.env.now, self._standings
         heard = {i: d for i, d in self._known.items() if now_s - self._heard_at_s[i] <= self._fresh_s}
-        self._standings = after = judge(before, self.drone, heard, self._arrivals)
+        self._standings = after = judge(before, self.drone, heard, self._arrivals, self._rules.form)
         self._arrivals = {}
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
         for peer in heard:
@@ -280,7 +294,7 @@ class Agent:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
-        view = FleetView(me, self._rules.period_s, known, ages_s)
+        view = FleetView(me, self._period_s, known, ages_s)
         begin_ns = time.perf_counter_ns()
         directives = self.policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
@@ -304,7 +318,7 @@ class Agent:
         rules, before = self._rules, link.state
         fidelity, link.asked, capped = LinkHealth.FRESH, asked, asked
         if age_s > self._fresh_s:
-            fidelity = health(age_s, rules.period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            fidelity = health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
             link.asked, capped = None, cap_by_age(asked, fidelity, age_s)
         link.state = after = damp(before, capped, now_s, rules.dwell_s)
         if after.enforced is not before.enforced and after.enforced != before.enforced:
@@ -329,7 +343,7 @@ class Agent:
 
     def _shake_hands(self, capture: Capture) -> None:
         """What the method asks and answers before payloads, to every peer that is not detached."""
-        limit_s = self._rules.period_s * self._rules.detached_after_periods
+        limit_s = self._period_s * self._rules.detached_after_periods
         for peer, age_s in self._ages_s().items():
             if peer != self.drone and age_s <= limit_s:
                 self._modem.handshake(peer, self.handshake_bytes, capture, self._rules.period_s)

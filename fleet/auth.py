@@ -26,6 +26,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from fleet.cdr import MalformedDatagram
+from fleet.compact import MAGIC, MIN_COMPACT_BYTES
 from fleet.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
 from policies.contract import Descriptor
 
@@ -125,8 +126,9 @@ def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dro
     size = len(data) - trailer
     if size > MAX_DESCRIPTOR_BYTES:
         return Dropped(DropReason.OVERSIZED, f"payload of {size} B, must be at most {MAX_DESCRIPTOR_BYTES}")
-    if size < MIN_DESCRIPTOR_BYTES:
-        return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {MIN_DESCRIPTOR_BYTES + trailer}")
+    least = MIN_COMPACT_BYTES if data[:1] == bytes([MAGIC]) else MIN_DESCRIPTOR_BYTES
+    if size < least:
+        return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {least + trailer}")
     key_id, counter, payload = None, 0, data
     if keys is not None:
         key_id, counter = _STAMP.unpack_from(data, size)

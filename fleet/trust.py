@@ -10,6 +10,7 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from statistics import median
@@ -17,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fleet.compact import FULL, Form
 from fleet.coverage import RANGE_M, unpack_grid
 from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
@@ -91,6 +93,7 @@ def judge(
     ego: int,
     known: Mapping[int, Descriptor],
     arrivals: Mapping[int, Sequence[Arrival]],
+    form: Form = FULL,
 ) -> dict[int, Standing]:
     """What `ego` thinks of everyone after one more second.
 
@@ -98,6 +101,7 @@ def judge(
         standings: what it thought, itself included; empty at first.
         known: the latest descriptor of every drone that it heard lately, and its own.
         arrivals: payloads that reached it in this second, by sender.
+        form: how finely descriptors are written; what rounding can do is no doubt.
 
     Returns:
         Standings of all in `known`, and of others unchanged: one strike more where a claim cannot be so, one less
@@ -112,9 +116,9 @@ def judge(
         others = [rate for i, rate in fell_per_s.items() if i != peer]
         others_fell = median(others) * standing.seconds if others else 0.0
         doubt = peer != ego and (
-            coverage_doubt(claim, seen_per_metre)
+            (math.isfinite(form.blur_m) and coverage_doubt(claim, seen_per_metre, form.blur_m))
             or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
-            or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell)
+            or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell, form.soc_step)
         )
         if doubt:
             standing = standing._replace(strikes=min(standing.strikes + 1, MOST_STRIKES), reason=doubt)
@@ -143,16 +147,17 @@ def discounted(d: Descriptor) -> Descriptor:
 
 
 @lru_cache(maxsize=1024)  # a claim is judged by everyone who heard it
-def coverage_doubt(d: Descriptor, seen_per_metre: float) -> str:
+def coverage_doubt(d: Descriptor, seen_per_metre: float, blur_m: float = 0.0) -> str:
     """What a coverage grid says that its pose forbids; empty where it may be so.
 
     Args:
         d: the claim.
         seen_per_metre: footprint radius over height, as the fleet's cameras have it.
+        blur_m: how far a cell may be off by the descriptor's form.
     """
     x_m, y_m, z_m = d.position_m
     radius_m = min(d.footprint_radius_m, max(0.0, z_m) * seen_per_metre * 1.1)
-    margin_m = MISPLACED_M + float(np.hypot(*d.velocity_mps[:2])) * 0.1
+    margin_m = MISPLACED_M + blur_m + float(np.hypot(*d.velocity_mps[:2])) * 0.1
     row, column = d.coverage_corner
     along = np.arange(COVERAGE_CELLS) + 0.5
     away_m = np.hypot((column + along) * COVERAGE_CELL_M - x_m, ((row + along) * COVERAGE_CELL_M - y_m)[:, None])
@@ -181,18 +186,21 @@ def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival]) -> str:
     return ""
 
 
-def battery_doubt(claimed_soc: float, least_soc: float, first_soc: float, others_fell: float) -> str:
+def battery_doubt(
+    claimed_soc: float, least_soc: float, first_soc: float, others_fell: float, soc_step: float = 0.0
+) -> str:
     """What a charge says against the past and the fleet's; empty where it may be so.
 
     Args:
         claimed_soc: the claim.
         least_soc, first_soc: the least that it claimed before, and the first.
         others_fell: by how much the fleet's charge fell since the first, in the median.
+        soc_step: the least difference that shows.
     """
     if claimed_soc > least_soc + RISE:
         return f"battery: {claimed_soc:.0%} after {least_soc:.0%}"
     fell = first_soc - claimed_soc
-    if others_fell >= FALL and fell < FALL_SHARE * others_fell:
+    if others_fell >= FALL + 3 * soc_step and fell < FALL_SHARE * others_fell:
         return f"battery: fell by {fell:.1%} while the fleet's fell by {others_fell:.1%}"
     return ""
 

@@ -16,6 +16,7 @@ import simpy
 from fleet.agent import Agent, PlaneRules
 from fleet.auth import Sealer
 from fleet.battery import FleetBatteries
+from fleet.compact import Form
 from fleet.frames import up_vector
 from fleet.motion import fly
 from fleet.traces import follow, read_traces
@@ -125,6 +126,8 @@ def run_sortie(
         compute_delay_s=config.compute_delay_s,
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=scenario.context.trust,
+        publish_every=scenario.context.publish_every,
+        form=Form(scenario.context.grid_cells, scenario.context.grid_bits, scenario.context.number_bits),
     )
     audit = Audit(env, recorder)
     pilots = [Pilot(i, flight_plan, audit) for i in range(n)]
