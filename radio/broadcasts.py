@@ -30,7 +30,7 @@ class Broadcast(GroupFrame):
         self, sender: int, airtime_s: float, slots: int, residual: float, mpdu_bytes: int, on_heard: OnHeard
     ) -> None:
         self.sender, self.airtime_s, self.slots = sender, airtime_s, slots  # as GroupFrame, in one go
-        self.fire_s, self.joined = inf, False
+        self.fire_s = inf
         self.residual = residual
         self.mpdu_bytes = mpdu_bytes
         self.on_heard = on_heard

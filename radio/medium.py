@@ -16,10 +16,11 @@ air. A timer that turns out to be early because others joined is set anew; it ne
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import Enum
-from heapq import heapify, heappop, heappush
+from heapq import heappop, heappush
 from math import inf, nan, nextafter
 from typing import Generic, TypeVar
 
@@ -90,14 +91,13 @@ _IDLE_ALONE_S = contention(1).idle_s
 class GroupFrame:
     """One group-addressed frame; subclassed by what knows its content."""
 
-    __slots__ = ("airtime_s", "fire_s", "joined", "sender", "slots")
+    __slots__ = ("airtime_s", "fire_s", "sender", "slots")
 
     def __init__(self, sender: int, airtime_s: float, slots: int) -> None:
         self.sender = sender
         self.airtime_s = airtime_s
         self.slots = slots
         self.fire_s = inf
-        self.joined = False
 
 
 J = TypeVar("J", bound=Job)
@@ -146,8 +146,7 @@ class Medium(Generic[J, F]):
         self._context_target_s = inf  # when the frame that is to win ends, as the clock will say it
         self._context_due_s = inf
         self._context_timer: simpy.Event | None = None
-        self._coming: list[tuple[float, int, F, float]] = []  # by when they will contend
-        self._soonest: list[tuple[float, int, F]] = []  # by when they end if nothing holds them up
+        self._coming: list[tuple[float, int, float, F, float]] = []  # the next to contend comes last
         self.transmit_s = [0.0] * n_drones
         """Seconds each drone has transmitted: data with retries and collisions, and context frames."""
         self.data_busy_s = 0.0
@@ -241,9 +240,9 @@ class Medium(Generic[J, F]):
     def _admit(self, now: float) -> None:
         """Let the frames contend whose time has come."""
         coming = self._coming
-        while coming and coming[0][0] <= now:
-            at_s, _, frame, residual = heappop(coming)
-            self._join(frame, residual, at_s)
+        while coming and -coming[-1][0] <= now:
+            minus_at_s, _, _, frame, residual = coming.pop()
+            self._join(frame, residual, -minus_at_s)
 
     def _account(self, now: float) -> None:
         dt = now - self._last_s
@@ -345,18 +344,25 @@ class Medium(Generic[J, F]):
         until = at_s + AIFS_CONTEXT_S + frame.slots * SLOT_S + frame.airtime_s
         end_s = at_s + (until - at_s)
         self._pushes += 1
-        heappush(self._coming, (at_s, self._pushes, frame, residual))
-        heappush(self._soonest, (end_s, self._pushes, frame))
+        insort(self._coming, (-at_s, -self._pushes, end_s, frame, residual))
         if end_s < self._context_due_s:
             self._aim(now)
 
     def _join(self, frame: F, residual: float, now: float) -> None:
         """A frame begins to contend."""
-        self._account(now)
-        frame.joined = True
         waiting = self._waiting
-        if not waiting:
-            self._context_from_s = now + residual * self._mean_exchange_s() if self._heads else now
+        if waiting:
+            self._account(now)
+        elif self._heads:
+            self._account(now)
+            self._context_from_s = now + residual * self._mean_exchange_s()
+        else:  # nothing else goes on: it is its own plan
+            self._last_s = self._context_from_s = now
+            waiting.append(frame)
+            self._context_fire_s = frame.fire_s = fire = now + AIFS_CONTEXT_S + frame.slots * SLOT_S
+            self._context_until_s = until = fire + frame.airtime_s
+            self._context_target_s = now + (until - now)
+            return
         waiting.append(frame)
         if now >= self._context_fire_s:
             return  # heard the frame that is on the air; counts down after it
@@ -366,10 +372,7 @@ class Medium(Generic[J, F]):
     def drop_context(self, sender: int) -> None:
         """Forget a drone's context frames, waiting or to come; one that is on the air ends."""
         now = self.sync()
-        for _, _, frame, _ in self._coming:
-            frame.joined |= frame.sender == sender
-        self._coming = [entry for entry in self._coming if entry[2].sender != sender]
-        heapify(self._coming)
+        self._coming = [entry for entry in self._coming if entry[3].sender != sender]
         kept = [
             f
             for f in self._waiting
@@ -409,12 +412,12 @@ class Medium(Generic[J, F]):
 
     def _aim(self, now: float) -> None:
         """Set the timer to the earliest end of a context frame."""
-        soonest = self._soonest
-        while soonest and soonest[0][2].joined:
-            heappop(soonest)
         due = self._context_target_s
-        if soonest and soonest[0][0] < due:
-            due = soonest[0][0]
+        for minus_at_s, _, end_s, _, _ in reversed(self._coming):
+            if -minus_at_s >= due:
+                break
+            if end_s < due:
+                due = end_s
         if due == self._context_due_s or due == inf:
             return
         delay = due - now
@@ -422,7 +425,7 @@ class Medium(Generic[J, F]):
             near = (nextafter(delay, inf), nextafter(delay, -inf))
             delay = next((d for d in near if now + d == due), delay)
         self._context_due_s = due
-        self._context_timer = timer = self._env.timeout(max(0.0, delay))
+        self._context_timer = timer = simpy.Timeout(self._env, max(0.0, delay))
         timer.callbacks.append(self._on_context_timer)
 
     def _on_context_timer(self, event: simpy.Event) -> None:
