@@ -324,6 +324,9 @@ def test_a_hatch_covers_exactly_the_cells_of_the_region() -> None:
     middle = [float(np.mean(left[i][inside[i]])) for i in np.flatnonzero(inside.any(axis=1))]
     own = -math.sin(0.7) * (runs[:, 0] - pose[0]) + math.cos(0.7) * (runs[:, 1] - pose[1])
     assert own.tolist() == pytest.approx(middle, abs=1e-9)
+    ahead = math.cos(0.7) * (runs[:, 0] - pose[0]) + math.sin(0.7) * (runs[:, 1] - pose[1])
+    strip = (1.5 / 4 - 0.5) * CELL_M  # the second of four strips, from the cell's centre
+    assert ahead.tolist() == pytest.approx((centres[inside.any(axis=1)] + strip).tolist(), abs=1e-9)
 
 
 def test_events_and_phase_changes_are_marked_on_the_plots(rows: Rows) -> None:
