@@ -31,7 +31,7 @@ class Cell:
     ap: float
     """AP@0.5 by the context's metric."""
     data_bytes: float
-    """Sent, a sortie."""
+    """Sent a sortie, handshakes included."""
     energy_j: float
     miss_rate: float
 
@@ -91,7 +91,7 @@ def _fly(policy: str, context: Context, scenarios: Sequence[Scenario], seeds: Se
         policy,
         context.name,
         float(ap),
-        float(np.mean([r["bytes"]["data_sent"] + r["bytes"]["handshakes_sent"] for r in results])),
+        float(np.mean([r["bytes"]["data_sent"] for r in results])),
         float(np.mean([r["energy_j"]["total"] for r in results])),
         float(np.mean([r["deadline_miss_rate"] or 0.0 for r in results])),
     )

@@ -165,7 +165,8 @@ class _Flight:
         self.actions: dict[int, np.ndarray[Any, Any]] = {}
         self.views: dict[int, FleetView] = {}
         self.done = False
-        self._scenario, self._error = scenario, None
+        self._scenario = scenario
+        self._error: Exception | None = None
         self._new: dict[str, pa.Table] = {}
         self._mission: pa.Table | None = None
         self._soc_j: dict[int, float] = {}
