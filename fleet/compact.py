@@ -62,7 +62,7 @@ FULL = Form()
 
 
 def _step(bounds: tuple[float, float], bits: int) -> float:
-    return (bounds[1] - bounds[0]) / (2**bits - 1)
+    return (bounds[1] - bounds[0]) / ((1 << bits) - 1)
 
 
 def encode_compact(d: Descriptor, form: Form) -> bytes:
