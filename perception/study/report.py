@@ -131,9 +131,9 @@ def answers(plan: Plan, found: Found) -> list[str]:
     masked = [found.get(View(first, s, "masked"), "contrast", little) for s in seeds]
     swept = [
         name
-        for v, s in networks for u in m.unsent for t in m.taus for c in m.cells_by
-        for name in [f"{v}-{s}, {u}, cells by {c}, τ {t}"]
-        if flips(found, View(v, s, u, c, str(t)), m.budgets)
+        for v, s in networks for u in m.unsent for t in m.taus for c in m.cells_by for d in m.densities
+        for name in [f"{v}-{s}, {u}, cells by {c}, τ {t}, {d}"]
+        if flips(found, View(v, s, u, c, str(t), d), m.budgets)
     ]  # fmt: skip
     flip = "No network shows the flip" if not flipped else f"The flip shows in {', '.join(dict.fromkeys(flipped))}"
     fall = "none falls" if not fallen else f"{', '.join(dict.fromkeys(fallen))} fall"
@@ -142,15 +142,20 @@ def answers(plan: Plan, found: Found) -> list[str]:
         f"- {flip} at the model's own threshold among {len(networks)} networks under {_and(m.unsent)} filling, and {fall} "
         f"below a single drone at ρ = {m.starved:g}: with {first} (seeds {_and(seeds)}) two peers minus four at ρ = {little:g} "
         f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
-        f"- What zero fill costs against masked fusion at ρ = {m.starved:g} is {_several(fill)}, and masking moves the contrast at "
-        f"ρ = {little:g} to {_several(masked)}"
+        f"- Zero fill costs {_several(fill)} against masked fusion at ρ = {m.starved:g}, significantly in "
+        + " and ".join(
+            f"{sum(sign(found.get(View(v.name, s), 'fill', m.starved)) < 0 for s in its)} of {len(its)} networks of `{v.name}`"
+            for v in (plan.variants[0], *dropped)
+            if (its := [s for s in v.seeds if (v.name, s) in networks])
+        )
+        + f": masking moves the contrast at ρ = {little:g} to {_several(masked)}"
         + "".join(
-            f"; {v.name} training moves it to {_several([found.get(View(v.name, s), 'contrast', little) for s in seeds])}"
+            f", {v.name} training to {_several([found.get(View(v.name, s), 'contrast', little) for s in seeds])}"
             for v in dropped
             if any((v.name, s) in networks for s in seeds)
         )
         + ".",
-        "- Over every threshold, ranking, filling and network measured the flip appears "
+        "- Over every threshold, ranking, filling, density and network measured the flip appears "
         + (
             f"in {len(swept)} of the cases: {'; '.join(swept[:6])}{' …' if len(swept) > 6 else ''}."
             if swept

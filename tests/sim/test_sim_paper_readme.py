@@ -8,6 +8,10 @@ import pyarrow.parquet as pq
 
 from perception.harness import report, rows
 from perception.harness.sensitivity import Varied
+from perception.study import report as study
+from perception.study.figures import CAPTIONS
+from perception.study.measure import from_table
+from perception.study.plan import read_plan
 from sim import paper
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,3 +24,13 @@ def test_the_repositorys_readme_is_what_its_committed_table_renders_to() -> None
     text = (ROOT / "docs" / "paper" / paper.REPORT).read_text(encoding="utf-8")
     varied = [Varied(**row) for row in pq.read_table(ROOT / "docs" / "paper" / paper.VARIED).to_pylist()]
     assert text == report.report(table, facts, list(paper.FIGURES.items()), varied)
+
+
+def test_the_repositorys_study_is_what_its_rows_render_to() -> None:
+    folder = ROOT / "docs" / "study"
+    rows = from_table(pq.read_table(folder / "study.parquet"))
+    plan = read_plan()
+    readme = (ROOT / "README.md").read_text("utf-8")
+    section = study.short(plan, rows, "docs/study/README.md")
+    assert report.put_into(readme, section, study.BEGIN, study.END) == readme
+    assert (folder / "README.md").read_text("utf-8") == study.report(plan, rows, list(CAPTIONS.items()))
