@@ -144,7 +144,7 @@ def open_engine(workers: int = 0, scheduler: str | None = None) -> Iterator[Engi
         # quiet: a worker that is killed is told by its rows, not by tracebacks
         with (
             LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0,
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", memory_limit=0,
                 silence_logs="CRITICAL",
             ) as cluster,
             Client(cluster, set_as_default=False) as client,

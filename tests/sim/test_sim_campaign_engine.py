@@ -23,6 +23,10 @@ from sim.folders import RunError
 
 pytest.importorskip("distributed")
 
+CLUSTER = pytest.mark.filterwarnings(
+    "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
+)
+"""A cluster whose processes are killed leaves sockets behind; dask says so when they are collected."""
 FAULTY = """
 import os
 from policies.contract import Directive
@@ -34,6 +38,7 @@ def decide(view, *, how="fail"):
 """
 
 
+@CLUSTER
 @pytest.mark.slow
 def test_zero_one_and_two_workers_give_the_same_bytes(tmp_path: Path) -> None:
     p = plan(tmp_path)
@@ -47,6 +52,7 @@ def test_zero_one_and_two_workers_give_the_same_bytes(tmp_path: Path) -> None:
     assert len(tables[0]) == 2
 
 
+@CLUSTER
 @pytest.mark.slow
 def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
     """The scheduler is joined by its address; two worker processes get SIGKILL while runs are in flight."""
@@ -58,7 +64,7 @@ def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 10}),
         LocalCluster(
-            n_workers=4, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs="CRITICAL"
+            n_workers=4, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
         ) as cluster,
         open_engine(scheduler=cluster.scheduler_address) as engine,
     ):
