@@ -1,6 +1,6 @@
 """What one liar costs, with and without trust, and whom trust doubts where nobody lies: `python -m sim.liars`.
 
-Each row flies the same sorties three times: everyone honest, one drone lying from the tenth second on, and the same
+Each row flies the same sorties three times: everyone honest, one drone lying from the fifth second on, and the same
 with trust. AP is of the honest drones alone, from the moment of the lie, and scored by the surrogate detector.
 """
 
@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from perception.ap import Matched
 from perception.harness.statistics import Difference, compare
 from scenarios.load import library, load
-from scenarios.schema import Scenario
 from sim.outcome import matched, outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
-SCENARIO, LIAR, SINCE_S = "search_grid", 2, 10.0
+SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
+RHO = 0.1
+"""Of a map on each link: five drones' links of it fit into the channel."""
 POLICIES = ("worked", "who2com", "deputies")
 LIES = (("coverage", "much"), ("coverage", "little"), ("goodput", "little"), ("battery", "much"))
 
@@ -33,7 +34,7 @@ class LiarRow:
     trusting: Difference
     """Everyone honest (a), one liar and trust (b)."""
     doubting: int
-    """How many (sortie, drone) came to doubt the liar, of 4 a sortie."""
+    """How many (sortie, drone) came to doubt the liar, of four a sortie."""
     wronged: int
     """How many came to doubt somebody else."""
 
@@ -71,12 +72,16 @@ def false_alarms(seeds: Sequence[int], duration_s: float) -> tuple[int, int]:
 
 
 def _flown(policy: str, seed: int, duration_s: float, trust: str, *more: str) -> SortieRecord:
-    settings = [f"duration_s={duration_s:g}", "perception.detector=surrogate", f"context.trust={trust}", *more]
-    return run_sortie(_scenario(settings), policy, seed)
-
-
-def _scenario(settings: Sequence[str]) -> Scenario:
-    return load(SCENARIO, ["fleet.formation.shape=line", "events=[]", "expect=[]", "expect_decisions=[]", *settings])
+    """In a line, where a drone's place decides what it can add, and while searching, so that every cell counts."""
+    scenario = load(
+        SCENARIO,
+        [
+            "expect=[]", "expect_decisions=[]", "fleet.formation.shape=line", "mission.phases=[{at_s: 0, phase: search}]",
+            f"policy.name={policy}", f"policy.params={{rho: {RHO}}}", f"duration_s={duration_s:g}",
+            "perception.detector=surrogate", f"context.trust={trust}", *more,
+        ],
+    )  # fmt: skip
+    return run_sortie(scenario, None, seed)
 
 
 def _difference(a: dict[int, SortieRecord], b: dict[int, SortieRecord]) -> Difference:
