@@ -271,3 +271,62 @@ def test_it_never_polls() -> None:
         steps += 1
     assert len(b.log) == 50
     assert steps < 3 * 50  # about one event a job, however long it lasts
+
+
+coming = st.lists(
+    st.tuples(
+        st.integers(0, 4),  # sender
+        st.integers(0, 400).map(lambda k: k * 1e-5 + 3e-6),  # when it begins to contend; never with a job's begin
+        st.integers(0, 15),
+        st.sampled_from([100e-6, 468e-6]),
+        st.floats(0.0, 1.0, exclude_max=True),
+    ),
+    max_size=12,
+)
+loads = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 300).map(lambda k: k * 1e-5 + 7e-6)), max_size=3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(coming, loads, st.none() | st.tuples(st.integers(0, 4), st.integers(0, 400).map(lambda k: k * 1e-5 + 5e-6)))
+def test_frames_to_come_fare_as_those_announced_by_an_event(
+    frames: list[tuple[int, float, int, float, float]],
+    jobs: list[tuple[int, float]],
+    dropped: tuple[int, float] | None,
+) -> None:
+    """`announce(in_s)` makes no event for the begin; an event that announces at that time must give the same."""
+    ends = []
+    for by_event in (False, True):
+        b = Bench()
+        for sender, at_s in jobs:
+            b.env.timeout(at_s, sender).callbacks.append(lambda event, b=b: b.submit(event.value))
+        gone: set[int] = set()
+        for sender, at_s, slots, airtime_s, residual in frames:
+            frame = GroupFrame(sender, airtime_s, slots)
+            if by_event:
+
+                def announce(
+                    _: object, b: Bench = b, frame: GroupFrame = frame, residual: float = residual, gone: set = gone
+                ) -> None:
+                    if frame.sender not in gone:
+                        b.medium.announce(frame, residual)
+
+                b.env.timeout(at_s).callbacks.append(announce)
+            else:
+                b.medium.announce(frame, residual, at_s)
+        if dropped is not None:
+            who, at_s = dropped
+
+            def drop(_: object, b: Bench = b, who: int = who, gone: set = gone) -> None:
+                gone.add(who)
+                b.medium.drop_context(who)
+
+            b.env.timeout(at_s).callbacks.append(drop)
+        b.run()
+        assert all(0.0 < t <= 10.0 for t, _, _ in b.heard)
+        ends.append((b.heard, b.log, b.medium.transmit_s, b.medium.context_busy_s))
+    (heard, log, sent_s, busy_s), (heard_2, log_2, sent_2_s, busy_2_s) = ends
+    assert [x[1:] for x in sorted(heard)] == [x[1:] for x in sorted(heard_2)]
+    assert [t for t, _, _ in sorted(heard)] == pytest.approx([t for t, _, _ in sorted(heard_2)])
+    assert [t for t, _, _ in log] == pytest.approx([t for t, _, _ in log_2])
+    assert sent_s == pytest.approx(sent_2_s)
+    assert busy_s == pytest.approx(busy_2_s)
