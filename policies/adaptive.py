@@ -42,18 +42,10 @@ class Arm(NamedTuple):
         return f"features{' of the region' if self.region else ''} to {who}{rest}" if self.peers else "boxes to all"
 
 
-ARMS: tuple[Arm, ...] = (
-    Arm(EVERYONE, True, False),
-    Arm(2, False, False),
-    Arm(2, True, False),
-    Arm(1, True, False),
-    Arm(0, True, False),
-    Arm(EVERYONE, True, True),
-    Arm(2, True, True),
-)
+ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, False), Arm(2, True, False), Arm(0, True, False))
 """What the adaptive policies choose from."""
-MAPS, BOXES = ARMS[0], ARMS[4]
-ENOUGH_TRACKING, ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.3, 0.03, 0.06
+MAPS, BOXES = ARMS[0], ARMS[-1]
+ENOUGH_TRACKING, ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.1, 0.03, 0.06
 """Budgets from which on feature cells find more than boxes, as `sortie learn`'s training contexts had it."""
 MUCH_OVERLAP = 0.65
 
@@ -77,7 +69,7 @@ def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
     reason = f"{why}: {arm.words}"
     directives = []
     for peer in peers:
-        weak = me.goodput_to(peer) < MIN_GOODPUT_MBPS
+        weak = 0.0 < me.goodput_to(peer) < MIN_GOODPUT_MBPS  # 0 is not yet measured: nothing was sent
         if peer in chosen and not weak:
             directives.append(Directive(ego, peer, Representation.FEATURES, per_link, roi, RATE_HZ, reason=reason))
         elif peer in chosen or arm.boxes:

@@ -54,7 +54,7 @@ def compare_contexts(contexts: Contexts, policies: Sequence[str], sets: Sequence
 
 
 def learn(
-    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 48,
+    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 15,
     seed: Annotated[int, typer.Option(help="Of the training contexts.", min=0)] = 0,
     workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
     out_file: Annotated[

@@ -7,6 +7,7 @@ import pytest
 from policies_examples import fleet_of
 
 from policies import adaptive as a
+from policies.baselines import everyone
 from policies.contract import Descriptor, FleetView, Representation, TaskPhase
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE
@@ -37,6 +38,13 @@ def test_arms_by_hand() -> None:
     assert {d.rate_hz for d in weak} == {2.0}
 
 
+@pytest.mark.parametrize("goodput", [0.0, 100.0])
+def test_maps_to_all_are_what_the_fixed_policy_sends(goodput: float) -> None:
+    """An unmeasured link (goodput 0) is not a weak one: waiting for a measure would cost the climb of a rung."""
+    view = fleet_of(5, goodput=goodput)
+    assert a.spend(view, a.MAPS, 0.1, "") == everyone(view, rho=0.1)
+
+
 def spread(view: FleetView, by: float) -> FleetView:
     """The same fleet, `by` times as far apart: less overlap."""
 
@@ -54,8 +62,8 @@ def spread(view: FleetView, by: float) -> FleetView:
         (TaskPhase.SEARCH, 3.0, 0.03, FEATURES),
         (TaskPhase.SEARCH, 0.5, 0.059, BOXES),
         (TaskPhase.SEARCH, 0.5, 0.06, FEATURES),
-        (TaskPhase.TRACK, 0.5, 0.299, BOXES),
-        (TaskPhase.TRACK, 0.5, 0.3, FEATURES),
+        (TaskPhase.TRACK, 0.5, 0.099, BOXES),
+        (TaskPhase.TRACK, 0.5, 0.1, FEATURES),
     ],
 )
 def test_budget_mission_and_coverage_decide_together(
