@@ -140,11 +140,13 @@ class Charts:
     def _plane(self, seconds: Sequence[tuple[float, float]], ages: pa.Table, medium: pa.Table) -> None:
         rows = np.column_stack([ages["t_s"].to_numpy(), ages["age_s"].to_numpy()])
         self._ages = np.concatenate([self._ages, rows])
+        points = []
         for begin_s, end_s in seconds:
-            within = self._ages[(self._ages[:, 0] >= begin_s) & (self._ages[:, 0] < end_s), 1]
-            if len(within):
-                p99 = float(np.percentile(within, 99))
-                self._canvas.scalars("plots/age/p99_ms", np.array([end_s]), np.array([1e3 * p99]))
+            first, last = np.searchsorted(self._ages[:, 0], (begin_s, end_s))  # rows come in order of time
+            if last > first:
+                points.append((end_s, 1e3 * float(np.percentile(self._ages[first:last, 1], 99))))
+        if points:
+            self._canvas.scalars("plots/age/p99_ms", *np.array(points).T)
         if seconds:
             self._ages = self._ages[self._ages[:, 0] >= seconds[-1][1]]
         busy = 100.0 * medium["busy_fraction"].to_numpy()
