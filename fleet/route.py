@@ -96,13 +96,13 @@ def frame_path(
         acceleration_mps2=slope @ jumps,
         yaw_rad=course[0] + turned @ turn,
         yaw_rate_radps=turning @ turn,
-        yaw_acceleration_radps2=_bend(since_s, width_s) @ turn,
+        yaw_acceleration_radps2=bend(since_s, width_s) @ turn,
     )
 
 
-def _bend(since_s: Array, width_s: Array) -> Array:
-    """Second derivative of the spread step, 1/s²."""
-    knot_s = width_s / 3
+def bend(since_s: Array, width_s: Array | float) -> Array:
+    """Second derivative of the spread step, 1/s²; arguments as for `spread`."""
+    knot_s = np.asarray(width_s) / 3
     r = np.clip(since_s / knot_s + 1.5, 0.0, 3.0)
-    bend: Array = (r - 3 * np.maximum(r - 1, 0.0) + 3 * np.maximum(r - 2, 0.0)) / knot_s**2
-    return bend
+    bent: Array = (r - 3 * np.maximum(r - 1, 0.0) + 3 * np.maximum(r - 2, 0.0)) / knot_s**2
+    return bent

@@ -74,13 +74,15 @@ def _window(roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: fl
     forward_m, left_m = c * dx + s * dy, -s * dx + c * dy
     rows, columns = _span(forward_m, radius_m), _span(left_m, radius_m)
     along = _centres_m()
-    inside = ((along[rows] - forward_m) ** 2)[:, None] + (along[columns] - left_m) ** 2 <= radius_m**2
-    return rows, columns, inside
+    ahead, aside = along[rows] - forward_m, along[columns] - left_m
+    return rows, columns, np.add.outer(ahead * ahead, aside * aside) <= radius_m**2
 
 
 def _span(centre_m: float, radius_m: float) -> slice:
     low = math.floor((centre_m - radius_m) / CELL_M) + GRID // 2
     high = math.ceil((centre_m + radius_m) / CELL_M) + GRID // 2
+    if 0 <= low and high <= GRID:
+        return slice(low, high)
     return slice(min(max(low, 0), GRID), min(max(high, 0), GRID))
 
 

@@ -2,7 +2,7 @@
 
 A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (ages are
 attached to the view), no I/O and no payloads. Frames: positions ENU, orientation quaternion x, y, z, w
-of FLU in ENU.
+of FLU in ENU. One that also chooses where to look from has a second function, marked by `looks_from`.
 
 The types are named tuples: frozen, and made in a third of a frozen dataclass's time, which a fleet feels that
 makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that differs.
@@ -11,10 +11,10 @@ makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
@@ -163,12 +163,48 @@ class Policy(Protocol):
     def __call__(self, view: FleetView, /) -> Sequence[Directive]: ...
 
 
+class Reposition(NamedTuple):
+    """Where a drone asks to look from, instead of from its slot in the formation.
+
+    A wish, not a command: `fleet.viewpoints` grants as much of it as separation, fence, speed and acceleration allow.
+    It stands until the drone's next decision; a wish for where the drone already is moves nothing.
+    """
+
+    x_m: float
+    """The place over ground where it would be now, ENU; the formation carries it on."""
+    y_m: float
+    reason: str = ""
+    """Why, in words; for the record."""
+
+
+class Viewpoint(Protocol):
+    """The optional second half of a policy: asked with the same view after every decision; None is its slot."""
+
+    def __call__(self, view: FleetView, /) -> Reposition | None: ...
+
+
+AnyPolicy = TypeVar("AnyPolicy", bound=Callable[..., Sequence[Directive]])
+
+
+def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPolicy], AnyPolicy]:
+    """Mark a policy as one that also chooses viewpoints; the keyword parameters that both name are given to both."""
+
+    def mark(policy: AnyPolicy) -> AnyPolicy:
+        marked: Any = policy
+        marked.viewpoint = viewpoint
+        return policy
+
+    return mark
+
+
 class PolicyError(ValueError):
     """A policy broke its contract; the message names the directive, the field and the bound."""
 
 
 MAX_RATE_HZ = 30.0
 MAX_DEADLINE_S = 10.0
+MAX_REPOSITION_M = 200.0
+"""No drone may ask for a place farther from where it is."""
 
 
 def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
@@ -197,6 +233,24 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
         ):
             raise PolicyError(_fault(d, view))
         seen.add(destination)
+
+
+def check_reposition(asked: object, view: FleetView) -> None:
+    """Hold what a viewpoint returned to the contract, once, where it enters the fleet.
+
+    Raises:
+        PolicyError: naming the drone and the bound it breaks.
+    """
+    if asked is None:
+        return
+    if not isinstance(asked, Reposition):
+        raise PolicyError(f"a viewpoint returns Reposition or None, got {type(asked).__name__}")
+    where, me = f"reposition of drone {view.ego}", view.me
+    if me is None:
+        raise PolicyError(f"{where}: asked for in a view without it, must be None")
+    far_m = math.hypot(asked.x_m - me.position_m[0], asked.y_m - me.position_m[1])
+    if not far_m <= MAX_REPOSITION_M:  # also catches NaN
+        raise PolicyError(f"{where}: {far_m:.1f} m from where it is, must be at most {MAX_REPOSITION_M:g} m")
 
 
 def _fault(d: Directive, view: FleetView) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from policies import adaptive, baselines
-from policies.contract import Directive, FleetView, Policy, PolicyError
+from policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
 from policies.deputies import deputies
 from policies.prior import METHODS
 from policies.worked import worked
@@ -56,6 +56,14 @@ def own_fusion(name: str) -> str | None:
     """The fusion that a prior method was published with, a value of `perception.fusion`; None where it has none."""
     method = METHODS.get(name)
     return None if method is None else method.fusion
+
+
+def viewpoint_of(policy: Policy) -> Viewpoint | None:
+    """The function by which a policy chooses where to look from, its parameters bound; None where it has none."""
+    bound = policy.keywords if isinstance(policy, functools.partial) else {}
+    found = getattr(policy.func if isinstance(policy, functools.partial) else policy, "viewpoint", None)
+    shared = {k: v for k, v in bound.items() if k in parameters(found)} if found is not None else {}
+    return functools.partial(found, **shared) if found is not None and shared else found
 
 
 def parameters(function: Callable[..., object]) -> dict[str, object]:

@@ -86,6 +86,7 @@ class Air:
         self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
         self._service = Service(config, seed, replication)
         self._luck = SampleLuck(seed, replication)
+        self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, once asked for
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._in_flight: dict[int, Sample] = {}
@@ -99,6 +100,7 @@ class Air:
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move the links on by one frame (arguments as in `Channel.advance`); samples in service feel it at once."""
         self.channel.advance(extra_loss_db, jammers)
+        self._rows_db = None
         if self._overrides is not None:
             self._overrides.advance(extra_loss_db, self.channel.noise_rise_db(jammers) if jammers else None)
         if self._routes is not None:
@@ -253,7 +255,10 @@ class Air:
 
     def _snr_of(self, sender: int, receiver: int) -> tuple[float, float]:
         """Mean SNR of a link as its sender knows it, from the frame before, and as it is."""
-        known_db, now_db = self.channel.before.rows_db[sender][receiver], self.channel.now.rows_db[sender][receiver]
+        rows = self._rows_db
+        if rows is None:
+            rows = self._rows_db = self.channel.before.rows_db, self.channel.now.rows_db
+        known_db, now_db = rows[0][sender][receiver], rows[1][sender][receiver]
         if self._overrides is None:
             return known_db, now_db
         return self._overrides.snr_of(sender, receiver, known_db, now_db)

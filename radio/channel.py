@@ -68,10 +68,10 @@ class FrameLinks:
 
     __slots__ = ("_rows", "_square", "links", "snr_db")
 
-    def __init__(self, links: Links, snr_db: AnyFloats) -> None:
+    def __init__(self, links: Links, snr_db: AnyFloats, rows_db: list[list[float]] | None = None) -> None:
         self.links, self.snr_db = links, snr_db
         self._square: FloatArray | None = None
-        self._rows: list[list[float]] | None = None
+        self._rows = rows_db
 
     @property
     def square_db(self) -> FloatArray:
@@ -162,6 +162,9 @@ class Channel:
         self._fades_db: AnyFloats
         self._luck: AnyFloats
         self._reach_bytes: AnyFloats
+        self._snr_rows: list[list[list[float]]] = []  # of a small fleet: the block as lists, which one looks up faster
+        self._reach_rows: list[list[list[float]]] = []
+        self._reach_now: list[list[float]] = []
         # who hears whom in this frame, if every frame is of this length
         self._heard_bytes = -1
         self._heard_ids: Sequence[int] = []
@@ -187,6 +190,9 @@ class Channel:
             self._refill()
         links, snr = self.links, self._snr_db[row]
         self.reach_bytes = self._reach_bytes[row]
+        rows_db = None
+        if self._crowd is None:
+            rows_db, self._reach_now = self._snr_rows[row], self._reach_rows[row]
         if extra_loss_db is not None or jammers:
             snr = snr.copy()
             if extra_loss_db is not None:
@@ -198,8 +204,11 @@ class Channel:
                 snr -= self.noise_rise_db(jammers)[links.receiver]
             fades_db, luck = self._chance(row)
             self.reach_bytes = self._reach(snr + fades_db, luck)
-        self.before = self.now if self.frame else FrameLinks(links, snr)
-        self.now = FrameLinks(links, snr)
+            rows_db = None
+            if self._crowd is None:
+                self._reach_now = self.reach_bytes.reshape(self.n, self.n).tolist()
+        self.before = self.now if self.frame else FrameLinks(links, snr, rows_db)
+        self.now = FrameLinks(links, snr, rows_db)
 
     @property
     def snr_db(self) -> FloatArray:
@@ -238,10 +247,11 @@ class Channel:
             reach = self._reach(self.now.snr_db[mine] + fades_db, luck)
             again = links.receiver[mine[reach >= length_bytes]]
             return cast(Sequence[int], again if self._crowd else again.tolist())
+        if self._crowd is None:
+            return [i for i, reach in enumerate(self._reach_now[sender]) if reach >= length_bytes]
         if self._heard_bytes != length_bytes:  # most frames of a moment have one length: look at all links together
             through = (self.reach_bytes >= length_bytes)[links.by_sender]
-            ids = links.receiver[links.by_sender[through]]
-            self._heard_ids = cast(Sequence[int], ids if self._crowd else ids.tolist())
+            self._heard_ids = cast(Sequence[int], links.receiver[links.by_sender[through]])
             self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
             self._heard_bytes = length_bytes
         return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
@@ -295,6 +305,9 @@ class Channel:
             self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
         self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._luck)
+        square = (len(p), self.n, self.n)
+        self._snr_rows = self._snr_db.reshape(square).tolist()
+        self._reach_rows = self._reach_bytes.reshape(square).tolist()
 
     def _chance(self, row: int, links: IntArray | None = None) -> tuple[AnyFloats, AnyFloats]:
         """Fades in dB and luck of some links, or all, in a frame of the block."""

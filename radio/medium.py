@@ -232,9 +232,11 @@ class Medium(Generic[J, F]):
     def sync(self) -> float:
         """Bring every account up to now, and return it; frames whose time has come contend."""
         now: float = self._env.now
-        if self._coming:
+        coming = self._coming
+        if coming and -coming[-1][0] <= now:
             self._admit(now)
-        self._account(now)
+        if now > self._last_s:
+            self._account(now)
         return now
 
     def _admit(self, now: float) -> None:
@@ -433,7 +435,9 @@ class Medium(Generic[J, F]):
             return
         self._context_due_s = inf
         now: float = self._env.now
-        self._admit(now)
+        coming = self._coming
+        if coming and -coming[-1][0] <= now:
+            self._admit(now)
         if now < self._context_target_s:  # something holds it up
             self._aim(now)
             return

@@ -91,14 +91,13 @@ class Ether:
         payload, capture = self._pending.pop(transmission.number)
         self._write(transmission, payload, capture)
         if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
-            missing = cells_of(transmission.missing, payload.cells, payload.tile_cells)
-            phy_mbps = self._phy_mbps(transmission.mcs)
+            missing, mcs, rates_mbps = transmission.missing, transmission.mcs, self._rates_mbps
+            if missing:
+                missing = cells_of(missing, payload.cells, payload.tile_cells)
+            phy_mbps = rates_mbps[mcs] if 0 <= mcs < len(rates_mbps) else math.inf
             self.agents[transmission.receiver].receive(
                 Received(capture, payload, transmission.t_done_s, missing, phy_mbps)
             )
-
-    def _phy_mbps(self, mcs: int) -> float:
-        return self._rates_mbps[mcs] if 0 <= mcs < len(self._rates_mbps) else math.inf
 
     def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
         self._recorder.rows["transmissions"].append((transmission, payload, capture.t_s))
