@@ -107,6 +107,10 @@ class Air:
             self._routes.renew(self.link_mbps())
         self.medium.retune()
 
+    def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
+        """From the next frame on the fleet flies another way (see `Channel.reroute`)."""
+        self.channel.reroute(positions_m, up)
+
     def link_mbps(self) -> FloatArray:
         """[N, N]: payload rate of each link alone on the channel as senders know it, from the frame before; 0: no link.
 

@@ -210,6 +210,26 @@ class Channel:
         self.before = self.now if self.frame else FrameLinks(links, snr, rows_db)
         self.now = FrameLinks(links, snr, rows_db)
 
+    def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
+        """From the next frame on the fleet flies another way; what was drawn of shadowing, fades and luck stays.
+
+        In fleets of more than `SQUARE` drones links follow it from the next block of `EPOCH` frames on.
+
+        Args:
+            positions_m, up: as for the channel, the same up to this frame.
+
+        Raises:
+            ValueError: if a shape is another one or a number is not finite.
+        """
+        p = np.asarray(positions_m, dtype=float)
+        u = None if up is None else np.asarray(up, dtype=float)
+        for name, new in (("positions_m", p), ("up", u)):
+            if new is not None and (new.shape != self._positions_m.shape or not np.isfinite(new).all()):
+                raise ValueError(f"{name} has shape {new.shape}, must be {self._positions_m.shape} and finite")
+        self._positions_m, self._up = p, u
+        if self._crowd is None and self.frame >= 0:
+            self._work_out(self.frame // self._block * self._block)
+
     @property
     def snr_db(self) -> FloatArray:
         """[N, N] of this frame; `OUT_OF_RANGE_DB` where a large fleet's link is out of earshot."""
@@ -297,11 +317,17 @@ class Channel:
             self._reach_bytes = np.full_like(self._snr_db, np.inf)
             self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, luck)
             return
-        loss_db = self._loss_db(p, up)
         drawn = self._draws.block(self._block, len(p))
         self._shadow_db, self._fades_db, self._luck = (x.reshape(len(p), -1) for x in drawn)
+        self._work_out(self.frame)
+
+    def _work_out(self, first: int) -> None:
+        """The block that begins with a frame, from what was drawn for it and where the drones are."""
+        c, p = self.config, self._positions_m[first : first + self._block]
+        up = None if self._up is None else self._up[first : first + self._block]
+        loss_db = self._loss_db(p, up)
         if self._field is not None:
-            at = [self._field.between(q, (self.frame + t) * self._frame_s) for t, q in enumerate(p)]
+            at = [self._field.between(q, (first + t) * self._frame_s) for t, q in enumerate(p)]
             self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
         self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._luck)
