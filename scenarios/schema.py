@@ -77,6 +77,30 @@ class Motion(Section):
     )
 
 
+class Viewpoints(Section):
+    """How far the formation gives way to a policy that chooses viewpoints; the others are asked nothing."""
+
+    reach_m: float = Field(
+        40.0, ge=0, le=50, description="How far from its slot a drone may stand when its policy asks; 0: nowhere else."
+    )
+    speed_mps: float = Field(3.0, gt=0, le=15, description="Fastest that it moves within the formation.")
+    acceleration_mps2: float = Field(1.0, gt=0, le=5, description="Most that it accelerates for it.")
+    separation_m: float = Field(
+        10.0, gt=0, le=500, description="No two drones closer than this, unless their slots are."
+    )
+    fence_m: tuple[float, float, float, float] | None = Field(
+        None, description="Geofence that every drone keeps within, ENU (x_min, y_min, x_max, y_max); left out, none."
+    )
+
+    @model_validator(mode="after")
+    def _fence_holds_something(self) -> Viewpoints:
+        if self.fence_m is not None:
+            x_min, y_min, x_max, y_max = self.fence_m
+            if not (x_min < x_max and y_min < y_max):
+                raise _inconsistent(("fence_m",), f"{self.fence_m}", "x_min < x_max and y_min < y_max")
+        return self
+
+
 class Airframe(Section):
     mass_kg: float = Field(2.04, gt=0, le=100, description="All-up mass without payload, battery included.")
     payload_kg: float = Field(0.0, ge=0, le=100, description="What is carried besides.")
@@ -155,6 +179,7 @@ class Fleet(Section):
     formation: Formation = Formation()
     route: Route = Route()
     motion: Motion = Motion()
+    viewpoints: Viewpoints = Viewpoints()
     airframe: Airframe = Airframe()
     battery: Battery = Battery()
     overrides: tuple[DroneOverride, ...] = Field(
