@@ -11,16 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import combinations
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fleet.formation import slots
-from fleet.frames import yaw_rad
-from fleet.motion import DRAG_PER_S, GRAVITY_MPS2, Motion, MotionError, attitude, body_rates
+from fleet.motion import MotionError
 from fleet.route import FramePath, bend, frame_path, spread
 from scenarios import schema
 
@@ -31,6 +29,8 @@ LEAST_MOVE_M = 2.0
 """A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
 SHARES = (1.0, 0.75, 0.5, 0.25)
 """What is tried of a wish before it is refused, the most first."""
+INSTANTS_S = 0.05
+"""At which two moves are held against each other."""
 JITTERS = 5.0
 """Places keep so many standard deviations of the pose jitter off the bounds, so that the drones keep them."""
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.25, 9.0
@@ -59,6 +59,11 @@ class Move(NamedTuple):
     def speed_mps(self) -> float:
         """The fastest that it gets."""
         return _PEAK_SPEED * self.length_m / self.width_s
+
+    @property
+    def acceleration_mps2(self) -> float:
+        """The most that it accelerates."""
+        return _PEAK_ACCELERATION * self.length_m / self.width_s**2
 
 
 Plan = tuple[Move, ...]
@@ -141,10 +146,10 @@ def standing_m(plan: Plan) -> Place:
 
 def shift_m(plan: Plan, time_s: Array) -> Array:
     """A drone's shift at any times [T]: [T, 2], m, the formation's frame."""
-    return _shift(plan, time_s)[0]
+    return shifts(plan, time_s)[0]
 
 
-def _shift(plan: Plan, time_s: Array) -> tuple[Array, Array, Array]:
+def shifts(plan: Plan, time_s: Array) -> tuple[Array, Array, Array]:
     """Shift, its rate and its acceleration, [T, 2] each."""
     total = np.zeros((3, len(time_s), 2))
     for move in plan:
@@ -229,13 +234,14 @@ def _too_near(drone: int, move: Move, plans: Sequence[Plan], course: Course, bou
             if _distance_m(apart + move.start_m, apart + move.end_m) < least:
                 return other
             continue
-        # both move: instants, and no nearer in between than their speeds allow
+        # both move: instants, and no nearer in between than speed and acceleration allow
         end_s = max(move.end_s, plan[-1].end_s)
-        count = max(2, math.ceil((end_s - move.begin_s) / 0.05) + 1)
-        time_s = np.linspace(move.begin_s, end_s, count)
-        between_m = 0.5 * (move.speed_mps + plan[-1].speed_mps) * (time_s[1] - time_s[0])
-        way = apart + shift_m((move,), time_s) + move.start_m - shift_m(plan, time_s)
-        if float(np.hypot(way[:, 0], way[:, 1]).min()) < least + between_m:
+        time_s = np.linspace(move.begin_s, end_s, max(2, math.ceil((end_s - move.begin_s) / INSTANTS_S) + 1))
+        ours, theirs = shifts((move,), time_s), shifts(plan, time_s)
+        way, rate = apart + move.start_m + ours[0] - theirs[0], np.linalg.norm(ours[1] - theirs[1], axis=-1)
+        half_s = 0.5 * (time_s[1] - time_s[0])
+        between_m = rate * half_s + (move.acceleration_mps2 + plan[-1].acceleration_mps2) * half_s**2 / 2
+        if float((np.linalg.norm(way, axis=-1) - between_m).min()) < least:
             return other
     return None
 
@@ -257,74 +263,3 @@ def _within(wanted_m: Place, reach_m: float) -> Place:
     far_m = math.hypot(*wanted_m)
     share = reach_m / far_m if far_m > reach_m else 1.0
     return wanted_m[0] * share, wanted_m[1] * share
-
-
-# --- what is flown ---------------------------------------------------------------------------------
-
-
-def displaced(flown: Motion, base: Motion, course: Course, plans: Sequence[Plan], frame: int) -> Motion:
-    """The flight, from a frame on, with every drone's moves: what was flown before stays bit for bit.
-
-    Place, velocity and acceleration follow from the rotating frame; attitude from the thrust that they ask for in the
-    drone's own wind, as without moves; what a drone believes keeps its errors.
-
-    Args:
-        flown: the flight up to `frame`.
-        base: the flight without any moves.
-    """
-    names = (
-        "position_m", "velocity_mps", "acceleration_mps2", "orientation_xyzw", "body_rates_radps", "yaw_rad",
-        "est_position_m", "est_yaw_rad",
-    )  # fmt: skip
-    new: dict[str, Array] = {name: getattr(flown, name).copy() for name in names}
-    rest = slice(frame, None)
-    path = course.path
-    cos, sin = np.cos(path.yaw_rad[rest])[:, None], np.sin(path.yaw_rad[rest])[:, None]
-    rate, rate_change = path.yaw_rate_radps[rest, None], path.yaw_acceleration_radps2[rest, None]
-    for drone in [i for i, plan in enumerate(plans) if plan]:
-        shift, speed, push = (_turned(v, cos, sin) for v in _shift(plans[drone], course.time_s[rest]))
-        new["position_m"][rest, drone, :2] = base.position_m[rest, drone, :2] + shift
-        new["est_position_m"][rest, drone, :2] = base.est_position_m[rest, drone, :2] + shift
-        velocity = base.velocity_mps[rest, drone].copy()
-        velocity[:, :2] += speed + rate * _across(shift)
-        acceleration = base.acceleration_mps2[rest, drone].copy()
-        acceleration[:, :2] += push + 2 * rate * _across(speed) + rate_change * _across(shift) - rate**2 * shift
-        thrust = acceleration + DRAG_PER_S * (velocity - base.wind_mps[rest, drone])
-        thrust[:, 2] += GRAVITY_MPS2
-        orientation = attitude(thrust, base.frame_yaw_rad[rest])
-        orientation *= _signs(np.concatenate([flown.orientation_xyzw[max(frame - 1, 0), drone][None], orientation]))
-        yaw = yaw_rad(orientation)
-        believed = yaw + base.est_yaw_rad[rest, drone] - base.yaw_rad[rest, drone]
-        new["velocity_mps"][rest, drone], new["acceleration_mps2"][rest, drone] = velocity, acceleration
-        new["orientation_xyzw"][rest, drone], new["yaw_rad"][rest, drone] = orientation, yaw
-        new["est_yaw_rad"][rest, drone] = np.mod(believed + np.pi, 2 * np.pi) - np.pi
-        step_s = float(course.time_s[1] - course.time_s[0])
-        new["body_rates_radps"][rest, drone] = body_rates(orientation[:, None], step_s)[:, 0]
-    after = replace(flown, **new)
-    for each in fields(after):
-        getattr(after, each.name).setflags(write=False)
-    return after
-
-
-def _turned(values: Array, cos: Array, sin: Array) -> Array:
-    """[T, 2] of the formation's frame, in ENU."""
-    x, y = values[:, :1], values[:, 1:]
-    return np.concatenate([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
-def _across(values: Array) -> Array:
-    """Turned left by a right angle."""
-    return np.stack([-values[:, 1], values[:, 0]], axis=-1)
-
-
-def _signs(quaternions: Array) -> Array:
-    """Factors [T, 1] for all but the first of [T + 1, 4] that keep each on the side of the one before."""
-    flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=-1))
-    flips[flips == 0] = 1.0
-    return np.asarray(np.cumprod(flips))[:, None]
-
-
-def nearest_pair_m(position_m: Array) -> Array:
-    """The least distance of any two drones in every frame: [T] of [T, N, 3]."""
-    pairs = combinations(range(position_m.shape[1]), 2)
-    return np.min([np.linalg.norm(position_m[:, i] - position_m[:, j], axis=-1) for i, j in pairs], axis=0)

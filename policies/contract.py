@@ -178,7 +178,7 @@ class Reposition(NamedTuple):
 
 
 class Viewpoint(Protocol):
-    """The optional second half of a policy: asked with the same view after every decision; None is its slot."""
+    """The optional second half of a policy: asked with the view of every decision; None is the drone's slot."""
 
     def __call__(self, view: FleetView, /) -> Reposition | None: ...
 

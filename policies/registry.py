@@ -12,6 +12,7 @@ from policies import adaptive, baselines
 from policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
 from policies.deputies import deputies
 from policies.prior import METHODS
+from policies.vantage import vantage
 from policies.worked import worked
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
@@ -25,6 +26,7 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "deputies": deputies,
     "adaptive": adaptive.adaptive,
     "learned": adaptive.learned,
+    "vantage": vantage,
     **{name: method.policy for name, method in METHODS.items()},
 }
 """One line a policy. Keyword-only arguments are its parameters."""

@@ -7,7 +7,7 @@ scenario says so, counts the directives that break an invariant, and with a shie
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -15,9 +15,9 @@ import simpy
 
 from fleet.agent import Agent
 from policies.conformance import raised_part
-from policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase
+from policies.contract import Directive, FleetView, Policy, PolicyError, Reposition, TaskPhase, check_reposition
 from policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
-from policies.registry import handshake_bytes, resolve
+from policies.registry import handshake_bytes, resolve, viewpoint_of
 from policies.shield import MARK, checked, enforce
 from policies.views import ViewError, from_json
 from scenarios.schema import Policy as PolicySection
@@ -46,6 +46,12 @@ class Plan(NamedTuple):
     rules: tuple[Invariant, ...] = ()
     shielded: bool = False
     replays: tuple[tuple[float, int, FleetView], ...] = ()
+
+    @property
+    def looks(self) -> bool:
+        """Whether any of its policies chooses viewpoints."""
+        policies = (self.first, *(policy for _, policy in self.changes))
+        return any(viewpoint_of(policy.decide) is not None for policy in policies)
 
 
 def plan_of(section: PolicySection, first: Named | None = None) -> Plan:
@@ -111,8 +117,12 @@ class Audit:
 class Pilot:
     """One drone's policy in flight."""
 
-    def __init__(self, drone: int, plan: Plan, audit: Audit) -> None:
-        self.drone, self.policy = drone, plan.first
+    def __init__(
+        self, drone: int, plan: Plan, audit: Audit, wish: Callable[[int, Reposition | None], None] | None = None
+    ) -> None:
+        """Args: `wish` takes where the drone asks to look from; None where no policy of the plan does."""
+        self.drone, self.policy, self._wish = drone, plan.first, wish
+        self._look = viewpoint_of(plan.first.decide)
         self.agent: Agent | None = None
         self._by_phase = {_PHASES[c.phase]: then for c, then in plan.changes if c.phase is not None}
         self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
@@ -125,7 +135,9 @@ class Pilot:
         """From the next decision on, `policy` decides."""
         if policy.name != self.policy.name:
             self._audit.took_over(self.drone, self.policy.name, policy.name, why)
-            self.policy = policy
+            self.policy, self._look = policy, viewpoint_of(policy.decide)
+            if self._look is None and self._wish is not None:
+                self._wish(self.drone, None)
             if self.agent is not None:
                 self.agent.handshake_bytes = policy.handshake_bytes
 
@@ -139,6 +151,8 @@ class Pilot:
             self._follow_phase(view)
         decisions = self._audit.decisions
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
+        if self._look is not None and self._wish is not None:
+            self._wish(self.drone, self._looked(view if self._shown is None else self._shown))
         if not self._rules and self._shown is None:
             return self._ask(view)
         shown, self._shown = self._shown, None
@@ -154,6 +168,17 @@ class Pilot:
             policy = self._by_phase.get(me.task_phase)
             if policy is not None:
                 self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}")
+
+    def _looked(self, view: FleetView) -> Reposition | None:
+        """Where the policy asks to look from."""
+        assert self._look is not None  # noqa: S101
+        try:
+            asked = self._look(view)
+        except Exception as error:
+            what = f"its viewpoint raises {type(error).__name__}: {error}"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
+        check_reposition(asked, view)
+        return asked
 
     def _ask(self, view: FleetView) -> Sequence[Directive]:
         try:

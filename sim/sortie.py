@@ -34,6 +34,7 @@ from sim.mission import MissionPlan
 from sim.pilot import Audit, Named, Pilot, Plan, named, plan_of, schedule_policies
 from sim.record import AgentNotes, Recorder, SortieRecord
 from sim.scoring import Scorer
+from sim.viewpoints import Choreography
 from sim.world import World, route_bounds
 
 VERSION = version("sortie-sim")
@@ -130,7 +131,13 @@ def run_sortie(
         form=Form(scenario.context.grid_cells, scenario.context.grid_bits, scenario.context.number_bits),
     )
     audit = Audit(env, recorder)
-    pilots = [Pilot(i, flight_plan, audit) for i in range(n)]
+    choreography: Choreography | None = None
+    if flight_plan.looks:
+        posed = any(trace.pose is not None for trace in traces.values())
+        choreography = Choreography(scenario, world, posed_by_trace=posed)
+        world.before_frame = choreography.renew
+    wish = None if choreography is None else choreography.ask
+    pilots = [Pilot(i, flight_plan, audit, wish) for i in range(n)]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     agents = [
         Agent(

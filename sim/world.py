@@ -15,6 +15,7 @@ import simpy
 from fleet.agent import Agent, Platform, Task
 from fleet.battery import FleetBatteries
 from fleet.coverage import RANGE_M
+from fleet.frames import up_vector
 from fleet.motion import Motion
 from fleet.rotor import fleet_power_w
 from fleet.senses import FlightSenses, Sensed
@@ -67,6 +68,8 @@ class World:
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self.on_second: Callable[[float], None] | None = None
         """Called once a simulated second; must not change anything."""
+        self.before_frame: Callable[[int], None] | None = None
+        """Called at each frame's begin, before the links are new: where the fleet may take another way."""
         self._scenario, self._recorder = scenario, recorder
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
@@ -94,12 +97,21 @@ class World:
             self.drain()
             self._frame = frame
             self.now = self.plan.at(env.now)
+            if self.before_frame is not None:
+                self.before_frame(frame)
             self.air.advance(self.extra_loss_db, list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
                 if self.on_second is not None:
                     self.on_second(env.now)
+
+    def reroute(self, motion: Motion) -> None:
+        """From the frame that begins on the fleet flies another way; what was flown before must be the same."""
+        self.motion = motion
+        self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
+        self._flight = FlightSenses(motion, self._scenario.frame_s)
+        self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
 
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land who has to."""
