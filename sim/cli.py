@@ -28,6 +28,7 @@ from sim import (
     cli_contexts,
     cli_export,
     cli_import,
+    cli_live,
     cli_paper,
     cli_recording,
     cli_report,
@@ -270,6 +271,7 @@ app.command()(cli_verify.overhead)
 app.command()(cli_export.export)
 app.command()(cli_report.report)
 app.command("import")(cli_import.import_log)
+app.command()(cli_live.live)
 
 
 @app.callback(invoke_without_command=True)

@@ -12,7 +12,7 @@ from sim.folders import RunError
 
 out = Console()
 err = Console(stderr=True, highlight=False)
-EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign"}
+EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds"}
 """Which extra brings a library that not everybody needs."""
 
 

@@ -224,10 +224,15 @@ class _OwnSenses:
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:
             return self._count_boxes(capture, roi)
-        x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
-        if roi is not None:
-            x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
-        return self._world.scene.cars_near(capture.t_s, x_m, y_m, radius_m)
+        return cars_in_reach(self._world.scene, capture, roi)
+
+
+def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
+    """How many cars a drone could report: within its range, or within a disc."""
+    x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
+    if roi is not None:
+        x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
+    return scene.cars_near(capture.t_s, x_m, y_m, radius_m)
 
 
 def route_bounds(motion: Motion) -> tuple[float, float, float, float]:

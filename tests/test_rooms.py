@@ -34,6 +34,7 @@ HOMES = {
     "distributed": ("sim/campaign/engine.py",),
     "dask": ("sim/campaign/engine.py",),
     "SALib": ("sim/campaign/*",),
+    "cyclonedds": ("sim/live/*",),
 }
 """Third-party libraries with one home each."""
 

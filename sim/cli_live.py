@@ -1,0 +1,129 @@
+"""`sortie live`: the context plane in real time over DDS, a process a drone."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from scenarios.load import load
+from sim.console import err, out, stages, user_errors
+from sim.folders import RunError, write_text
+from sim.named import policy_overrides
+
+if TYPE_CHECKING:
+    from sim.live.result import LiveResult
+
+SHOWN = 20
+"""So many changes are printed; `--out` keeps all of them."""
+
+
+def live(
+    scenario: Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")] = "paper_replay",
+    policy: Annotated[
+        str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
+    ] = None,
+    begin: Annotated[float, typer.Option(help="The scenario's time at which the fleet begins, s.", min=0)] = 0.0,
+    duration: Annotated[
+        float | None, typer.Option(help="How long it flies, s; left out, to the scenario's end.")
+    ] = None,
+    loss: Annotated[float, typer.Option(help="Share of descriptors that are lost on their way.", min=0, max=1)] = 0.0,
+    kill: Annotated[
+        str | None, typer.Option(metavar="DRONE@SECONDS", help="Kill a drone's process at the scenario's time: 2@70")
+    ] = None,
+    domain: Annotated[
+        int | None, typer.Option(help="DDS domain; left out, ROS_DOMAIN_ID or 0.", min=0, max=230)
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
+    ] = None,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write everything measured as JSON here.")] = None,
+) -> None:
+    """Run the context plane in real time over DDS: one process a drone, with publisher, policy node and gate.
+
+    Topics, types and QoS are those of ROS 2, so that its nodes can join: /fleet/context, /drone_0/to_drone_1/directive.
+    Ctrl-C ends the flight and reports what has been measured.
+    """
+    try:
+        number = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain
+    except ValueError as error:
+        raise RunError(f"ROS_DOMAIN_ID is {os.environ['ROS_DOMAIN_ID']!r}, must be a number") from error
+    killed = None if kill is None else _kill(kill)
+    flown = load(scenario, set_ or [])
+    if policy is not None:
+        flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
+    with user_errors():
+        from sim.live.session import fly_live
+
+    with stages() as report:
+        result = fly_live(
+            flown,
+            begin_s=begin,
+            duration_s=duration,
+            loss=loss,
+            kill=killed,
+            domain=number,
+            progress=lambda what, done, of: report(what, round(done), round(of)),
+        )
+    _show(result)
+    if out_file is not None:
+        write_text(out_file, json.dumps(result.as_json(), indent=2) + "\n")
+        out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
+    if result.interrupted:
+        err.print(f"interrupted after {result.flown_s:.1f} s")
+        raise typer.Exit(130)
+
+
+def _kill(text: str) -> tuple[int, float]:
+    drone, at, t_s = text.partition("@")
+    try:
+        if not at:
+            raise ValueError
+        return int(drone), float(t_s)
+    except ValueError as error:
+        raise RunError(f"--kill {text!r}, must be a drone and a time, as in 2@70") from error
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1%}"
+
+
+def _show(result: LiveResult) -> None:
+    from sim.live.result import overhead_rows
+    from sim.live.words import changes_in_words
+
+    where = f"{result.begin_s:g}–{result.begin_s + result.flown_s:.0f} s"
+    losses = f", {result.loss:.0%} of descriptors lost" if result.loss else ""
+    table = Table(
+        "overhead of the plane", "paper, 4 agents", "here", title=f"{result.scenario}, {where}, {result.policy}{losses}"
+    )
+    for row in overhead_rows(result):
+        table.add_row(*row)
+    out.print(table)
+    table = Table(title="on the bus, all keep-last-1")
+    for column in ("topic", "type", "QoS", "per s", "kB/s", "heard", "arrived"):
+        table.add_column(column, no_wrap=column != "type", overflow="fold")
+    for t in result.topics:
+        table.add_row(
+            t.topics.replace("to_drone_*", "…"), t.type.rpartition("/")[2], t.qos.partition(",")[0], f"{t.samples_per_s:.1f}",
+            f"{t.bytes_per_s / 1e3:.1f}", _share(t.heard_share), _share(t.delivered_share),
+        )  # fmt: skip
+    out.print(table)
+    table = Table("drone", "CPU", "published", "heard", "lost", "refused", "publishes within", title="processes")
+    for d in result.each:
+        refused = ", ".join(f"{n} {why}" for why, n in d.refused.items()) or "0"
+        table.add_row(
+            f"{d.drone}", f"{d.cpu_percent:.1f} %", f"{d.published}", f"{d.heard}", f"{d.dropped_by_loss}", refused,
+            f"{1e3 * d.publishes_within_s:.0f} ms",
+        )  # fmt: skip
+    out.print(table)
+    lines = changes_in_words(result)
+    for line in lines[:SHOWN]:
+        out.print(line, soft_wrap=True, markup=False)
+    if len(lines) > SHOWN:
+        out.print(f"… and {len(lines) - SHOWN} more changes; --out keeps all")
+    out.print(f"{result.machine}; {result.decisions} decisions", soft_wrap=True)

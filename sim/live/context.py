@@ -1,0 +1,104 @@
+"""What each drone of a live fleet senses: a sortie flown before, told again at the wall's pace.
+
+The paper's publishers replay context traces; here the trace is a flown scenario. Poses are the motion model's, the
+mission is the plan's; charge, headrooms and goodput are those that the drone published in the simulated flight, under
+the same policy, since on loopback there is neither a pack to drain nor a radio to measure.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pyarrow.compute as pc
+
+from fleet.agent import Platform, Task
+from fleet.motion import fly
+from fleet.senses import FlightSenses, Sensed
+from fleet.traces import follow, read_traces
+from perception.scene import SceneModel
+from perception.types import Capture
+from policies.contract import Disc
+from scenarios.schema import Scenario
+from sim.mission import MissionPlan
+from sim.sortie import run_sortie
+from sim.world import cars_in_reach, route_bounds
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """What one drone published in the simulated flight, by rising time."""
+
+    t_s: tuple[float, ...]
+    platform: tuple[Platform, ...]
+    goodput_mbps: tuple[tuple[float, ...], ...]
+    end_s: float
+    """From when on it is silent: it landed or was lost; infinite where it flew to the end."""
+
+    def at(self, t_s: float) -> int:
+        """Index of the latest row at `t_s`, the first one before there is any."""
+        return max(0, bisect_right(self.t_s, t_s) - 1)
+
+
+def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) -> list[Trace]:
+    """Fly the scenario without a detector and keep each drone's trace.
+
+    Raises:
+        PolicyError: its policy is unknown or breaks its contract.
+    """
+    perception = scenario.perception.model_copy(update={"detector": "none"})
+    record = run_sortie(scenario.model_copy(update={"perception": perception}), progress=progress)
+    rows, found = record.tables["descriptors"], []
+    for drone in range(scenario.fleet.drones):
+        own = rows.filter(pc.equal(rows["drone"], drone)).to_pylist()
+        t_s = tuple(row["t_s"] for row in own)
+        silent_s = t_s[-1] + 1.5 * scenario.frame_s * scenario.context.publish_every if t_s else 0.0
+        found.append(
+            Trace(
+                t_s,
+                tuple(Platform(row["soc"], row["cpu_headroom"], row["gpu_headroom"]) for row in own),
+                tuple(tuple(row["goodput_mbps"]) for row in own),
+                silent_s if silent_s < scenario.duration_s else float("inf"),
+            )
+        )
+    return found
+
+
+class ReplaySenses:
+    """One drone's own sensors (fleet.agent.Senses), frame 0 being the one of `begin_s`."""
+
+    def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
+        motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
+        poses = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, scenario.fleet.drones)
+        motion = follow(motion, poses, scenario.frame_s)
+        self._flight = FlightSenses(motion, scenario.frame_s)
+        self._scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
+        self._plan = MissionPlan(scenario.mission)
+        self._drone, self._trace = drone, trace
+        self._first = round(begin_s / scenario.frame_s)
+        self._sensed = self._flight.at(self._first)[drone]
+        self._row = trace.at(begin_s)
+
+    def sense(self, frame: int) -> Sensed:
+        """The drone in a frame; what is asked for next is of the same moment."""
+        self._sensed = sensed = self._flight.at(self._first + frame)[self._drone]
+        self._row = self._trace.at(sensed.capture.t_s)
+        return sensed
+
+    def platform(self) -> Platform:
+        """Charge and headrooms."""
+        return self._trace.platform[self._row]
+
+    def goodput_mbps(self) -> tuple[float, ...]:
+        """To every other drone by ascending id."""
+        return self._trace.goodput_mbps[self._row]
+
+    def task(self) -> Task:
+        """Phase, region and targets."""
+        capture = self._sensed.capture
+        return self._plan.at(capture.t_s).task(capture.position_m, self._sensed.footprint_radius_m)
+
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        """Cars in range: no detector runs here."""
+        return cars_in_reach(self._scene, capture, roi)

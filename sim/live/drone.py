@@ -1,0 +1,129 @@
+"""One drone as one OS process: its nodes on the bus, its agent on the wall's clock, a pipe to the bench."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+from fleet.agent import Agent, PlaneRules
+from policies.contract import PolicyError
+from scenarios.schema import Scenario
+from scenarios.streams import stream
+from sim.live.bus import Bus
+from sim.live.clock import WallClock
+from sim.live.context import ReplaySenses, Trace
+from sim.live.node import LiveNode
+from sim.live.reports import Failed, Go, Home, Notice, Ready, Report
+from sim.pilot import Audit, Pilot, plan_of, schedule_policies
+from sim.record import Recorder
+from sim.sortie import PHASE_SHARE
+from sim.world import at
+
+POLL_S = 0.02
+"""How often a process that waits for others looks at its pipe."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orders:
+    """What a drone's process is started with."""
+
+    scenario: Scenario
+    drone: int
+    trace: Trace
+    begin_s: float
+    """The scenario's time at which the replay begins."""
+    end_s: float
+    loss: float
+    domain: int
+
+
+def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
+    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus tells no rates."""
+    return PlaneRules(
+        period_s=scenario.frame_s,
+        frames=round((end_s - begin_s) / scenario.frame_s),
+        degraded_after_periods=scenario.context.degraded_after_periods,
+        detached_after_periods=scenario.context.detached_after_periods,
+        dwell_s=scenario.policy.dwell_s,
+        compute_delay_s=scenario.perception.compute_delay_s,
+        publish_every=scenario.context.publish_every,
+    )
+
+
+def fly_one(orders: Orders, pipe: Connection) -> None:
+    """The process of one drone: ready, go, fly, report; ends with its flight, a word from the bench or its death."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the bench's, which tells everybody to stop
+    try:
+        node = LiveNode(
+            Bus(orders.domain), orders.drone, orders.scenario.fleet.drones, seed=orders.scenario.seed, loss=orders.loss
+        )
+        senses = ReplaySenses(orders.scenario, orders.drone, orders.trace, orders.begin_s)
+        while not node.all_found(orders.scenario.fleet.drones):
+            if pipe.poll(POLL_S):
+                return
+        pipe.send(Ready(orders.drone))
+        go = pipe.recv()
+        if isinstance(go, Go):
+            _fly(orders, node, senses, go, pipe)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return  # nobody is left to report to
+    except (PolicyError, OSError) as error:
+        pipe.send(Failed(orders.drone, str(error)))
+    finally:
+        pipe.close()
+
+
+def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Connection) -> None:
+    scenario, drone = orders.scenario, orders.drone
+    time.sleep(max(0.0, go.monotonic_s - time.monotonic()))
+    clock = WallClock(orders.begin_s, go.monotonic_s)
+    recorder = Recorder()
+    plan = plan_of(scenario.policy)._replace(replays=())
+    pilot = Pilot(drone, plan, Audit(clock, recorder))
+    rules = rules_of(scenario, orders.begin_s, orders.end_s)
+    phase_s = PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
+    agent = Agent(
+        clock,
+        drone,
+        rules=rules,
+        policy=node.watched(pilot),
+        senses=senses,
+        modem=node,
+        log=node,
+        sealer=None,
+        phase_s=orders.begin_s + phase_s,
+        handshake_bytes=plan.first.handshake_bytes,
+    )
+    agent.clock_skew_s = go.unix_ns * 1e-9 - orders.begin_s  # stamps are ns since 1970, as ROS 2 has them
+    node.fly(agent, rules, senses.goodput_mbps)
+    schedule_policies(clock, plan, [pilot], [agent])
+    if orders.trace.end_s < orders.end_s:
+        at(clock, orders.trace.end_s, agent.stop)
+    agent.start()
+
+    def tell() -> None:
+        pipe.send(_with_notices(node.report(clock.now), recorder))
+
+    told_s = orders.begin_s
+    while clock.now < orders.end_s and not pipe.poll():
+        node.wait(min(clock.peek(), orders.end_s) - clock.now)
+        node.take()
+        clock.catch_up()
+        if clock.now - told_s >= 1.0:
+            told_s = clock.now
+            tell()
+    tell()
+    pipe.send(Home(drone))
+
+
+def _with_notices(report: Report, recorder: Recorder) -> Report:
+    """The report with what the audit wrote since the last one."""
+    for t_s, drone, _, text in recorder.rows["events"]:
+        report.notices.append(Notice(t_s, drone, text))
+    for t_s, drone, peer, _, kind, text in recorder.rows["interventions"]:
+        report.notices.append(Notice(t_s, drone, f"{kind} → {peer}: {text}"))
+    recorder.rows["events"].clear()
+    recorder.rows["interventions"].clear()
+    return report

@@ -1,0 +1,111 @@
+"""The plane's messages as DDS types, named and laid out as ROS 2 has them on the wire.
+
+A type is made from its `.msg` text (`fleet/sortie_msgs`; three standard ones stand below), so that there is no second
+definition. A sample is kept as its CDR bytes: `fleet.wire` writes and reads them, with all its checks, and this module
+only tells DDS what they are called. `sortie_msgs/msg/ContextDescriptor` is `sortie_msgs::msg::dds_::ContextDescriptor_`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from functools import cache
+from typing import Any
+
+from cyclonedds.idl import make_idl_struct
+from cyclonedds.idl.types import array, float32, int32, sequence, uint8, uint16, uint32
+
+from fleet.cdr import ENCAPSULATION, MalformedDatagram
+from fleet.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
+
+BYTES_NAME = "std_msgs/msg/UInt8MultiArray"
+DEFINITIONS = {
+    DESCRIPTOR_NAME: DESCRIPTOR_MSG,
+    DIRECTIVE_NAME: DIRECTIVE_MSG,
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/msg/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
+    "std_msgs/msg/MultiArrayLayout": "MultiArrayDimension[] dim\nuint32 data_offset",
+    BYTES_NAME: "MultiArrayLayout layout\nuint8[] data",
+}
+"""By ROS 2 name."""
+
+_PRIMITIVES = {"uint8": uint8, "uint16": uint16, "uint32": uint32, "int32": int32, "float32": float32, "string": str}
+_FIELD = re.compile(r"(?P<type>[A-Za-z0-9_/]+)(?:\[(?P<length>\d*)\])?\s+(?P<name>[a-z][a-z0-9_]*)")
+_BYTES = struct.Struct("<4s3I")  # an empty layout (no dimensions, offset 0), then the count of bytes
+BYTES_OVERHEAD = _BYTES.size
+"""What a `UInt8MultiArray` puts in front of its bytes, encapsulation included."""
+
+
+class Cdr:
+    """How a sample of every type made here behaves: it is its CDR bytes, encapsulation header included."""
+
+    def __init__(self, cdr: bytes) -> None:
+        self.cdr = cdr
+
+    def serialize(self, buffer: object = None, endianness: object = None, use_version_2: object = None) -> bytes:
+        """As DDS asks for it."""
+        return self.cdr
+
+    @classmethod
+    def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: object = None) -> Cdr:
+        """As DDS hands it over; nothing is believed yet."""
+        return cls(data)
+
+
+def dds_name(ros_name: str) -> str:
+    """`pkg/msg/Name` as DDS knows it: `pkg::msg::dds_::Name_`."""
+    package, kind, name = ros_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+@cache
+def dds_type(ros_name: str) -> type[Any]:
+    """The DDS type of a ROS 2 message; its samples are `Cdr`.
+
+    Raises:
+        KeyError: none of `DEFINITIONS`.
+        ValueError: a line that is no field.
+    """
+    package = ros_name.partition("/")[0]
+    fields = {}
+    for line in DEFINITIONS[ros_name].splitlines():
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        field = _FIELD.fullmatch(text)
+        if field is None:
+            raise ValueError(f"{ros_name}: {text!r} is no field")
+        fields[field["name"]] = _field_type(package, field["type"], field["length"])
+    name = f"{ros_name.rpartition('/')[2]}_"
+    made: type[Any] = make_idl_struct(name, dds_name(ros_name), fields, dataclassify=False)
+    for own in ("__init__", "serialize", "deserialize"):  # as a base, Cdr would have to be a type of IDL itself
+        setattr(made, own, vars(Cdr)[own])
+    return made
+
+
+def _field_type(package: str, text: str, length: str | None) -> Any:
+    base = _PRIMITIVES.get(text)
+    if base is None:
+        base = dds_type(text.replace("/", "/msg/") if "/" in text else f"{package}/msg/{text}")
+    if length is None:
+        return base
+    return array[base, int(length)] if length else sequence[base]  # type: ignore[misc]
+
+
+def pack_bytes(content: bytes) -> bytes:
+    """Bytes as CDR of `std_msgs/msg/UInt8MultiArray`."""
+    return _BYTES.pack(ENCAPSULATION, 0, 0, len(content)) + content
+
+
+def unpack_bytes(cdr: bytes) -> bytes:
+    """The bytes of a `UInt8MultiArray` with an empty layout.
+
+    Raises:
+        MalformedDatagram: for anything else.
+    """
+    if len(cdr) < BYTES_OVERHEAD:
+        raise MalformedDatagram(f"{len(cdr)} B, must be at least {BYTES_OVERHEAD}")
+    header, dimensions, offset, count = _BYTES.unpack_from(cdr)
+    if header != ENCAPSULATION or dimensions or offset or not 0 <= len(cdr) - BYTES_OVERHEAD - count < 4:
+        raise MalformedDatagram("no UInt8MultiArray with an empty layout")
+    return cdr[BYTES_OVERHEAD : BYTES_OVERHEAD + count]

@@ -1,0 +1,262 @@
+"""One drone's nodes on the bus: context publisher, policy node and gate, around the simulator's own `Agent`.
+
+    publisher    /fleet/context                      what `fleet.agent` broadcasts
+    policy node  /fleet/context → /…/directive       staleness rules and damping as in the simulator; every directive in
+                                                     force again with every tick, as the paper's node does
+    gate         /…/directive → /…/features, compact payloads of the size that `fleet.gate` gives them
+
+Policy node and gate speak through DDS alone, though they share a process.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fleet.agent import Agent, PlaneRules
+from fleet.auth import Dropped, DropReason, Opened, open_datagram
+from fleet.cdr import MalformedDatagram
+from fleet.gate import HEADER_BYTES, Gate, Payload
+from fleet.staleness import LinkHealth, health
+from fleet.trust import Standing
+from fleet.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
+from perception.types import Capture
+from policies.contract import Descriptor, Directive, FleetView, Policy
+from scenarios.streams import stream
+from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, Writer
+from sim.live.messages import pack_bytes, unpack_bytes
+from sim.live.reports import Count, HealthChange, Order, Report
+
+_HEADER = struct.Struct("<qI3f4f")
+"""Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `fleet.gate`."""
+
+
+class Link:
+    """One drone's ends towards one peer."""
+
+    def __init__(self, bus: Bus, me: int, peer: int) -> None:
+        self.peer = peer
+        self.directive = bus.writer(Topic(Kind.DIRECTIVE, me, peer))
+        self.payload = {kind: bus.writer(Topic(kind, me, peer)) for kind in PAYLOADS}
+        self.ordered = bus.reader(Topic(Kind.DIRECTIVE, me, peer))
+        self.incoming = [bus.reader(Topic(kind, peer, me)) for kind in PAYLOADS]
+
+    @property
+    def writers(self) -> list[Writer]:
+        """Ends that speak."""
+        return [self.directive, *self.payload.values()]
+
+
+class BusGate(Gate):
+    """The agent's gate, behind the bus: what it is told goes out as directives, and it obeys what comes in."""
+
+    def __init__(self, publish: Callable[[Directive], None]) -> None:
+        super().__init__()
+        self._publish = publish
+        self._ordered: dict[int, Directive] = {}
+
+    def enforce(self, directive: Directive) -> None:
+        """The policy node changed its mind about a link."""
+        self._ordered[directive.destination] = directive
+
+    def repeat(self) -> None:
+        """Publish every directive in force; repeating one changes nothing at the gate."""
+        for directive in self._ordered.values():
+            self._publish(directive)
+
+    def obey(self, directive: Directive) -> None:
+        """A directive came in."""
+        super().enforce(directive)
+
+
+class LiveNode:
+    """The nodes of one drone; it is the agent's modem and its log."""
+
+    def __init__(self, bus: Bus, drone: int, drones: int, *, seed: int, loss: float) -> None:
+        """Args: `loss` is the share of others' descriptors that is dropped on arrival, 0 … 1, drawn by link."""
+        self.drone = drone
+        self._bus, self._seed, self._loss = bus, seed, loss
+        self._context = bus.writer(CONTEXT)
+        self._fleet = bus.reader(CONTEXT, MAX_DEPTH)
+        self._links: dict[int, Link] = {}
+        for peer in range(drones):
+            if peer != drone:
+                self._meet(peer)
+        self.gate = BusGate(self._direct)
+        self._draws: dict[int, np.random.Generator] = {}
+        self._health: dict[int, LinkHealth] = {}
+        self._published = self._heard = self._lost = 0
+        self._late_s = 0.0
+        self._refused: Counter[str] = Counter()
+        self._sent = dict.fromkeys((Kind.DIRECTIVE, *PAYLOADS), Count())
+        self._received = dict.fromkeys(PAYLOADS, Count())
+        self._new = Report(drone, 0.0, 0.0, 0, 0, 0, {}, 0.0, {}, {})
+        self._began_cpu_s = 0.0
+
+    def all_found(self, drones: int) -> bool:
+        """Whether every end has met its readers: each drone's and the bench's."""
+        others = [w for link in self._links.values() for w in link.writers]
+        return self._context.listeners > drones and all(w.listeners >= 2 for w in others)
+
+    def fly(self, agent: Agent, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]) -> None:
+        """Take the agent that speaks through these nodes; its processor time counts from here."""
+        self.agent, self._rules = agent, rules
+        agent.gate = self.gate
+        self.goodput_mbps = goodput_mbps
+        self._began_cpu_s = time.process_time()
+
+    def watched(self, decide: Policy) -> Policy:
+        """The policy, timed, the health of every peer noted beside it."""
+
+        def watching(view: FleetView) -> Sequence[Directive]:
+            self._note_health(view)
+            begin_ns = time.thread_time_ns()
+            directives = decide(view)
+            self._new.decide_ns.append(time.thread_time_ns() - begin_ns)
+            return directives
+
+        return watching
+
+    def wait(self, timeout_s: float) -> None:
+        """Sleep until something came in or the time is over."""
+        self._bus.wait(timeout_s)
+
+    def take(self) -> None:
+        """Hand over what came in: directives first, since the gate may be about to act on them."""
+        for link in list(self._links.values()):
+            for cdr in link.ordered.take():
+                self._obey(cdr, link.peer)
+            for reader in link.incoming:
+                for cdr in reader.take():
+                    self._receive(cdr, reader)
+        for cdr in self._fleet.take():
+            self._hear(cdr)
+
+    def report(self, t_s: float) -> Report:
+        """How it stands; what is new in it will not be told again."""
+        new, self._new = self._new, Report(self.drone, 0.0, 0.0, 0, 0, 0, {}, 0.0, {}, {})
+        return Report(
+            self.drone, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
+            dict(self._refused), self._late_s, dict(self._sent), dict(self._received),
+            new.decide_ns, new.data_age_s, new.health, new.orders,
+        )  # fmt: skip
+
+    # --- fleet.agent.Modem -----------------------------------------------------------------------
+
+    goodput_mbps: Callable[[], tuple[float, ...]]
+
+    def broadcast(self, datagram: bytes) -> None:
+        self._published += 1
+        self._context.write(datagram)
+
+    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
+        """Publish a payload of its exact size: header and directive as they are, zeros for the features."""
+        directive = self.gate.in_force(peer)
+        if directive is None:
+            return
+        stamp_ns = round((capture.t_s + self.agent.clock_skew_s) * 1e9)
+        header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)
+        content = (header + encode_directive(directive)).ljust(payload.size_bytes, b"\0")
+        self._write(peer, Kind.COMPACT if payload.reliable else Kind.FEATURES, content)
+
+    def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
+        self._write(peer, Kind.FEATURES, bytes(size_bytes))
+
+    # --- fleet.agent.AgentLog --------------------------------------------------------------------
+
+    def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None:
+        clock_s = t_s + self.agent.clock_skew_s
+        self._late_s = max(self._late_s, clock_s - descriptor.stamp_ns * 1e-9)
+
+    def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
+        rung = enforced.representation.name.lower()
+        self._new.orders.append(Order(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
+
+    def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:
+        """Trust is off here."""
+
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
+        self.gate.repeat()
+
+    # --- what comes in ---------------------------------------------------------------------------
+
+    def _hear(self, cdr: bytes) -> None:
+        heard = opened(cdr)
+        if isinstance(heard, Opened):
+            sender = heard.descriptor.agent_id
+            if sender == self.drone:
+                return
+            if self._loss and self._drawn(sender).random() < self._loss:
+                self._lost += 1
+                return
+            if sender not in self._links:
+                self._meet(sender)
+        refused = self.agent.hear(heard)
+        if isinstance(refused, DropReason):
+            self._refused[f"descriptor {refused}"] += 1
+        else:
+            self._heard += 1
+
+    def _obey(self, cdr: bytes, peer: int) -> None:
+        try:
+            directive = decode_directive(cdr)
+        except MalformedDatagram:
+            self._refused["directive malformed"] += 1
+            return
+        if (directive.source, directive.destination) != (self.drone, peer):
+            self._refused["directive of another link"] += 1
+            return
+        self.gate.obey(directive)
+
+    def _receive(self, cdr: bytes, reader: Reader) -> None:
+        kind = reader.topic.kind
+        try:
+            content = unpack_bytes(cdr)
+            self._received[kind] = self._received[kind].plus(len(content))
+            if len(content) < HEADER_BYTES + DIRECTIVE_BYTES or not any(content[:HEADER_BYTES]):
+                return  # a handshake
+            decode_directive(content[HEADER_BYTES : HEADER_BYTES + DIRECTIVE_BYTES])
+        except MalformedDatagram:
+            self._refused["payload malformed"] += 1
+            return
+        self._new.data_age_s.append(time.time() - _HEADER.unpack_from(content)[0] * 1e-9)
+
+    # --- helpers ---------------------------------------------------------------------------------
+
+    def _meet(self, peer: int) -> None:
+        self._links[peer] = Link(self._bus, self.drone, peer)
+
+    def _direct(self, directive: Directive) -> None:
+        self._sent[Kind.DIRECTIVE] = self._sent[Kind.DIRECTIVE].plus(DIRECTIVE_BYTES)
+        self._links[directive.destination].directive.write(encode_directive(directive))
+
+    def _write(self, peer: int, kind: Kind, content: bytes) -> None:
+        self._sent[kind] = self._sent[kind].plus(len(content))
+        self._links[peer].payload[kind].write(pack_bytes(content))
+
+    def _drawn(self, sender: int) -> np.random.Generator:
+        if sender not in self._draws:
+            self._draws[sender] = stream(self._seed, 0, (sender, self.drone), "live loss")
+        return self._draws[sender]
+
+    def _note_health(self, view: FleetView) -> None:
+        rules, now_s = self._rules, self.agent.env.now
+        for peer in view.peers:
+            age_s = view.age_s[peer]
+            found = health(age_s, rules.descriptor_period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            if found != self._health.get(peer, LinkHealth.DETACHED):
+                self._health[peer] = found
+                self._new.health.append(HealthChange(now_s, self.drone, peer, found, age_s))
+
+
+def opened(cdr: bytes) -> Opened | Dropped:
+    """A descriptor, checked; DDS fills samples up to a multiple of 4 B, and one may end on 2 B."""
+    whole = open_datagram(cdr, None)
+    if isinstance(whole, Dropped) and cdr[-2:] == b"\0\0":
+        shorter = open_datagram(cdr[:-2], None)
+        return shorter if isinstance(shorter, Opened) else whole
+    return whole

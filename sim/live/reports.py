@@ -1,0 +1,104 @@
+"""What a drone's process tells the bench, once a second, by pipe: plain values that outlive the process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from fleet.staleness import LinkHealth
+from sim.live.bus import Kind
+
+
+class HealthChange(NamedTuple):
+    """A drone's context about a peer became fresh, degraded or detached."""
+
+    t_s: float
+    drone: int
+    peer: int
+    health: LinkHealth
+    age_s: float
+    """Of the peer's latest descriptor."""
+
+
+class Order(NamedTuple):
+    """A directive that a policy node published for the first time: what a link carries changed."""
+
+    t_s: float
+    drone: int
+    peer: int
+    representation: str
+    rate_hz: float
+    reason: str
+
+
+class Count(NamedTuple):
+    """Samples and their bytes."""
+
+    samples: int = 0
+    bytes: int = 0
+
+    def plus(self, size: int) -> Count:
+        """One more."""
+        return Count(self.samples + 1, self.bytes + size)
+
+
+class Notice(NamedTuple):
+    """A policy that took over, a directive that the shield replaced."""
+
+    t_s: float
+    drone: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One drone so far: counts since the begin, and what is new since the last report."""
+
+    drone: int
+    t_s: float
+    cpu_s: float
+    """Processor time of all threads of the process."""
+    published: int
+    heard: int
+    """Descriptors of others that were believed."""
+    lost: int
+    """Descriptors of others that `--loss` took."""
+    refused: dict[str, int]
+    """Descriptors, directives and payloads that were not what they claimed to be, by reason."""
+    late_s: float
+    """From a frame's begin until its descriptor was published, at most; a tenth of a frame is meant."""
+    sent: dict[Kind, Count]
+    received: dict[Kind, Count]
+    decide_ns: list[int] = field(default_factory=list)
+    """New: processor time of each decision."""
+    data_age_s: list[float] = field(default_factory=list)
+    """New: age of each payload's capture when it came in."""
+    health: list[HealthChange] = field(default_factory=list)
+    orders: list[Order] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+
+
+class Ready(NamedTuple):
+    """The process has found all others."""
+
+    drone: int
+
+
+class Go(NamedTuple):
+    """When the flight begins: on the host's monotonic clock, and as ns since 1970."""
+
+    monotonic_s: float
+    unix_ns: int
+
+
+class Home(NamedTuple):
+    """The process flew to its end, and this is its last word."""
+
+    drone: int
+
+
+class Failed(NamedTuple):
+    """The process gave up; its error in one line."""
+
+    drone: int
+    what: str

@@ -1,0 +1,239 @@
+"""What a live flight came to: bytes, decision time and processor time as the paper measures them, and who was lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fleet.staleness import LinkHealth
+from perception.harness.claims import OVERHEAD
+from scenarios.schema import Scenario
+from sim.live.bench import Bench, Fleet
+from sim.live.bus import CONTEXT, PAYLOADS, Kind, Topic
+from sim.live.reports import HealthChange, Notice, Order
+from sim.plane import machine
+
+PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
+"""The paper's figures, by the claim that states them."""
+
+
+class Lost(NamedTuple):
+    """A process that ended in the air."""
+
+    drone: int
+    t_s: float
+    how: str
+
+
+class DroneResult(NamedTuple):
+    """One drone's process."""
+
+    drone: int
+    cpu_percent: float
+    """Of one core, all threads, from the begin to its last report."""
+    published: int
+    heard: int
+    dropped_by_loss: int
+    refused: dict[str, int]
+    publishes_within_s: float
+    """From a frame's begin to its descriptor, at most."""
+
+
+class TopicRate(NamedTuple):
+    """One kind of topic, all of them together, as the bench heard them."""
+
+    topics: str
+    type: str
+    qos: str
+    samples_per_s: float
+    bytes_per_s: float
+    mean_bytes: float | None
+    heard_share: float | None
+    """Of what the drones' last reports say was published, the bench heard so much."""
+    delivered_share: float | None
+    """Of payloads, so many came in at the drones that they were for."""
+
+
+class Noticed(NamedTuple):
+    """How the others noticed that a drone was gone: the first and the last of them, s after it."""
+
+    drone: int
+    degraded_s: tuple[float, float] | None
+    detached_s: tuple[float, float] | None
+    by: int
+    """How many of the others detached it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveResult:
+    """A live flight, measured."""
+
+    scenario: str
+    policy: str
+    drones: int
+    begin_s: float
+    flown_s: float
+    loss: float
+    interrupted: bool
+    machine: str
+    topics: list[TopicRate]
+    descriptor_bytes: float | None
+    directives_per_s: float
+    context_bytes_per_s: float
+    """Descriptors and directives, as serialised."""
+    data_bytes_per_s: float
+    """Payloads, as the bench received them."""
+    context_share: float | None
+    """Context over data."""
+    decide_ms_p50: float | None
+    """Processor time of one drone's decision."""
+    decide_ms_p99: float | None
+    decisions: int
+    data_age_ms_p50: float | None
+    """From a capture to its payload's arrival, compute delay included."""
+    drones_cpu_percent: float
+    """All drones' processes together, of one core."""
+    bench_cpu_percent: float
+    each: list[DroneResult]
+    lost: list[Lost]
+    noticed: list[Noticed]
+    health: list[HealthChange]
+    """Fresh, degraded, detached: by drone and peer, as time goes."""
+    orders: list[Order]
+    notices: list[Notice]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        plain = asdict(self)
+        for name in ("topics", "each", "lost", "noticed", "orders", "notices"):
+            plain[name] = [row._asdict() for row in getattr(self, name)]
+        plain["health"] = [{**row._asdict(), "health": row.health.name.lower()} for row in self.health]
+        return plain
+
+
+def summary(
+    scenario: Scenario,
+    bench: Bench,
+    fleet: Fleet,
+    *,
+    begin_s: float,
+    flown_s: float,
+    loss: float,
+    lost: Sequence[Lost],
+    interrupted: bool,
+) -> LiveResult:
+    """Put the bench's counts and the drones' reports together; `flown_s` is the wall's time in the air."""
+    reports = [r for of_drone in fleet.all.values() for r in of_drone]
+    decide_ms = np.array([ns for r in reports for ns in r.decide_ns]) / 1e6
+    data_age_ms = np.array([s for r in reports for s in r.data_age_s]) * 1e3
+    health = sorted((c for r in reports for c in r.health), key=lambda c: c.t_s)
+    context, directives = bench.of(Kind.CONTEXT), bench.of(Kind.DIRECTIVE)
+    data_bytes = sum(bench.of(kind).bytes for kind in PAYLOADS)
+    context_bytes = context.bytes + directives.bytes
+    each = [
+        DroneResult(
+            r.drone, 100 * r.cpu_s / max(r.t_s - begin_s, 1e-9), r.published, r.heard, r.lost, r.refused, r.late_s
+        )
+        for r in fleet.last.values()
+    ]  # fmt: skip
+    return LiveResult(
+        scenario=scenario.name,
+        policy=scenario.policy.name,
+        drones=scenario.fleet.drones,
+        begin_s=begin_s,
+        flown_s=flown_s,
+        loss=loss,
+        interrupted=interrupted,
+        machine=machine(),
+        topics=list(_topics(bench, fleet, flown_s)),
+        descriptor_bytes=context.bytes / context.samples if context.samples else None,
+        directives_per_s=directives.samples / flown_s,
+        context_bytes_per_s=context_bytes / flown_s,
+        data_bytes_per_s=data_bytes / flown_s,
+        context_share=context_bytes / data_bytes if data_bytes else None,
+        decide_ms_p50=_percentile(decide_ms, 50),
+        decide_ms_p99=_percentile(decide_ms, 99),
+        decisions=len(decide_ms),
+        data_age_ms_p50=_percentile(data_age_ms, 50),
+        drones_cpu_percent=sum(d.cpu_percent for d in each),
+        bench_cpu_percent=100 * bench.cpu_s / flown_s,
+        each=sorted(each),
+        lost=list(lost),
+        noticed=[_noticed(gone, health) for gone in lost],
+        health=health,
+        orders=sorted((o for r in reports for o in r.orders), key=lambda o: o.t_s),
+        notices=sorted((n for r in reports for n in r.notices), key=lambda n: n.t_s),
+    )
+
+
+def overhead_rows(result: LiveResult) -> Iterator[tuple[str, str, str]]:
+    """The paper's overhead table beside ours: what, the paper's figure, ours."""
+    n, hz = result.drones, result.topics[0].samples_per_s
+    yield "descriptor, serialised", f"{PAPER['plane.descriptor']:.0f} B", _figure(result.descriptor_bytes, "{:.0f} B")
+    yield "descriptors a second", "4 × 10", f"{hz:.1f} of {n} drones"
+    yield "directives a second, 36 B each", "80", f"{result.directives_per_s:.0f}"
+    yield "context plane", f"{PAPER['plane.rate']:.1f} kB/s", f"{result.context_bytes_per_s / 1e3:.1f} kB/s"
+    paper_data = f"{PAPER['plane.data']:.0f} MB/s; {PAPER['plane.x86.data']:.0f} in an x86 container"
+    yield "data plane that it steers", paper_data, f"{result.data_bytes_per_s / 1e6:.1f} MB/s"
+    share = None if result.context_share is None else 100 * result.context_share
+    yield "context over data", f"{PAPER['plane.share']:.2f} %", _figure(share, "{:.2f} %")
+    median = f"{PAPER['plane.median']:.2f} ms; {PAPER['plane.x86.median']:.2f} on x86"
+    yield "a policy decision, median", median, _figure(result.decide_ms_p50, "{:.3f} ms")
+    yield (
+        "a policy decision, 99th percentile",
+        f"{PAPER['plane.p99']:.2f} ms",
+        _figure(result.decide_ms_p99, "{:.3f} ms"),
+    )
+    cpu = f"{result.drones_cpu_percent:.0f} % by {n} drones, {result.bench_cpu_percent:.0f} % by the bench"
+    yield "processor, of one core", f"{PAPER['plane.core']:.0f} %", cpu
+
+
+def _figure(value: float | None, text: str) -> str:
+    return "–" if value is None else text.format(value)
+
+
+def _percentile(values: np.ndarray, percent: float) -> float | None:
+    return float(np.percentile(values, percent)) if len(values) else None
+
+
+def _topics(bench: Bench, fleet: Fleet, flown_s: float) -> Iterator[TopicRate]:
+    for kind in Kind:
+        topic = CONTEXT if kind == Kind.CONTEXT else Topic(kind, 0, 1)
+        name = topic.name.replace("drone_0", "drone_*").replace("drone_1", "drone_*")
+        count = bench.of(kind)
+        if kind == Kind.CONTEXT:
+            sent = sum(r.published for r in fleet.last.values())
+        else:
+            sent = sum(r.sent[kind].samples for r in fleet.last.values())
+        yield TopicRate(
+            name,
+            kind.ros_type,
+            ("reliable" if kind.reliable else "best effort") + ", keep last 1",
+            count.samples / flown_s,
+            count.bytes / flown_s,
+            count.bytes / count.samples if count.samples else None,
+            min(1.0, count.samples / sent) if sent else None,
+            min(1.0, sum(r.received[kind].samples for r in fleet.last.values()) / sent)
+            if sent and kind in PAYLOADS
+            else None,
+        )
+
+
+def _noticed(gone: Lost, health: Sequence[HealthChange]) -> Noticed:
+    """When the others' contexts of a lost drone were degraded and detached, after it was seen to be gone."""
+    after = [c for c in health if c.peer == gone.drone and c.t_s > gone.t_s - 1.0]
+    # the last change of each of the others is the one that lasts
+    last: dict[int, dict[LinkHealth, float]] = {}
+    for c in after:
+        last.setdefault(c.drone, {})[c.health] = max(0.0, c.t_s - gone.t_s)
+    degraded = [at[LinkHealth.DEGRADED] for at in last.values() if LinkHealth.DEGRADED in at]
+    detached = [at[LinkHealth.DETACHED] for at in last.values() if LinkHealth.DETACHED in at]
+    return Noticed(
+        gone.drone,
+        (min(degraded), max(degraded)) if degraded else None,
+        (min(detached), max(detached)) if detached else None,
+        len(detached),
+    )

@@ -1,0 +1,227 @@
+"""A live flight from its begin to its end: fly for the traces, start the processes, measure, bring everybody home."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from policies.contract import PolicyError
+from scenarios.schema import Scenario
+from sim.folders import RunError
+from sim.live.bench import Bench, Fleet
+from sim.live.context import traces
+from sim.live.drone import Orders, fly_one
+from sim.live.reports import Failed, Go, Home, Ready, Report
+from sim.live.result import LiveResult, Lost, summary
+
+MAX_DRONES = 20
+"""As many processes as this starts on one host."""
+FIND_S = 90.0
+"""How long the processes may take to start and to find one another."""
+LEAD_S = 0.3
+"""From the word to go until the flight begins."""
+PATIENCE_S = 5.0
+"""How long a process may take to end after the flight."""
+Progress = Callable[[str, float, float], None]
+
+
+@dataclass
+class _Drone:
+    process: BaseProcess
+    pipe: Connection
+    over: bool = False
+
+
+def fly_live(
+    scenario: Scenario,
+    *,
+    begin_s: float = 0.0,
+    duration_s: float | None = None,
+    loss: float = 0.0,
+    kill: tuple[int, float] | None = None,
+    domain: int = 0,
+    progress: Progress | None = None,
+    begun: Callable[[dict[int, int]], None] | None = None,
+) -> LiveResult:
+    """Fly a scenario's context plane over DDS in real time, a process a drone.
+
+    Args:
+        scenario: what is flown; its policy decides on every drone.
+        begin_s: the scenario's time at which the fleet begins.
+        duration_s: how long it flies, s; None: to the scenario's end.
+        loss: share of descriptors that each drone drops on arrival, 0 … 1.
+        kill: a drone whose process is killed (SIGKILL), and the scenario's time when.
+        domain: DDS domain, as `ROS_DOMAIN_ID`.
+        progress: called with (what is done, how much of it, of how much).
+        begun: called with the process ids by drone once the fleet flies.
+
+    Returns:
+        What was measured; after Ctrl-C of the part that flew, `interrupted`.
+
+    Raises:
+        RunError: options that do not fit the scenario, or processes that do not find one another.
+        PolicyError: an unknown policy, or one that breaks its contract.
+    """
+    end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
+    _check(scenario, begin_s, end_s, loss, kill)
+    tell = progress or (lambda what, done, of: None)
+    found = traces(
+        scenario.model_copy(update={"duration_s": end_s}), lambda t_s: tell("flying for the context", t_s, end_s)
+    )
+    drones = scenario.fleet.drones
+    bench, fleet = Bench(domain, drones), Fleet(drones)
+    flown: list[_Drone] = []
+    lost: list[Lost] = []
+    interrupted = False
+    t_s = begin_s
+    try:
+        for i, trace in enumerate(found):
+            flown.append(_start(Orders(scenario, i, trace, begin_s, end_s, loss, domain)))
+        _meet(flown, tell)
+        go = Go(time.monotonic() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9))
+        for drone in flown:
+            drone.pipe.send(go)
+        bench.begin()
+        time.sleep(LEAD_S)
+        if begun is not None:
+            begun({i: d.process.pid or 0 for i, d in enumerate(flown)})
+        try:
+            while not all(d.over for d in flown):
+                t_s = min(end_s, begin_s + time.monotonic() - go.monotonic_s)
+                if kill is not None and t_s >= kill[1]:
+                    _kill(flown[kill[0]].process)
+                    kill = None
+                bench.wait(0.05)
+                bench.take()
+                _collect(flown, fleet, lost, t_s)
+                tell("in the air", t_s - begin_s, end_s - begin_s)
+        except KeyboardInterrupt:
+            interrupted = True
+            _stop(flown)
+            _collect(flown, fleet, lost, t_s)
+        return summary(
+            scenario,
+            bench,
+            fleet,
+            begin_s=begin_s,
+            flown_s=t_s - begin_s,
+            loss=loss,
+            lost=lost,
+            interrupted=interrupted,
+        )
+    finally:
+        _end(flown)
+
+
+def _check(scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None) -> None:
+    drones = scenario.fleet.drones
+    if drones > MAX_DRONES:
+        raise RunError(f"fleet.drones is {drones}, live flights have at most {MAX_DRONES}: each is a process")
+    if not 0 <= begin_s < end_s <= scenario.duration_s:
+        raise RunError(
+            f"the flight is to be from {begin_s:g} s to {end_s:g} s, must be within the scenario's "
+            f"{scenario.duration_s:g} s"
+        )
+    if not 0 <= loss <= 1:
+        raise RunError(f"loss is {loss:g}, must be in [0, 1]")
+    if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):
+        raise RunError(f"kill {kill[0]}@{kill[1]:g}: must be a drone below {drones} and a time in the flight")
+
+
+def _start(orders: Orders) -> _Drone:
+    """A new process; spawned, not forked: the bench's DDS threads would not survive a fork."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=fly_one, args=(orders, theirs), name=f"drone {orders.drone}", daemon=True)
+    process.start()
+    theirs.close()  # so that our end shows when the process is gone
+    return _Drone(process, ours)
+
+
+def _meet(flown: list[_Drone], tell: Progress) -> None:
+    """Wait until every process has found all others."""
+    waiting, until_s = {id(d.pipe): d for d in flown}, time.monotonic() + FIND_S
+    while waiting:
+        tell("starting the processes", len(flown) - len(waiting), len(flown))
+        for pipe in wait([d.pipe for d in waiting.values()], timeout=0.2):
+            said = _said(pipe)  # type: ignore[arg-type]
+            if isinstance(said, Ready):
+                del waiting[id(pipe)]
+            elif said is None:
+                raise RunError(f"{waiting[id(pipe)].process.name} ended before the flight began")
+        if time.monotonic() > until_s:
+            names = ", ".join(d.process.name for d in waiting.values())
+            raise RunError(
+                f"{names} did not find the others within {FIND_S:g} s: is loopback allowed (CYCLONEDDS_URI)?"
+            )
+    tell("starting the processes", len(flown), len(flown))
+
+
+def _collect(flown: list[_Drone], fleet: Fleet, lost: list[Lost], t_s: float) -> None:
+    """Take every report that is there; a pipe that closes before its drone came home is a drone that was lost."""
+    for number, drone in enumerate(flown):
+        while not drone.over and drone.pipe.poll():
+            said = _said(drone.pipe)
+            if isinstance(said, Report):
+                fleet.add(said)
+            elif isinstance(said, Home):
+                drone.over = True
+            elif said is None:
+                drone.over = True
+                drone.process.join(PATIENCE_S)
+                lost.append(Lost(number, t_s, _how(drone.process.exitcode)))
+
+
+def _said(pipe: Connection) -> object | None:
+    """What a process says; None where it is gone.
+
+    Raises:
+        PolicyError: its policy failed.
+    """
+    try:
+        said: object = pipe.recv()
+    except (EOFError, ConnectionResetError):
+        return None
+    if isinstance(said, Failed):
+        raise PolicyError(said.what)
+    return said
+
+
+def _how(exitcode: int | None) -> str:
+    """How a process ended, in words."""
+    if exitcode is None:
+        return "does not answer"
+    return f"was killed by {signal.Signals(-exitcode).name}" if exitcode < 0 else f"ended with exit code {exitcode}"
+
+
+def _kill(process: BaseProcess) -> None:
+    if process.pid is not None and process.is_alive():
+        os.kill(process.pid, signal.SIGKILL)
+
+
+def _stop(flown: list[_Drone]) -> None:
+    """Ask everybody to come home, and give them time for a last report."""
+    for drone in flown:
+        try:
+            drone.pipe.send(None)
+        except OSError:
+            continue  # it is gone already
+    for drone in flown:
+        drone.process.join(PATIENCE_S)
+
+
+def _end(flown: list[_Drone]) -> None:
+    """Nobody is left behind, whatever happened."""
+    for drone in flown:
+        drone.pipe.close()  # a process that still waits for us ends by itself
+    for drone in flown:
+        drone.process.join(PATIENCE_S)
+        if drone.process.is_alive():
+            drone.process.kill()
+            drone.process.join()

@@ -1,0 +1,40 @@
+"""What happened on the bus, as sentences."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from fleet.staleness import LinkHealth
+from sim.live.result import LiveResult, Noticed
+
+
+def changes_in_words(result: LiveResult) -> list[str]:
+    """Lost processes first and how the others noticed, then what links carry, as time goes; staleness as counts."""
+    said = [f"{gone.t_s:6.1f} s  drone {gone.drone}: its process {gone.how}" for gone in result.lost]
+    said += [_noticed(n, result.drones - 1) for n in result.noticed]
+    after_start = [c for c in result.health if c.t_s - result.begin_s > 1.0]
+    counts = Counter(c.health for c in after_start)
+    said.append(
+        f"contexts of peers went degraded {counts[LinkHealth.DEGRADED]} times, detached {counts[LinkHealth.DETACHED]} "
+        f"times, and fresh again {counts[LinkHealth.FRESH]} times"
+    )
+    events = [(n.t_s, f"drone {n.drone}: {n.text}") for n in result.notices]
+    events += [
+        (o.t_s, f"drone {o.drone} → {o.peer}: {_carries(o.representation, o.rate_hz)}, because {o.reason}")
+        for o in result.orders
+    ]
+    return said + [f"{t_s:6.1f} s  {text}" for t_s, text in sorted(events)]
+
+
+def _carries(representation: str, rate_hz: float) -> str:
+    return "nothing" if representation == "none" else f"{representation} at {rate_hz:g} Hz"
+
+
+def _noticed(noticed: Noticed, others: int) -> str:
+    def span(s: tuple[float, float] | None) -> str:
+        return "never" if s is None else f"after {s[0]:.2f}–{s[1]:.2f} s"
+
+    return (
+        f"          drone {noticed.drone} was degraded at the others {span(noticed.degraded_s)}, detached "
+        f"{span(noticed.detached_s)} ({noticed.by} of {others})"
+    )
