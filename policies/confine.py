@@ -15,9 +15,9 @@ import importlib
 import sys
 import types
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar, cast
 
-from policies.contract import Policy
+Decides = TypeVar("Decides", bound=Callable[..., Any])
 
 PURE = frozenset({
     "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
@@ -73,13 +73,13 @@ class _Part:
         return getattr(self._module, name)
 
 
-def confined(policy: Policy) -> Policy:
-    """The policy over a namespace of its own: where it keeps to its view it decides the same, elsewhere it raises.
+def confined(policy: Decides) -> Decides:
+    """The policy, or its viewpoint, over a namespace of its own: where it keeps to its view it decides the same.
 
     Called, it raises `Reached`, naming what the policy reached for.
     """
-    built: Policy = _Rebuilding().function(policy)
-    return built
+    built: Any = _Rebuilding().function(policy)
+    return cast(Decides, built)
 
 
 class _Rebuilding:

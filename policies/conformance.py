@@ -13,14 +13,15 @@ import contextlib
 import inspect
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
 
 from policies.confine import Reached, confined
-from policies.contract import Directive, FleetView, Policy, PolicyError, check_directives
+from policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, check_directives, check_reposition
+from policies.registry import viewpoint_of
 from policies.views import draw_view, draw_views, smaller
 
 VIEWS = 300
@@ -244,6 +245,39 @@ def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
     return None
 
 
+def _looks(policy: Policy, view: FleetView) -> str | None:
+    """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
+    look = viewpoint_of(policy)
+    if look is None:
+        return None
+    shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
+    try:
+        asked = look(shown)
+        check_reposition(asked, view)
+        others = {
+            "two calls with the same view differ": look(_copied(view)),
+            "drones in another order get another place": look(view._replace(descriptors=_turned(view.descriptors))),
+            "decides otherwise where only its view is in reach": confined(look)(view),
+        }
+        for few in (alone, {}):
+            fewer = view._replace(descriptors=few, age_s={i: view.age_s[i] for i in few})
+            check_reposition(look(fewer), fewer)
+    except PolicyError as error:
+        return str(error)
+    except Reached as error:
+        return f"its viewpoint {error}"
+    except Exception as error:
+        return f"its viewpoint raises {type(error).__name__}: {error}"
+    if shown != view:
+        return "its viewpoint changed its input"
+    return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
+
+
+def _turned(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
+    """The same in the opposite order."""
+    return dict(reversed(list(descriptors.items())))
+
+
 RULES: dict[str, Rule] = {
     "answers": _answers,
     "bounds kept": _keeps_bounds,
@@ -257,6 +291,7 @@ RULES: dict[str, Rule] = {
     "stale views": _stands_stale,
     "age-monotone": age_monotone,
     "budget kept": _keeps_budget,
+    "viewpoint kept": _looks,
 }
 """The kit's rules by name; a policy without a parameter `rho` has no budget to break."""
 

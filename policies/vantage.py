@@ -6,19 +6,21 @@ What is shared is full sharing's (`all-4`), so that a sortie under each differs 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot
+from math import fsum, hypot
 
 from policies.baselines import everyone
 from policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
 
 FRESH_PERIODS = 10.0
 """Peers heard longer ago than this are detached: where they are now is not known."""
+MOST_M = 100.0
+"""It asks for no place farther away; the formation's reach is shorter."""
 
 
 def over_region(view: FleetView) -> Reposition | None:
     """While tracking: where it would be if the fleet's middle stood over the region, each drone at its own side.
 
-    The fleet shifts as a whole, so that nobody crosses another's way. In other phases, and alone, its slot.
+    The fleet shifts as a whole, so that nobody crosses another's way. In other phases its slot.
     """
     me = view.me
     if me is None or me.region is None or me.task_phase != TaskPhase.TRACK:
@@ -26,12 +28,12 @@ def over_region(view: FleetView) -> Reposition | None:
     fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= FRESH_PERIODS * view.period_s]
     if not fresh:
         return None
-    middle_x, middle_y = (sum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))
-    return Reposition(
-        me.region.x_m + me.position_m[0] - middle_x,
-        me.region.y_m + me.position_m[1] - middle_y,
-        f"the fleet's middle is {hypot(me.region.x_m - middle_x, me.region.y_m - middle_y):.0f} m from the region",
-    )
+    middle_x, middle_y = (fsum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))
+    dx_m, dy_m = me.region.x_m - middle_x, me.region.y_m - middle_y
+    far_m = hypot(dx_m, dy_m)
+    share = MOST_M / far_m if far_m > MOST_M else 1.0
+    x_m, y_m, _ = me.position_m
+    return Reposition(x_m + share * dx_m, y_m + share * dy_m, f"the fleet's middle is {far_m:.0f} m from the region")
 
 
 @looks_from(over_region)
