@@ -59,6 +59,9 @@ def live(
     with user_errors():
         from sim.live.session import fly_live
 
+        if out_file is not None:
+            out_file.parent.mkdir(parents=True, exist_ok=True)
+
     with stages() as report:
         result = fly_live(
             flown,
@@ -104,12 +107,11 @@ def _show(result: LiveResult) -> None:
     for row in overhead_rows(result):
         table.add_row(*row)
     out.print(table)
-    table = Table(title="on the bus, all keep-last-1")
-    for column in ("topic", "type", "QoS", "per s", "kB/s", "heard", "arrived"):
-        table.add_column(column, no_wrap=column != "type", overflow="fold")
+    columns = ("topic", "QoS", "per s", "kB/s", "heard", "arrived")
+    table = Table(*columns, title="on the bus, all keep-last-1")
     for t in result.topics:
         table.add_row(
-            t.topics.replace("to_drone_*", "…"), t.type.rpartition("/")[2], t.qos.partition(",")[0], f"{t.samples_per_s:.1f}",
+            t.topics.replace("to_drone_*", "…"), t.qos.partition(",")[0], f"{t.samples_per_s:.1f}",
             f"{t.bytes_per_s / 1e3:.1f}", _share(t.heard_share), _share(t.delivered_share),
         )  # fmt: skip
     out.print(table)

@@ -6,8 +6,9 @@ import time
 from collections import Counter
 
 from fleet.auth import Opened
+from fleet.cdr import MalformedDatagram
 from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, links
-from sim.live.messages import BYTES_OVERHEAD
+from sim.live.messages import unpack_bytes
 from sim.live.node import opened
 from sim.live.reports import Count, Report
 
@@ -58,12 +59,19 @@ class Bench:
     def _take(self, reader: Reader) -> None:
         topic = reader.topic
         for cdr in reader.take():
-            size = len(cdr) - BYTES_OVERHEAD if topic.kind in PAYLOADS else len(cdr)
-            self.counts[topic] = self.counts[topic].plus(size)
+            self.counts[topic] = self.counts[topic].plus(_size(cdr, topic.kind))
             if topic.kind == Kind.CONTEXT:
                 descriptor = opened(cdr)
                 if isinstance(descriptor, Opened):
                     self.heard[descriptor.descriptor.agent_id] += 1
+
+
+def _size(cdr: bytes, kind: Kind) -> int:
+    """As `Bench.counts` counts; what is no payload counts as it came."""
+    try:
+        return len(unpack_bytes(cdr)) if kind in PAYLOADS else len(cdr)
+    except MalformedDatagram:
+        return len(cdr)
 
 
 class Fleet:

@@ -174,21 +174,21 @@ def overhead_rows(result: LiveResult) -> Iterator[tuple[str, str, str]]:
     n, hz = result.drones, result.topics[0].samples_per_s
     yield "descriptor, serialised", f"{PAPER['plane.descriptor']:.0f} B", _figure(result.descriptor_bytes, "{:.0f} B")
     yield "descriptors a second", "4 × 10", f"{hz:.1f} of {n} drones"
-    yield "directives a second, 36 B each", "80", f"{result.directives_per_s:.0f}"
+    yield "directives a second", "80", f"{result.directives_per_s:.0f}"
     yield "context plane", f"{PAPER['plane.rate']:.1f} kB/s", f"{result.context_bytes_per_s / 1e3:.1f} kB/s"
-    paper_data = f"{PAPER['plane.data']:.0f} MB/s; {PAPER['plane.x86.data']:.0f} in an x86 container"
-    yield "data plane that it steers", paper_data, f"{result.data_bytes_per_s / 1e6:.1f} MB/s"
+    paper_data = f"{PAPER['plane.data']:.0f} MB/s; {PAPER['plane.x86.data']:.0f} on x86"
+    yield "data plane", paper_data, f"{result.data_bytes_per_s / 1e6:.1f} MB/s"
     share = None if result.context_share is None else 100 * result.context_share
     yield "context over data", f"{PAPER['plane.share']:.2f} %", _figure(share, "{:.2f} %")
     median = f"{PAPER['plane.median']:.2f} ms; {PAPER['plane.x86.median']:.2f} on x86"
-    yield "a policy decision, median", median, _figure(result.decide_ms_p50, "{:.3f} ms")
+    yield "a decision, median", median, _figure(result.decide_ms_p50, "{:.3f} ms")
     yield (
-        "a policy decision, 99th percentile",
+        "a decision, 99th %",
         f"{PAPER['plane.p99']:.2f} ms",
         _figure(result.decide_ms_p99, "{:.3f} ms"),
     )
     cpu = f"{result.drones_cpu_percent:.0f} % by {n} drones, {result.bench_cpu_percent:.0f} % by the bench"
-    yield "processor, of one core", f"{PAPER['plane.core']:.0f} %", cpu
+    yield "of one core", f"{PAPER['plane.core']:.0f} %", cpu
 
 
 def _figure(value: float | None, text: str) -> str:

@@ -1,0 +1,327 @@
+"""The context plane over DDS: real processes, a real bus, and a peer that shares no code with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import dds_peer
+import pytest
+from sim_examples import BASE, example
+from typer.testing import CliRunner
+
+from fleet.auth import Dropped, Opened
+from fleet.cdr import MalformedDatagram
+from fleet.staleness import LinkHealth
+from fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
+from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sim.cli import app
+from sim.folders import RunError
+from sim.live import messages
+from sim.live.bus import CONTEXT, LOOPBACK, Kind, Topic, links
+from sim.live.clock import WallClock
+from sim.live.messages import BYTES_NAME, dds_name, dds_type, pack_bytes, unpack_bytes
+from sim.live.node import opened
+from sim.live.result import LiveResult, overhead_rows
+from sim.live.session import MAX_DRONES, fly_live
+from sim.live.words import changes_in_words
+
+ROOT = Path(__file__).resolve().parents[2]
+DOMAIN = os.getpid() % 200 + 20
+"""Tests that run beside one another share no bus."""
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+def said_by_hand(agent_id: int = 9) -> Descriptor:
+    """What `dds_peer.context` says, as this project has it; one priority target, so that it ends on 2 B."""
+    return Descriptor(
+        STAMP_NS, agent_id, (5.0, 5.0, 60.0), (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 42.0, 0.5, 1.0, 1.0,
+        (50.0,) * 9, bytes([0b10101010]) * 64, 0, TaskPhase.SEARCH, None, (7,),
+    )  # fmt: skip
+
+
+# --- the bytes -------------------------------------------------------------------------------------
+
+
+def test_types_written_by_hand_give_the_bytes_of_the_wire() -> None:
+    by_hand = dds_peer.context(9, STAMP_NS).serialize(use_version_2=False)
+    assert by_hand == encode_descriptor(said_by_hand())
+    order = Directive(0, 9, Representation.FEATURES, 0.25, Disc(1.0, 2.0, 32.0), 5.0, 0.1, 0.5, 80)
+    by_hand = dds_peer.Directive(0, 9, 3, 80, [1.0, 2.0, 32.0], 0.25, 5.0, 0.1, 0.5).serialize(use_version_2=False)
+    assert by_hand == encode_directive(order)
+    by_hand = dds_peer.Bytes(dds_peer.Layout([], 0), list(b"abcde")).serialize(use_version_2=False)
+    assert by_hand == pack_bytes(b"abcde")
+
+
+@pytest.mark.parametrize(
+    ("ros_name", "by_hand"),
+    [
+        (DESCRIPTOR_NAME, dds_peer.Context),
+        (DIRECTIVE_NAME, dds_peer.Directive),
+        (BYTES_NAME, dds_peer.Bytes),
+    ],
+)
+def test_types_made_of_msg_files_are_those_written_by_hand(ros_name: str, by_hand: Any) -> None:
+    made = dds_type(ros_name)
+    assert made.__idl__.get_type_id() == by_hand.__idl__.get_type_id()
+    assert made.__idl_typename__ == by_hand.__idl_typename__ == dds_name(ros_name)
+
+
+def test_a_line_that_is_no_field_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(messages.DEFINITIONS, "a/msg/B", "float32 x\nfloat32<=3 y")
+    with pytest.raises(ValueError, match=r"^a/msg/B: 'float32<=3 y' is no field$"):
+        dds_type("a/msg/B")
+
+
+def test_a_descriptor_that_dds_filled_up_is_the_descriptor() -> None:
+    cdr = encode_descriptor(said_by_hand())
+    assert len(cdr) % 4 == 2
+    for sample in (cdr, cdr + b"\0\0"):
+        found = opened(sample)
+        assert isinstance(found, Opened)
+        assert found.descriptor == said_by_hand()._replace(stamp_ns=STAMP_NS)
+    assert isinstance(opened(cdr + b"\0\1"), Dropped)
+    assert isinstance(opened(cdr + bytes(4)), Dropped)
+
+
+@pytest.mark.parametrize("content", [b"", b"abc", bytes(70_000)])
+def test_payload_bytes_come_back_filled_up_or_not(content: bytes) -> None:
+    cdr = pack_bytes(content)
+    assert unpack_bytes(cdr) == content
+    assert unpack_bytes(cdr.ljust(-len(cdr) % 4 + len(cdr), b"\0")) == content
+
+
+@pytest.mark.parametrize(
+    "cdr", [b"", pack_bytes(b"abc")[:-1], pack_bytes(b"abc") + bytes(4), b"\0\1\0\0" + bytes([1] * 12)]
+)
+def test_a_payload_that_is_none_is_refused(cdr: bytes) -> None:
+    with pytest.raises(MalformedDatagram):
+        unpack_bytes(cdr)
+
+
+def test_topics_are_named_as_ros_2_names_them() -> None:
+    assert CONTEXT.dds_name == "rt/fleet/context"
+    assert Topic(Kind.DIRECTIVE, 0, 12).dds_name == "rt/drone_0/to_drone_12/directive"
+    assert dds_name(DESCRIPTOR_NAME) == "sortie_msgs::msg::dds_::ContextDescriptor_"
+    assert links(3) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
+
+
+def test_the_readme_has_the_configuration_as_it_is() -> None:
+    assert LOOPBACK in (ROOT / "sim/live/README.md").read_text("utf-8")
+
+
+# --- the clock -------------------------------------------------------------------------------------
+
+
+def test_a_late_event_finds_the_clock_at_the_time_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall_s = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: wall_s[0])
+    clock, seen = WallClock(50.0, 1000.0), []
+
+    def steps() -> Any:
+        for _ in range(2):
+            yield clock.timeout(1.0)
+            seen.append(clock.now)
+
+    clock.process(steps())
+    clock.catch_up()
+    wall_s[0] = 1000.9
+    clock.catch_up()
+    assert seen == []
+    wall_s[0] = 1003.0  # two seconds late
+    clock.catch_up()
+    assert seen == [53.0]
+    assert clock.peek() == pytest.approx(54.0)  # a second from when it was handled
+    wall_s[0] = 1004.5
+    clock.catch_up()
+    assert seen == [53.0, 54.5]
+
+
+# --- a flight with a peer, and a process that is killed ----------------------------------------------
+
+
+class Flown(NamedTuple):
+    """What became of it."""
+
+    result: LiveResult
+    peer: dict[str, Any]
+    pids: dict[int, int]
+
+
+@pytest.fixture(scope="module")
+def flown() -> Flown:
+    """Three drones for four seconds; number 2 is killed at 2 s, and a peer of its own making says 12 contexts."""
+    environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK}
+    peer = subprocess.Popen(
+        [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "12"],
+        stdout=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    pids: dict[int, int] = {}
+    try:
+        assert peer.stdout is not None
+        assert peer.stdout.readline() == "listening\n"
+        scenario = example("fleet.drones=3", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0.3}")
+        result = fly_live(scenario, duration_s=4.0, kill=(2, 2.0), domain=DOMAIN, begun=pids.update)
+        told, _ = peer.communicate(timeout=60)
+    finally:
+        peer.kill()
+    return Flown(result, json.loads(told), pids)
+
+
+def test_the_peer_reads_what_the_drones_publish(flown: Flown) -> None:
+    assert set(flown.peer["contexts"]) == {"0", "1", "2"}
+    for drone, said in flown.peer["last"].items():
+        assert said["agent_id"] == int(drone)
+        assert said["position"][2] == pytest.approx(60.0, abs=3.0)  # the scenario's altitude
+        assert abs(said["stamp"]["sec"] - time.time()) < 3600  # as ROS 2 stamps: since 1970
+        assert 0 < said["battery"] <= 1
+        assert len(said["peer_goodput"]) == 2
+        assert any(said["coverage_grid"])
+
+
+def test_the_fleet_shares_with_a_peer_that_was_on_no_roster(flown: Flown) -> None:
+    met = [c for c in flown.result.health if c.peer == dds_peer.ME]
+    assert {c.drone for c in met if c.health == LinkHealth.FRESH} >= {0, 1}
+    orders = flown.peer["directives"]
+    assert {(o["source"], o["destination"]) for o in orders} == {(0, dds_peer.ME)}
+    assert Representation.FEATURES in {o["representation"] for o in orders}
+    assert orders[-1]["representation"] == Representation.NONE  # it fell silent and was detached
+    shared = [o for o in orders if o["representation"] == Representation.FEATURES]
+    assert {round(o["rho"], 6) for o in shared} == {0.02}
+    assert len(set(flown.peer["payload_bytes"])) == 1
+    assert 82 * 160 < flown.peer["payload_bytes"][0] < 83 * 160 + 600
+
+
+def test_what_cannot_be_a_drone_is_refused(flown: Flown) -> None:
+    for drone in flown.result.each:
+        if drone.drone != 2:
+            assert drone.refused == {"descriptor malformed": 1}
+
+
+def test_a_killed_process_is_noticed_by_age_and_the_others_fly_on(flown: Flown) -> None:
+    result = flown.result
+    (gone,) = result.lost
+    assert (gone.drone, gone.how) == (2, "was killed by SIGKILL")
+    assert result.noticed[0].by == 2
+    for drone in (0, 1):
+        seen = [c for c in result.health if (c.drone, c.peer) == (drone, 2)]
+        assert [c.health for c in seen][-2:] == [LinkHealth.DEGRADED, LinkHealth.DETACHED]
+        degraded, detached = seen[-2:]
+        assert 0.3 < degraded.age_s < detached.age_s
+        assert detached.age_s > 1.0
+        last = [o for o in result.orders if (o.drone, o.peer) == (drone, 2)][-1]
+        assert last.representation == "none"
+        assert last.reason.startswith("detached")
+        other = [o for o in result.orders if (o.drone, o.peer) == (drone, 1 - drone)]
+        assert "features" in {o.representation for o in other}
+    assert [d.drone for d in result.each] == [0, 1, 2]
+    assert result.each[0].published > result.each[2].published
+    assert "drone 2: its process was killed by SIGKILL" in changes_in_words(result)[0]
+
+
+def test_nobody_is_left_behind(flown: Flown) -> None:
+    assert set(flown.pids) == {0, 1, 2}
+    for pid in flown.pids.values():
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_the_bench_counts_every_topic(flown: Flown) -> None:
+    result = flown.result
+    by_kind = dict(zip(Kind, result.topics, strict=True))
+    assert by_kind[Kind.CONTEXT].type == DESCRIPTOR_NAME
+    assert by_kind[Kind.FEATURES].mean_bytes == pytest.approx(flown.peer["payload_bytes"][0])
+    assert by_kind[Kind.DIRECTIVE].mean_bytes == 36
+    assert result.data_bytes_per_s > 0
+    assert result.decisions > 0
+    assert result.drones_cpu_percent > 0
+    rows = {what: (paper, here) for what, paper, here in overhead_rows(result)}
+    assert rows["descriptor, serialised"][0] == "180 B"
+    assert rows["context plane"][0] == "10.1 kB/s"
+    assert rows["data plane"][0] == "105 MB/s; 62 on x86"
+    assert rows["of one core"][0] == "9 %"
+    json.dumps(result.as_json())
+
+
+# --- loss, interruption, options ---------------------------------------------------------------------
+
+
+def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path) -> None:
+    scenario, told = tmp_path / "s.yaml", tmp_path / "told" / "live.json"
+    scenario.write_text(BASE)
+    done = CliRunner().invoke(
+        app,
+        ["live", str(scenario), "--set", "fleet.drones=2", "--policy", "all-4(rho=0.02)", "--duration", "2", "--begin", "1",
+         "--loss", "0.5", "--domain", str(DOMAIN), "--out", str(told)],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "50% of descriptors lost" in done.output
+    assert "10.1 kB/s" in done.output
+    result = json.loads(told.read_text())
+    for drone in result["each"]:
+        came = drone["heard"] + drone["dropped_by_loss"]
+        assert abs(drone["dropped_by_loss"] - came / 2) < 4 * (came / 4) ** 0.5  # four standard deviations
+    assert result["policy"] == "all-4"
+    assert {row["health"] for row in result["health"]} >= {"fresh"}
+
+
+def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost_leaves_everybody_alone() -> None:
+    pids: dict[int, int] = {}
+
+    def interrupt(begun: dict[int, int]) -> None:
+        pids.update(begun)
+        signal.setitimer(signal.ITIMER_REAL, 1.0)
+
+    before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    try:
+        scenario = example("fleet.drones=2", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0}")
+        result = fly_live(scenario, loss=1.0, domain=DOMAIN, begun=interrupt)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert result.interrupted
+    assert result.flown_s < 6
+    assert result.lost == []
+    assert [d.heard for d in result.each] == [0, 0]
+    assert all(d.published > 0 and d.dropped_by_loss > 0 for d in result.each)
+    assert (result.data_bytes_per_s, result.context_share, result.health) == (0, None, [])
+    for pid in pids.values():
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+@pytest.mark.parametrize(
+    ("sets", "options", "message"),
+    [
+        ([f"fleet.drones={MAX_DRONES + 1}"], {}, "fleet.drones is 21, live flights have at most 20: each is a process"),
+        (
+            [],
+            {"begin_s": 4.0, "duration_s": 3.0},
+            "the flight is to be from 4 s to 7 s, must be within the scenario's 6 s",
+        ),
+        ([], {"loss": 1.5}, "loss is 1.5, must be in [0, 1]"),
+        ([], {"kill": (7, 1.0)}, "kill 7@1: must be a drone below 5 and a time in the flight"),
+        ([], {"kill": (1, 9.0)}, "kill 1@9: must be a drone below 5 and a time in the flight"),
+    ],
+)
+def test_options_that_do_not_fit_are_named(sets: list[str], options: dict[str, Any], message: str) -> None:
+    with pytest.raises(RunError) as error:
+        fly_live(example(*sets), domain=DOMAIN, **options)
+    assert str(error.value) == message
+
+
+def test_a_kill_that_is_none_and_a_missing_extra_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = CliRunner().invoke(app, ["live", "--kill", "2"])
+    assert isinstance(done.exception, RunError)
+    assert str(done.exception) == "--kill '2', must be a drone and a time, as in 2@70"
+    for name in [m for m in sys.modules if m.startswith(("cyclonedds", "sim.live"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    done = CliRunner().invoke(app, ["live", "track_target"])
+    assert isinstance(done.exception, RunError)
+    assert str(done.exception) == "cyclonedds is missing: pip install 'sortie-sim[dds]'"
