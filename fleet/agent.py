@@ -192,10 +192,10 @@ class Agent:
 
     def _hold(self, descriptor: Descriptor) -> None:
         known, sender = self._known, descriptor.agent_id
-        met = sender in known
-        known[sender] = descriptor
-        if not met:  # by ascending id, so that the order of hearing decides nothing
-            self._known = dict(sorted(known.items()))
+        if sender in known:
+            known[sender] = descriptor
+        else:  # by ascending id, so that the order of hearing decides nothing
+            self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = self.env.now
 
     def receive(self, received: Received) -> None:
@@ -271,7 +271,10 @@ class Agent:
         """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
         now_s = self.env.now
         clock_s, heard_at_s = now_s + self.clock_skew_s, self._heard_at_s
-        return {i: max(clock_s - d.stamp_ns * 1e-9, now_s - heard_at_s[i]) for i, d in self._known.items()}
+        return {
+            i: stamped_s if (stamped_s := clock_s - d.stamp_ns * 1e-9) > (heard_s := now_s - heard_at_s[i]) else heard_s
+            for i, d in self._known.items()
+        }
 
     def trust_in(self, peer: int) -> float:
         """What this drone thinks of a peer, 0 … 1; payloads are fused with their weight times this."""

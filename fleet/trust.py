@@ -110,29 +110,30 @@ def judge(
     seen_per_metre = _metres_seen_per_metre_up(known)
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / s.seconds for i, s in before.items()}
+    in_order = sorted(fell_per_s.values())
     after = dict(standings)
     for peer, claim in known.items():
         standing = before[peer]
-        others = [rate for i, rate in fell_per_s.items() if i != peer]
-        others_fell = median(others) * standing.seconds if others else 0.0
+        others = in_order.copy()
+        others.remove(fell_per_s[peer])
+        others_fell = _middle(others) * standing.seconds if others else 0.0
         doubt = peer != ego and (
             (math.isfinite(form.blur_m) and coverage_doubt(claim, seen_per_metre, form.blur_m))
             or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
             or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell, form.soc_step)
         )
-        if doubt:
-            standing = standing._replace(strikes=min(standing.strikes + 1, MOST_STRIKES), reason=doubt)
-        else:
-            standing = standing._replace(strikes=max(standing.strikes - 1, 0))
-        after[peer] = standing._replace(least_soc=min(standing.least_soc, claim.battery_soc))
+        strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
+        least_soc = min(standing.least_soc, claim.battery_soc)
+        after[peer] = Standing(strikes, doubt or standing.reason, standing.seconds, standing.first_soc, least_soc)
     return after
 
 
 def _aged(standing: Standing, soc: float) -> Standing:
     """The standing a second later; who is judged for the first time, or fell at once, begins with its charge."""
-    if standing.seconds == 0 or soc < standing.least_soc - JUMP:
-        return standing._replace(seconds=1, first_soc=soc, least_soc=soc)
-    return standing._replace(seconds=standing.seconds + 1)
+    strikes, reason, seconds, first_soc, least_soc = standing
+    if seconds == 0 or soc < least_soc - JUMP:
+        return Standing(strikes, reason, 1, soc, soc)
+    return Standing(strikes, reason, seconds + 1, first_soc, least_soc)
 
 
 def discounted(d: Descriptor) -> Descriptor:
@@ -203,6 +204,12 @@ def battery_doubt(
     if others_fell >= FALL + 3 * soc_step and fell < FALL_SHARE * others_fell:
         return f"battery: fell by {fell:.1%} while the fleet's fell by {others_fell:.1%}"
     return ""
+
+
+def _middle(ascending: Sequence[float]) -> float:
+    """The median of what is sorted already, at least one number."""
+    half = len(ascending) // 2
+    return ascending[half] if len(ascending) % 2 else (ascending[half - 1] + ascending[half]) / 2
 
 
 def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:

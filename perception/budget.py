@@ -81,7 +81,7 @@ def _window(roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: fl
 def _span(centre_m: float, radius_m: float) -> slice:
     low = math.floor((centre_m - radius_m) / CELL_M) + GRID // 2
     high = math.ceil((centre_m + radius_m) / CELL_M) + GRID // 2
-    if 0 <= low and high <= GRID:
+    if low >= 0 and high <= GRID:
         return slice(low, high)
     return slice(min(max(low, 0), GRID), min(max(high, 0), GRID))
 

@@ -157,7 +157,7 @@ class Sample(Job):
         sent = self.left if done >= 1.0 else int(done * self.left + 1e-9)
         if self.unreachable or sent == 0:
             return self.left
-        lost = losses(self.round_luck(), sent, min(1.0, self.loss_share / done))
+        lost = losses(self.round_luck(), sent, min(1.0, self.loss_share / done)) if self.loss_share > 0.0 else 0
         missing = lost + self.left - sent
         if self.pieces is not None:
             which = np.sort(self.order(self, sent)[:lost]) if lost else np.arange(0)
@@ -278,7 +278,7 @@ class Service:
             per = rescale(per, frame_bytes(s.piece_bytes) / self._frame_bytes)
         if given is not None:
             per = 1.0 - (1.0 - per) * (1.0 - given.burst_loss) if isnan(given.loss) else given.loss
-        mean_tries, s.loss_probability, s.full_mbps = self._quality(mcs, per)
+        mean_tries, s.loss_probability, s.full_mbps = self._qualities.get((mcs, per)) or self._quality(mcs, per)
         s.pass_frames = s.left * mean_tries
         if given is not None and not isnan(given.goodput_mbps):
             mean_tries, s.full_mbps = self._full_mbps[mcs] / given.goodput_mbps, given.goodput_mbps
@@ -308,15 +308,12 @@ class Service:
 
     def _quality(self, mcs: int, per: float) -> tuple[float, float, float]:
         """Mean tries, loss after all of them, and payload rate of full A-MPDUs, of frames that fail with `per`."""
-        key = (mcs, per)
-        known = self._qualities.get(key)
-        if known is None:
-            if len(self._qualities) > _MAX_DEMANDS:
-                self._qualities.clear()
-            limit = self._config.retry_limit
-            mean_tries, loss = tries(per, limit), residual_loss(per, limit)
-            known = self._qualities[key] = (mean_tries, loss, self._full_mbps[mcs] / mean_tries * (1.0 - loss))
-        return known
+        if len(self._qualities) > _MAX_DEMANDS:
+            self._qualities.clear()
+        limit = self._config.retry_limit
+        mean_tries, loss = tries(per, limit), residual_loss(per, limit)
+        found = self._qualities[mcs, per] = (mean_tries, loss, self._full_mbps[mcs] / mean_tries * (1.0 - loss))
+        return found
 
     def repair_payload(self, s: Sample) -> int:
         """Payload bytes of the fragments that are left."""

@@ -72,7 +72,7 @@ def losses(u: float, count: int, q: float) -> int:
 
     Walks up from the likely end, because q is tiny or the sample is lost anyhow.
     """
-    if q <= 0.0:
+    if q <= 0.0 or u < 1.0 - count * q:  # (1 − q)^count ≥ 1 − count · q
         return 0
     if q >= 1.0:
         return count

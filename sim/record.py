@@ -33,6 +33,8 @@ _LINKS = {link: link.name.lower() for link in LinkHealth}
 _NO_DISC = (NAN, NAN, NAN)
 F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
 
+pa.array(())  # pyarrow looks for pandas at its first array; at import, that is no part of a flight's time
+
 TABLES: dict[str, dict[str, pa.DataType]] = {
     # one row a drone and frame; position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU
     "states": dict(
