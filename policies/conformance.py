@@ -254,6 +254,8 @@ def _looks(policy: Policy, view: FleetView) -> str | None:
     try:
         asked = look(shown)
         check_reposition(asked, view)
+        if shown != view:
+            return "its viewpoint changed its input"
         others = {
             "two calls with the same view differ": look(_copied(view)),
             "drones in another order get another place": look(view._replace(descriptors=_turned(view.descriptors))),
@@ -268,8 +270,6 @@ def _looks(policy: Policy, view: FleetView) -> str | None:
         return f"its viewpoint {error}"
     except Exception as error:
         return f"its viewpoint raises {type(error).__name__}: {error}"
-    if shown != view:
-        return "its viewpoint changed its input"
     return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.displaced import displaced
-from fleet.motion import MotionError, fly
+from fleet.motion import Motion, MotionError, fly
 from fleet.rotor import fleet_power_w
 from fleet.viewpoints import (
     LEAST_MOVE_M,
@@ -135,6 +135,17 @@ def test_a_wish_through_another_drone_is_cut_short_or_refused() -> None:
     assert grant(2, (0.0, -39.0), [()] * 5, course, bounds, 0) == "would come too near drone 0"
 
 
+def test_a_wish_for_where_another_is_going_waits_and_is_cut_short() -> None:
+    course, bounds = course_and_bounds(fleet_with(drones=2, formation={"shape": "line"}))  # at (0, 0) and (0, 20)
+    other = grant(1, (30.0, -20.0), [(), ()], course, bounds, 0)
+    assert isinstance(other, Move)
+    assert other.end_m == (30.0, -20.0)  # to (30, 0), as drone 0 wishes too
+    assert grant(0, (30.0, 0.0), [(), (other,)], course, bounds, 1) == "would come too near drone 1"
+    move = grant(0, (30.0, 0.0), [(), (other,)], course, bounds, 280)
+    assert isinstance(move, Move)
+    assert move.end_m == (15.0, 0.0)
+
+
 def test_a_wish_that_would_leave_the_fence_some_day_is_cut_short_now() -> None:
     """Drone 4 flies 20 m right of the track, on the last leg at x = 40: there 15 m farther out is within 58, 30 m not."""
     fleet = fleet_with(viewpoints={"fence_m": [-100, -100, 60, 100]})
@@ -153,7 +164,7 @@ def test_a_fence_that_the_formation_leaves_is_no_fence_to_fly_in() -> None:
         course_and_bounds(fleet_with(viewpoints={"fence_m": [-100, -100, 30, 100]}))
 
 
-def flown_with_moves(**changed: object):  # noqa: ANN201
+def flown_with_moves(**changed: object) -> tuple[Fleet, Motion, Motion, list[Plan], Course]:
     fleet = fleet_with(**changed)
     base = fly(fleet, 30.0, FRAME_S, seed=3)
     course, bounds = course_of(fleet, np.asarray(base.time_s)), bounds_of(fleet)
