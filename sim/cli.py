@@ -40,7 +40,7 @@ from sim import (
 )
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
-from sim.folders import RunError
+from sim.folders import RunError, put_between
 from sim.named import policy_overrides
 from sim.sortie import VERSION, run_sortie
 from sim.watchers import Watcher, Watchers
@@ -102,6 +102,10 @@ def fly(
         float,
         typer.Option(help="Simulated seconds in one of the wall's, with --mavlink; 0: as fast as it goes.", min=0),
     ] = 1.0,
+    mavlink_key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Sign what --mavlink sends with this file's 32 B or 64 hex digits."),
+    ] = None,
     recording: Annotated[bool, typer.Option(help="Save sortie.rrd.")] = True,
     profile: Annotated[bool, typer.Option("--profile", help="Tell where the wall time went.")] = False,
     campaign: Annotated[
@@ -116,7 +120,7 @@ def fly(
         flown, replication, expected = _load(_named(scenario), set_, policy), 0, None
     if out_dir is not None:
         rundir.ensure_writable(out_dir)
-    with _watching(live, mavlink, pace) as watchers, _profiled(profile) as report, bars() as bar:
+    with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=watchers or None)
     path = out_dir or rundir.default_path(record)
@@ -284,17 +288,19 @@ def _version(version: Annotated[bool, typer.Option("--version", help="Print the 
 # --- helpers -------------------------------------------------------------------------------------
 
 
-def _watching(live: bool, mavlink: str | None, pace: float) -> Watchers:
+def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) -> Watchers:
     """Who watches a sortie while it flies; imported here, since a viewer costs a third of a second."""
+    if key is not None and mavlink is None:
+        raise RunError("--mavlink-key without --mavlink: there is nothing to sign")
     watchers: list[Watcher] = []
     if live:
         from sim.playback import LiveViewer
 
         watchers.append(LiveViewer())
     if mavlink is not None:
-        from sim.telemetry import MavlinkEndpoint
+        from sim.telemetry import MavlinkEndpoint, read_key
 
-        watchers.append(MavlinkEndpoint(mavlink, pace or None))
+        watchers.append(MavlinkEndpoint(mavlink, pace or None, key=None if key is None else read_key(key)))
     return Watchers(watchers)
 
 

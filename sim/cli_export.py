@@ -31,18 +31,22 @@ def export(
         str | None,
         typer.Option(help="LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0), for --tlog; left out, a field in Zurich."),
     ] = None,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Sign --tlog's frames with this file's 32 B or 64 hex digits.")
+    ] = None,
 ) -> None:
     """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, or as a log for ground stations."""
     if mcap == tlog:
         raise typer.BadParameter("name one format: --mcap or --tlog")
+    if key is not None and not tlog:
+        raise typer.BadParameter("--key signs --tlog alone")
     began_s = int(moment(begin).timestamp())
     if tlog:
-        from sim.telemetry import ORIGIN, parse_origin, save_tlog
+        from sim.telemetry import ORIGIN, parse_origin, read_key, save_tlog
 
-        path = out_path or run / TLOG
-        frames = save_tlog(
-            rundir.load(run), path, began_s * 1_000_000, ORIGIN if origin is None else parse_origin(origin)
-        )
+        path, secret = out_path or run / TLOG, None if key is None else read_key(key)
+        where = ORIGIN if origin is None else parse_origin(origin)
+        frames = save_tlog(rundir.load(run), path, began_s * 1_000_000, where, secret)
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
         return
     path = out_path or run / BAG

@@ -12,7 +12,17 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet.mavlink import STATUS, Listener, Origin, Telemetry, Transmitter, answers, messages, write_tlog
+from fleet.mavlink import (
+    KEY_BYTES,
+    STATUS,
+    Listener,
+    Origin,
+    Telemetry,
+    Transmitter,
+    answers,
+    messages,
+    write_tlog,
+)
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
 from sim.folders import RunError
@@ -84,16 +94,21 @@ class Stream:
                     yield state.time_s, drone, self.transmitters[drone].pack(message)
 
 
-def save_tlog(record: SortieRecord, path: Path, begin_us: int, origin: Origin = ORIGIN) -> int:
+def save_tlog(
+    record: SortieRecord, path: Path, begin_us: int, origin: Origin = ORIGIN, key: bytes | None = None
+) -> int:
     """Write a run as one telemetry log of all its drones, system ids 1 … N; returns the number of frames.
 
     Args:
         begin_us: when the sortie began, µs since 1970.
+        origin: where on the globe it flew.
+        key: 32 B with which frames are signed.
 
     Raises:
         RunError: the file cannot be written.
     """
-    frames = [(begin_us + round(t_s * 1e6), f) for t_s, _, f in Stream(record.scenario, origin).add(record.tables)]
+    stream = Stream(record.scenario, origin, key, None if key is None else begin_us)
+    frames = [(begin_us + round(t_s * 1e6), f) for t_s, _, f in stream.add(record.tables)]
     try:
         write_tlog(path, frames)
     except OSError as error:
@@ -205,3 +220,24 @@ def parse_origin(text: str) -> Origin:
         raise RunError(
             f"origin is {text!r}, must be latitude,longitude or latitude,longitude,altitude: {error}"
         ) from error
+
+
+def read_key(path: Path) -> bytes:
+    """A signing key out of a file: 64 hexadecimal digits, or 32 B as they are. It is told to nobody.
+
+    Raises:
+        RunError: the file cannot be read or holds neither.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from error
+    if len(content) == KEY_BYTES:
+        return content
+    try:
+        key = bytes.fromhex(content.decode("ascii"))
+    except ValueError:  # includes what is no ASCII
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise RunError(f"{path}: no signing key, must hold {2 * KEY_BYTES} hexadecimal digits or {KEY_BYTES} bytes")
+    return key

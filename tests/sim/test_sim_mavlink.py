@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -26,7 +27,7 @@ from sim.cli import app
 from sim.folders import RunError
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
-from sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, save_tlog
+from sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
 
 BEGIN_US = 1_767_225_600_000_000
 
@@ -289,6 +290,70 @@ def test_the_command_sends_while_it_flies(tmp_path: Path) -> None:
         parser = mavlink2.MAVLink(None)
         heard = [m for _ in range(60) for m in parser.parse_buffer(station.recv(65_535)) or []]
     assert {m.get_srcSystem() for m in heard} == {1, 2, 3, 4, 5}
+
+
+def signed_parser(key: bytes) -> mavlink2.MAVLink:
+    """Believes frames signed with a key alone."""
+    parser = mavlink2.MAVLink(None)
+    parser.signing.secret_key, parser.robust_parsing = key, True
+    return parser
+
+
+def test_a_log_is_signed_by_the_command(record: SortieRecord, tmp_path: Path) -> None:
+    rundir.save(record, tmp_path / "run")
+    key = bytes(range(KEY_BYTES))
+    (tmp_path / "key").write_text(key.hex() + "\n")
+    told = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--tlog", "--key", str(tmp_path / "key")])
+    assert told.exit_code == 0, told.output
+    frames = (tmp_path / "run" / "sortie.tlog").read_bytes()
+    parser, unsigned = signed_parser(key), signed_parser(bytes(KEY_BYTES))
+    heard, read_on = Counter(), 0
+    while read_on < len(frames):
+        size = frames[read_on + 9] + 12 + 13  # after the log's stamp: the frame's length, its head, its signature
+        frame = frames[read_on + 8 : read_on + 8 + size]
+        read_on += 8 + size
+        heard.update(m.get_type() for m in parser.parse_buffer(frame) or [])
+        assert [m.get_type() for m in unsigned.parse_buffer(frame) or []] == ["BAD_DATA"]
+    assert heard["HEARTBEAT"] == 20
+    assert "BAD_DATA" not in heard
+
+
+def test_what_flies_is_signed_by_the_command(tmp_path: Path) -> None:
+    key = hashlib.sha256(b"a ground station's passphrase").digest()
+    (tmp_path / "key").write_bytes(key)
+    scenario = tmp_path / "short.yaml"
+    scenario.write_text(BASE.replace("duration_s: 6", "duration_s: 2"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(10.0)
+        to = f"udpout:127.0.0.1:{station.getsockname()[1]}"
+        arguments = ["fly", str(scenario), "--no-recording", "--mavlink", to, "--pace", "0"]
+        arguments += ["--mavlink-key", str(tmp_path / "key"), "--out", str(tmp_path / "run")]
+        said = CliRunner().invoke(app, arguments)
+        assert said.exit_code == 0, said.output
+        parser = signed_parser(key)
+        heard = [m for _ in range(60) for m in parser.parse_buffer(station.recv(65_535)) or []]
+    assert {m.get_srcSystem() for m in heard if m.get_type() != "BAD_DATA"} == {1, 2, 3, 4, 5}
+    assert "BAD_DATA" not in {m.get_type() for m in heard}
+
+
+@pytest.mark.parametrize("content", [b"", b"secret", b"00" * 31, b"zz" * 32, bytes(33), "ä".encode() * 20])
+def test_a_key_that_is_none_is_named_and_not_told(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(content)
+    with pytest.raises(RunError) as error:
+        read_key(path)
+    assert str(error.value) == f"{path}: no signing key, must hold 64 hexadecimal digits or 32 bytes"
+    with pytest.raises(RunError, match=r"gone: No such file or directory$"):
+        read_key(tmp_path / "gone")
+
+
+def test_a_key_with_nothing_to_sign_is_named(tmp_path: Path) -> None:
+    said = CliRunner().invoke(app, ["fly", "track_target", "--mavlink-key", str(tmp_path / "key")])
+    assert str(said.exception) == "--mavlink-key without --mavlink: there is nothing to sign"
+    said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--key", str(tmp_path / "key")])
+    assert said.exit_code == 2
+    assert "--key signs --tlog alone" in said.output
 
 
 # --- what can go wrong -----------------------------------------------------------------------------
