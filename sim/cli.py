@@ -155,6 +155,9 @@ def compare(
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
     recording: Annotated[Path | None, typer.Option(help="Save all of them side by side as a Rerun recording.")] = None,
+    readme: Annotated[
+        Path | None, typer.Option(help="A Markdown file whose section between the comparison's markers is replaced.")
+    ] = None,
 ) -> None:
     """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
     contexts = load_contexts(scenario)
@@ -173,6 +176,10 @@ def compare(
     if out_file is not None:
         _write_json(out_file, {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows})
         out.print(f"kept in [bold]{out_file}[/bold]")
+    if readme is not None:
+        section = tables.comparison_markdown(rows, f"sortie compare {scenario} --policies {policies}")
+        put_between(readme, section, tables.COMPARE_BEGIN, tables.COMPARE_END)
+        out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
         from sim.playback import save_comparison
 

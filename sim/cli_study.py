@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sim.console import out, stages, user_errors
-from sim.folders import RunError, ensure_folder, replacing, write_text
+from sim.folders import RunError, ensure_folder, put_between, replacing
 
 if TYPE_CHECKING:
     from perception.study.measure import Row
@@ -83,7 +83,6 @@ def study_report(
 ) -> None:
     """Tell the study: a Markdown report with figures, the rows beside it, and the README's sentences."""
     from perception.harness import figures as common
-    from perception.harness.report import put_into
     from perception.study import figures, report
     from perception.study.measure import to_table
     from perception.study.plan import read_plan
@@ -101,7 +100,7 @@ def study_report(
         if readme is not None:
             link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
             section = report.short(plan, rows, link)
-            write_text(readme, put_into(readme.read_text("utf-8"), section, report.BEGIN, report.END))
+            put_between(readme, section, report.BEGIN, report.END)
             out.print(f"the study's sentences in [bold]{readme}[/bold] written")
     for line in report.answers(plan, report.Found(rows)):
         out.print(line)

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from perception.harness.report import put_into
+
 
 class RunError(ValueError):
     """What a user asked of files or folders and cannot be done; the message names the path."""
@@ -68,6 +70,19 @@ def write_text(path: Path, text: str) -> None:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def put_between(path: Path, section: str, begin: str, end: str) -> None:
+    """Replace a Markdown file's section between its markers, which the new one holds too.
+
+    Raises:
+        RunError: no such file, or one without the markers.
+    """
+    try:
+        text = put_into(path.read_text(encoding="utf-8"), section, begin, end)
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: {error}") from error
+    write_text(path, text)
 
 
 def _replace(new: Path, path: Path) -> None:

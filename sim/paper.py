@@ -19,7 +19,7 @@ from perception.harness.paper import bench_frames, camera_views, measure
 from perception.harness.picture import PAPER_BUDGETS, Picture, picture
 from perception.harness.rows import Point, Row
 from perception.harness.sensitivity import Varied, sensitivity
-from sim.folders import RunError, ensure_folder, replacing, write_text
+from sim.folders import ensure_folder, put_between, replacing
 from sim.plane import machine, measure_plane
 from sim.sortie import VERSION
 
@@ -150,11 +150,7 @@ def put_into_readme(readme: Path, result_rows: Sequence[Row], facts: dict[str, A
     Raises:
         RunError: no such file, or one without the section's markers.
     """
-    try:
-        text = report.put_into(readme.read_text(encoding="utf-8"), report.short(result_rows, facts, link))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{readme}: {error}") from error
-    write_text(readme, text)
+    put_between(readme, report.short(result_rows, facts, link), report.BEGIN, report.END)
 
 
 def _draw(result: Result, folder: Path) -> list[str]:

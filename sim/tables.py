@@ -15,6 +15,7 @@ from sim.expect import Verdict
 
 ROOMS = ("sim", "fleet", "radio", "policies", "perception", "scenarios")
 MAX_TRANSITIONS = 24
+COMPARE_BEGIN, COMPARE_END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
 
 def number(value: Any, form: str = ".3f", unit: str = "") -> str:
@@ -115,6 +116,26 @@ def comparison_table(rows: Sequence[Compared]) -> Table:
     table.add_column("", style="bold")
     for row in rows:
         table.add_column(row.policy, justify="right")
+    for name, cells in _side_by_side(rows).items():
+        table.add_row(name, *cells)
+    return table
+
+
+def comparison_markdown(rows: Sequence[Compared], command: str) -> str:
+    """The same for a README, between its markers, with why the figures differ."""
+    first = rows[0].outcome
+    head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, seed {first['seed']}"
+    rate_hz = first["ap50"]["sample_rate_hz"]
+    if rate_hz is not None:
+        head += f", accuracy scored at {rate_hz:g} Hz, gains over {rows[0].policy} in AP points, paired, 95 %"
+    lines = [f"{head}.", "", f"| | {' | '.join(r.policy for r in rows)} |", f"|---|{'---|' * len(rows)}"]
+    lines += [f"| {name.strip()} | {' | '.join(cells)} |" for name, cells in _side_by_side(rows).items()]
+    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(rows)]
+    return "\n".join([COMPARE_BEGIN, "", *lines, "", *(f"- {line}" for line in why), "", COMPARE_END])
+
+
+def _side_by_side(rows: Sequence[Compared]) -> dict[str, list[str]]:
+    """What is compared, a row each: its name and a cell a policy."""
     figures: dict[str, Callable[[Compared], str]] = {
         "AP@0.5 full scene": lambda r: number(r.outcome["ap50"]["full_scene"]),
         "  gain": lambda r: _gain(r.gain["full_scene"]),
@@ -132,9 +153,7 @@ def comparison_table(rows: Sequence[Compared]) -> Table:
         "  compute": lambda r: f"{r.outcome['energy_j']['compute'] / 1e3:.2f} kJ",
         "charge left, least": lambda r: percent(min(r.outcome["battery"].values(), default=None)),
     }
-    for name, figure in figures.items():
-        table.add_row(name, *(figure(r) for r in rows))
-    return table
+    return {name: [figure(r) for r in rows] for name, figure in figures.items()}
 
 
 def _gain(gain: tuple[float, float, float] | None) -> str:

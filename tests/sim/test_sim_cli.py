@@ -211,8 +211,18 @@ def test_check_passes_with_code_0(scenario: Path) -> None:
 
 
 def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: Path, tmp_path: Path) -> None:
-    done = sortie("compare", scenario, "--policies", "worked,all-4(rho=0.1),silence", "--out", "c.json", cwd=tmp_path)
+    (tmp_path / "README.md").write_text("# Mine\n\n<!-- compare:begin -->old<!-- compare:end -->\n\nSee below.\n")
+    done = sortie(
+        "compare", scenario, "--policies", "worked,all-4(rho=0.1),silence", "--out", "c.json", "--readme", "README.md",
+        cwd=tmp_path,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    readme = (tmp_path / "README.md").read_text()
+    assert readme.startswith("# Mine\n\n<!-- compare:begin -->\n")
+    assert readme.endswith("<!-- compare:end -->\n\nSee below.\n")
+    assert "| | worked | all-4(rho=0.1) | silence |" in readme
+    assert "- **silence**: sent nothing" in readme
+    assert "old" not in readme
     assert "sent nothing; every drone saw with its own eyes only" in done.stdout
     kept = json.loads((tmp_path / "c.json").read_text())
     assert list(kept) == ["worked", "all-4(rho=0.1)", "silence"]
