@@ -150,6 +150,27 @@ def test_a_flight_of_many_blocks_is_one_flight() -> None:
         np.testing.assert_array_equal(step(two), step(many)[:2, :2])
 
 
+@pytest.mark.parametrize("distance_m", [None, 30.0])
+@pytest.mark.parametrize("antenna", ["isotropic", "dipole"])
+def test_a_flight_that_goes_another_way_is_as_if_it_had_been_planned(distance_m: float | None, antenna: str) -> None:
+    """From the next frame on; what is drawn stays, within a block and across its end."""
+    config = Radio.model_validate({"shadowing_distance_m": distance_m, "antenna": antenna})
+    planned = still(CROSS_M, 1300)
+    other = planned.copy()
+    other[700:, 2] += np.linspace(0, 40, 600)[:, None] * np.array([0.6, 0.8, 0.1])
+    changed, known = Channel(config, planned, 1, 0, 0.1), Channel(config, other, 1, 0, 0.1)
+    for frame in range(1300):
+        if frame == 700:
+            changed.reroute(other)
+        changed.advance()
+        known.advance()
+        assert np.array_equal(changed.snr_db, known.snr_db, equal_nan=True)
+        assert np.array_equal(changed.group_reach_bytes, known.group_reach_bytes, equal_nan=True)
+        assert changed.now.rows_db[2][1] == known.now.rows_db[2][1]
+    with pytest.raises(ValueError, match=r"positions_m has shape \(1300, 4, 3\), must be \(1300, 6, 3\) and finite"):
+        changed.reroute(other[:, :4])
+
+
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(frames, drones, 3\)"):
         Channel(Radio(), np.zeros((3, 3)), 1, 0, 0.1)

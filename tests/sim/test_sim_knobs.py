@@ -40,6 +40,12 @@ FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radi
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
+ASIDE = "mission.target.waypoints_m=[[-60, 60], [200, 60]]"
+LOOKS = ("policy.name=vantage", "policy.params={rho: 0.02}", ASIDE, "fleet.formation.spacing_m=14")
+SHARP = (*LOOKS, "fleet.viewpoints.acceleration_mps2=5", "fleet.viewpoints.reach_m=30")  # speed binds, not acceleration
+FAST = (*LOOKS, "fleet.viewpoints.speed_mps=15", "fleet.viewpoints.acceleration_mps2=5")
+FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
+
 BURSTS = "radio.bursts.good_to_bad=0.3"
 LINKS = str(Path(__file__).parent / "links.csv")
 
@@ -62,6 +68,22 @@ def descriptor(agent_id: int) -> Descriptor:
     )
 
 
+CROSSING = """
+from policies.baselines import everyone
+from policies.contract import Reposition, looks_from
+
+def nearer(view):
+    me, middle = view.me, view.descriptors.get(0)
+    if me is None or middle is None or view.ego == 0:
+        return None
+    x, y = ((a + b) / 2 for a, b in zip(me.position_m, middle.position_m[:2]))
+    return Reposition(x, y)
+
+@looks_from(nearer)
+def decide(view):
+    return everyone(view, rho=0.02)
+"""
+"""Everybody asks to be half as far from drone 0."""
 TIRED_VIEW = [tired(0), tired(1)]
 REPLAY = f"policy.replays=[{{at_s: 2, drone: 0, view: {TIRED_VIEW[0]}}}]"
 
@@ -83,6 +105,11 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.motion.pose_jitter_time_s": ("5", ()),
     "fleet.motion.pose_error_m": ("1", ()),
     "fleet.motion.heading_error_deg": ("5", (FIXED, "mission.target=null")),
+    "fleet.viewpoints.reach_m": ("20", LOOKS),
+    "fleet.viewpoints.speed_mps": ("6", SHARP),
+    "fleet.viewpoints.acceleration_mps2": ("0.5", (*LOOKS, "fleet.viewpoints.speed_mps=15")),
+    "fleet.viewpoints.separation_m": ("2", (*LOOKS, "policy.name=CROSSING")),
+    "fleet.viewpoints.fence_m": ("[-100, -50, 100, 18]", (*FAST, FENCE)),
     "fleet.battery.capacity_wh": ("100", ()),
     "fleet.battery.cells": ("6", ()),
     "fleet.battery.initial_soc": ("0.8", ()),
@@ -269,6 +296,9 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     change = [f"{place(field, shared)}={value}"]
     if field == "policy.replays.drone":
         change.append(f"policy.replays.0.view={TIRED_VIEW[1]}")  # a view is its drone's own
+    if "policy.name=CROSSING" in shared:
+        Path(tmp_path / "crossing.py").write_text(CROSSING)
+        shared = (*shared, f"policy.name={tmp_path / 'crossing.py'}:decide", "policy.params={}")
     before = run_sortie(example(*shared))
     after = run_sortie(example(*shared, *change))
     assert after.fingerprint != before.fingerprint
