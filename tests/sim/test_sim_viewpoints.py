@@ -76,7 +76,7 @@ def test_drones_move_and_all_that_hangs_on_it_follows() -> None:
     assert np.abs(np.diff(after[:, :, 1], axis=0) / 0.1 - velocity[:-1]).max() < 0.3
     # the battery: what the rotors draw depends on the air speed
     rotor = [
-        {e["drone"]: e["joules"] for e in r.tables["energy"].to_pylist() if e["cause"] == "rotor"}
+        {e["drone"]: e["energy_j"] for e in r.tables["energy"].to_pylist() if e["cause"] == "rotor"}
         for r in (stays, moves)
     ]
     assert all(abs(rotor[1][i] - rotor[0][i]) > 1.0 for i in range(5))
