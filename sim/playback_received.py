@@ -1,7 +1,9 @@
 """What peers sent to each drone, on the ground of the scene: the cells of feature maps, hatched in the sender's colour.
 
 A payload's cells follow from its budget ρ, its region and its sender's pose. Where the budget ranks the cells by the
-detector's own confidence, the record does not hold which ones won: all that stood to choice are hatched then. The
+detector's own confidence, the record does not hold which ones won: all that stood to choice are hatched then. Of a
+payload that arrived in part (tiles), neither is it held which cells are missing: its rows are as much shorter, its
+square as much smaller, that the area shown is the share that came. The
 pose is the true one of the capture's frame; the sender used its own estimate, a metre or so away.
 """
 
@@ -35,7 +37,17 @@ HEIGHT_M = 0.5
 Disc = tuple[float, float, float]
 Link = tuple[int, int]
 Pose = tuple[float, float, float]
-_COLUMNS = ("t_done_s", "t_sent_s", "captured_s", "drone", "peer", "representation", "status")
+_COLUMNS = (
+    "t_done_s",
+    "t_sent_s",
+    "captured_s",
+    "drone",
+    "peer",
+    "representation",
+    "status",
+    "payload_bytes",
+    "arrived_bytes",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +57,8 @@ class Arrival:
     t_s: float
     captured_s: float
     region: Disc | None
+    share: float = 1.0
+    """Of its bytes that arrived; below 1 where tiles were lost."""
 
 
 class Received:
@@ -92,12 +106,13 @@ class Received:
             self._regions[drone, peer].append((t_s, None if radius != radius else (x, y, radius)))
 
     def _note_arrivals(self, transmissions: pa.Table) -> None:
-        for done, sent, captured, sender, receiver, what, fate in zip(
+        for done, sent, captured, sender, receiver, what, fate, size, arrived in zip(
             *(transmissions[k].to_pylist() for k in _COLUMNS), strict=True
         ):
-            if what == "features" and fate == "delivered":
+            if what == "features" and fate in ("delivered", "partial"):
                 region = self._region(sender, receiver, sent)
-                self._arrivals[receiver, sender].append(Arrival(done, captured, region))
+                share = arrived / size if fate == "partial" else 1.0
+                self._arrivals[receiver, sender].append(Arrival(done, captured, region, share))
 
     def _region(self, sender: int, receiver: int, t_s: float) -> Disc | None:
         """The region of the directive in force when a payload was handed to the radio."""
@@ -119,9 +134,10 @@ class Received:
             if latest is not None:
                 x, y, yaw = self._pose(peer, latest.captured_s)
                 if latest.region is None:
-                    square = _square(x, y, yaw, peer)[None]
+                    square = _square(x, y, yaw, peer, latest.share)[None]
                 else:
                     runs = hatch(latest.region, (x, y, yaw), peer % LANES)
+                    runs[:, 2] *= latest.share
             regions.append(runs)
             squares.append(square)
         if latest is not None:
@@ -180,9 +196,9 @@ def hatch(region: Disc, pose: Pose, lane: int) -> Floats:
     )
 
 
-def _square(x: float, y: float, yaw: float, lane: int) -> Floats:
-    """The outline of a sender's whole map [5, 3]; those of several senders lie inside one another."""
-    half = CELLS * CELL_M / 2 - 1.2 * lane
+def _square(x: float, y: float, yaw: float, lane: int, share: float) -> Floats:
+    """The outline of a sender's whole map [5, 3], of a share of its area; several senders' lie inside one another."""
+    half = CELLS * CELL_M / 2 * share**0.5 - 1.2 * lane
     corners = half * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)], float)
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     return np.column_stack([corners @ turn + (x, y), np.full(5, HEIGHT_M)])

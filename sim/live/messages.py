@@ -51,6 +51,11 @@ class Cdr:
         """As DDS hands it over; nothing is believed yet."""
         return cls(data)
 
+    @classmethod
+    def deserialize_key(cls, data: bytes, has_header: bool = True, use_version_2: object = None) -> Cdr:
+        """Of a writer that left: there are no keys, and DDS wraps this so that it is no sample."""
+        return cls(data)
+
 
 def dds_name(ros_name: str) -> str:
     """`pkg/msg/Name` as DDS knows it: `pkg::msg::dds_::Name_`."""
@@ -78,7 +83,12 @@ def dds_type(ros_name: str) -> type[Any]:
         fields[field["name"]] = _field_type(package, field["type"], field["length"])
     name = f"{ros_name.rpartition('/')[2]}_"
     made: type[Any] = make_idl_struct(name, dds_name(ros_name), fields, dataclassify=False)
-    for own in ("__init__", "serialize", "deserialize"):  # as a base, Cdr would have to be a type of IDL itself
+    for own in (
+        "__init__",
+        "serialize",
+        "deserialize",
+        "deserialize_key",
+    ):  # as a base, Cdr would have to be a type of IDL itself
         setattr(made, own, vars(Cdr)[own])
     return made
 

@@ -24,7 +24,7 @@ from policies.contract import Descriptor, Directive, Disc, Representation, TaskP
 from sim.cli import app
 from sim.folders import RunError
 from sim.live import messages
-from sim.live.bus import CONTEXT, LOOPBACK, Kind, Topic, links
+from sim.live.bus import CONTEXT, LOOPBACK, Bus, Kind, Topic, links
 from sim.live.clock import WallClock
 from sim.live.messages import BYTES_NAME, dds_name, dds_type, pack_bytes, unpack_bytes
 from sim.live.node import opened
@@ -71,6 +71,20 @@ def test_types_made_of_msg_files_are_those_written_by_hand(ros_name: str, by_han
     made = dds_type(ros_name)
     assert made.__idl__.get_type_id() == by_hand.__idl__.get_type_id()
     assert made.__idl_typename__ == by_hand.__idl_typename__ == dds_name(ros_name)
+
+
+def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
+    bus = Bus(DOMAIN)
+    topic = Topic(Kind.COMPACT, 0, 1)
+    reader, writer = bus.reader(topic, 4), Bus(DOMAIN).writer(topic)
+    while not writer.listeners:
+        time.sleep(0.01)
+    writer.write(pack_bytes(b"abc"))
+    assert bus.wait(10.0)
+    assert [unpack_bytes(cdr) for cdr in reader.take()] == [b"abc"]
+    del writer  # its participant goes with it, and tells so
+    assert bus.wait(10.0)
+    assert reader.take() == []
 
 
 def test_a_line_that_is_no_field_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

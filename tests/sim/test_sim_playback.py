@@ -310,6 +310,39 @@ def test_what_peers_sent_is_hatched_cell_by_cell(rows: Rows, record: SortieRecor
     assert {len(v) for _, _, v in whole} <= {0, 1}
 
 
+def test_of_a_payload_that_came_in_part_as_much_is_drawn_as_came(tmp_path: Path) -> None:
+    """By area: rows of cells in a region, the square of a whole map."""
+    flown = example("radio.framing=tiles", "radio.bursts={good_to_bad: 0.5, loss_bad: 0.9}", "fleet.drones=3")
+    record = run_sortie(flown)
+    save_rrd(record, tmp_path / "sortie.rrd")
+    drawn = read(tmp_path / "sortie.rrd")
+    sent, seen = record.tables["transmissions"].to_pylist(), {"cells": 0, "whole_map": 0}
+
+    def last(ego: int, peer: int, t_s: float) -> dict[str, Any]:
+        came = [
+            t for t in sent
+            if (t["drone"], t["peer"], t["representation"]) == (peer, ego, "features")
+            and t["status"] in ("delivered", "partial") and t_s - 1.0 <= t["t_done_s"] < t_s
+        ]  # fmt: skip
+        return max(came, key=lambda t: t["t_done_s"])
+
+    for ego, peer in ((i, j) for i in range(3) for j in range(3) if i != j):
+        path = f"/world/received/{ego}/{peer}"
+        for t_s, _, halves in drawn[f"{path}/cells"].get("Boxes3D:half_sizes", []):
+            if halves and (row := last(ego, peer, t_s))["status"] == "partial":
+                share = row["arrived_bytes"] / row["payload_bytes"]
+                assert 0 < share < 1
+                assert sum(2 * h[1] for h in halves) / CELL_M == pytest.approx(row["cells"] * share, abs=12)
+                seen["cells"] += 1
+        for t_s, _, strips in drawn[f"{path}/whole_map"].get("LineStrips3D:strips", []):
+            if strips and (row := last(ego, peer, t_s))["status"] == "partial":
+                share = row["arrived_bytes"] / row["payload_bytes"]
+                side_m = math.dist(*strips[0][:2]) + 2 * 1.2 * peer
+                assert (side_m / (64 * CELL_M)) ** 2 == pytest.approx(share, abs=1e-3)
+                seen["whole_map"] += 1
+    assert min(seen.values()) > 0
+
+
 def test_a_hatch_covers_exactly_the_cells_of_the_region() -> None:
     """Against every cell's centre, turned and moved by hand; a turned sender's runs lie along its own left."""
     pose, region = (10.0, -20.0, 0.7), (25.0, -10.0, 32.0)
