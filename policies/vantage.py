@@ -13,6 +13,8 @@ from policies.contract import Directive, FleetView, Reposition, TaskPhase, looks
 
 FRESH_PERIODS = 10.0
 """Peers heard longer ago than this are detached: where they are now is not known."""
+NEAR_M = 5.0
+"""Nearer than this is near enough: everyone stays where it is."""
 MOST_M = 100.0
 """It asks for no place farther away; the formation's reach is shorter."""
 
@@ -31,7 +33,7 @@ def over_region(view: FleetView) -> Reposition | None:
     middle_x, middle_y = (fsum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))
     dx_m, dy_m = me.region.x_m - middle_x, me.region.y_m - middle_y
     far_m = hypot(dx_m, dy_m)
-    share = MOST_M / far_m if far_m > MOST_M else 1.0
+    share = 0.0 if far_m < NEAR_M else MOST_M / far_m if far_m > MOST_M else 1.0
     x_m, y_m, _ = me.position_m
     return Reposition(x_m + share * dx_m, y_m + share * dy_m, f"the fleet's middle is {far_m:.0f} m from the region")
 

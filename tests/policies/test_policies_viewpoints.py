@@ -76,6 +76,10 @@ def test_a_policy_and_its_viewpoint_share_the_parameters_that_both_name() -> Non
     assert [name for name in POLICIES if viewpoint_of(resolve(name))] == ["vantage"]
 
 
+def middle_of(view: FleetView) -> list[float]:
+    return [math.fsum(d.position_m[axis] for d in view.descriptors.values()) / len(view.descriptors) for axis in (0, 1)]
+
+
 def test_vantage_brings_the_fleets_middle_over_the_region_and_nobody_past_another() -> None:
     view = tracking(fleet_of(5), Disc(10.0, 50.0, 32.0))
     asked = []
@@ -90,10 +94,13 @@ def test_vantage_brings_the_fleets_middle_over_the_region_and_nobody_past_anothe
         for a, d in zip(asked, view.descriptors.values(), strict=True)
     ]
     assert all(shift == pytest.approx(shifts[0]) for shift in shifts)
-    far = over_region(tracking(fleet_of(5), Disc(4000.0, 0.0, 32.0)))
     me = view.me
-    assert far is not None
     assert me is not None
+    near = over_region(tracking(fleet_of(5), Disc(middle_of(view)[0] + 4.0, middle_of(view)[1], 32.0)))
+    assert near is not None
+    assert near[:2] == me.position_m[:2]
+    far = over_region(tracking(fleet_of(5), Disc(4000.0, 0.0, 32.0)))
+    assert far is not None
     assert math.dist(far[:2], me.position_m[:2]) == pytest.approx(MOST_M)
 
 
