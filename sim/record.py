@@ -1,8 +1,8 @@
 """The record of a sortie: what happened, as tables, and its fingerprint.
 
 Rows are gathered as plain tuples while the sortie flies and become Arrow tables at its end. The column lists
-below are the documentation of the Parquet files. Wall-clock figures are kept apart, so that the fingerprint is a
-function of (scenario, policy, seed, version) alone.
+below are those of the Parquet files, and `ABOUT` says what a row is; `outcome.md` shows both. Wall-clock figures are
+kept apart, so that the fingerprint is a function of (scenario, policy, seed, version) alone.
 """
 
 from __future__ import annotations
@@ -36,60 +36,65 @@ F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - r
 pa.array(())  # pyarrow looks for pandas at its first array; at import, that is no part of a flight's time
 
 TABLES: dict[str, dict[str, pa.DataType]] = {
-    # one row a drone and frame; position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU
     "states": dict(
         t_s=F, drone=I, x_m=F, y_m=F, z_m=F, qx=F, qy=F, qz=F, qw=F, vx_mps=F, vy_mps=F, vz_mps=F,
         p_radps=F, q_radps=F, r_radps=F, soc=F, voltage_v=F, current_a=F, airborne=B,
     ),
-    # one row a descriptor published; goodput to each other drone by ascending id, 0 where unmeasured
     "descriptors": dict(
         t_s=F, drone=I, stamp_ns=pa.int64(), wire_bytes=I, soc=F, cpu_headroom=F, gpu_headroom=F,
         goodput_mbps=pa.list_(F), phase=S, region_x_m=F, region_y_m=F, region_radius_m=F,
         novelty_flags=I, coverage_grid=pa.binary(),
     ),
-    # one row a descriptor heard or refused at a receiver: `reason` is empty where it was accepted
     "drops": dict(t_s=F, receiver=I, reason=S),
-    # one row a change of what a gate enforces, with the reason that decided it
     "directives": dict(
         t_s=F, drone=I, peer=I, representation=S, rho=F, roi_x_m=F, roi_y_m=F, roi_radius_m=F, rate_hz=F,
         deadline_s=F, fusion_weight=F, duty_percent=I, asked=S, asked_rate_hz=F, link=S, reason=S,
         policy=S,
     ),
-    # one row a directive that the shield replaced ("shield"), or that breaks an invariant all the same ("broken");
-    # peer −1: all of a drone's together
     "interventions": dict(t_s=F, drone=I, peer=I, policy=S, kind=S, text=S),
-    # one row a payload handed to the radio, with its fate; `partial`: some of its tiles arrived, `arrived_bytes` of it
     "transmissions": dict(
         t_sent_s=F, drone=I, peer=I, representation=S, captured_s=F, rho=F, cells=I, boxes=I, index_bytes=I,
         payload_bytes=I, wire_bytes=I, deadline_s=F, t_start_s=F, t_done_s=F, status=S, reason=S, fragments=I,
         fragments_lost=I, repairs=I, mcs=I, snr_db=F, airtime_s=F, hops=I, arrived_bytes=I,
     ),
-    # one row a scored fusion: an ego, and the peers whose payloads it held; a weight is the directive's times trust
     "fusions": dict(
         t_s=F, drone=I, peers=pa.list_(I), representations=pa.list_(S), ages_s=pa.list_(F), weights=pa.list_(F),
         detections=I, truths=I,
     ),
-    # boxes detected by an ego and true boxes in its range, ENU
     "detections": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, score=F),
     "truths": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F),
-    # the mission over time, one row a frame: NaN where there is no region or target
     "mission": dict(t_s=F, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target_x_m=F, target_y_m=F),
-    # the medium, one row a frame
     "medium": dict(t_s=F, busy_fraction=F, connected_drones=I),
-    # once a second where payloads are relayed: whether all drones reach all, who is outside the largest such group, and
-    # the link that limits the worst-off pair (−1 and NaN where there is none)
     "topology": dict(
         t_s=F, connected=B, cut_drones=pa.list_(I), bottleneck_sender=I, bottleneck_receiver=I, bottleneck_mbps=F,
     ),
-    # energy by drone and cause at the end
     "energy": dict(drone=I, cause=S, energy_j=F),
-    # what happened to the fleet: scenario events, landings
     "events": dict(t_s=F, drone=I, kind=S, text=S),
-    # one row a change of what a drone thinks of a peer (fleet.trust): 1 is undoubted
     "trust": dict(t_s=F, drone=I, peer=I, trust=F, reason=S),
-    # age of each peer's descriptor whenever a policy read it
     "ages": dict(t_s=F, drone=I, age_s=F),
 }  # fmt: skip
+ABOUT = {
+    "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU.",
+    "descriptors": "A descriptor published. Goodput to each other drone by ascending id, 0 where unmeasured.",
+    "drops": "A descriptor refused at a receiver, with the reason.",
+    "directives": "A change of what a gate enforces, with the reason that decided it.",
+    "interventions": 'A directive that the shield replaced ("shield"), or that breaks an invariant all the same '
+    '("broken"); peer −1: all of a drone\'s together.',
+    "transmissions": "A payload handed to the radio, with its fate. `partial`: some of its tiles arrived, "
+    "`arrived_bytes` of it.",
+    "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
+    "detections": "A box that an ego detected, ENU.",
+    "truths": "A car within an ego's range at a scored fusion, ENU.",
+    "mission": "The mission in a frame; NaN where there is no region or target.",
+    "medium": "The channel in a second, and how many drones have a usable link.",
+    "topology": "Once a second where payloads are relayed: whether all drones reach all, who is outside the largest such "
+    "group, and the link that limits the worst-off pair (−1 and NaN where there is none).",
+    "energy": "What a drone spent on a cause.",
+    "events": "What happened to the fleet: scenario events, landings, policies that took over; drone −1 is the fleet.",
+    "trust": "A change of what a drone thinks of a peer (`fleet.trust`); 1 is undoubted.",
+    "ages": "Age of a peer's descriptor when a policy read it.",
+}
+"""What a row of each table is; units stand in the columns' names."""
 
 
 @dataclass(frozen=True)

@@ -72,17 +72,3 @@ def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[\w-]+)?\)", page.read_text("utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
-
-
-def test_every_field_of_the_outcome_is_told() -> None:
-    """The table in the room's README names every field of outcome.json, so that no new one goes untold."""
-    from sim_examples import example
-
-    from sim.outcome import outcome
-    from sim.sortie import run_sortie
-
-    told = (ROOT / "sim" / "README.md").read_text("utf-8")
-    result = outcome(run_sortie(example("duration_s=1")))
-    known = {"scenario", "policy", "seed", "replication", "version", "fingerprint", "duration_s", "frame_s"}
-    untold = [k for k in result if k not in known and f"`{k}" not in told]
-    assert untold == []

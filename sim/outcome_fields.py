@@ -1,0 +1,126 @@
+"""The fields of `outcome.json` and what they mean: the reference in `outcome.md` is made of this.
+
+A test holds `sim.outcome.outcome` to these types, field by field.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, TypedDict
+
+
+class Percentiles(TypedDict):
+    p50: Annotated[float | None, "Median."]
+    p99: Annotated[float | None, "99th percentile."]
+
+
+class Accuracy(TypedDict):
+    full_scene: Annotated[
+        float | None, "AP@0.5 over all cars within range, rotated BEV IoU, pooled over egos and scored fusions."
+    ]
+    mission: Annotated[
+        float | None, "The same of detections and cars whose centres lie in the mission disc, while there is one."
+    ]
+
+
+class Ap50(Accuracy):
+    detector: Annotated[str, "`perception.detector`."]
+    calibration: Annotated[str | None, "Which fit a surrogate detector is of."]
+    sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
+    scored_fusions: Annotated[int, "How many fusions were scored."]
+
+
+class Bytes(TypedDict):
+    context_sent: Annotated[int, "Descriptors and directives."]
+    context_descriptors: Annotated[int, "Descriptors as sent, 28 B of authentication included."]
+    context_directives: Annotated[int, "Directives at 36 B, counted when they change."]
+    data_sent: Annotated[int, "Payloads handed to the radio: delivered + lost + expired + in flight."]
+    handshakes_sent: Annotated[
+        int, "What a method put on its links before payloads (`policies.prior`), part of `data_sent`."
+    ]
+    data_delivered: Annotated[int, "Arrived; of payloads that came in part, that part."]
+    data_lost: Annotated[int, "Lost on the air."]
+    data_expired: Annotated[int, "Past their deadline, or replaced by a newer one before they were through."]
+    data_in_flight: Annotated[int, "On the way at the end."]
+
+
+class Drone(TypedDict):
+    soc: Annotated[float, "State of charge at the end, 0 … 1."]
+    voltage_v: Annotated[float, "At the pack's terminals at the end."]
+    airborne: Annotated[bool, "Whether it still flew."]
+    energy_j: Annotated[float, "Spent, all causes."]
+
+
+class Policies(TypedDict):
+    decisions: Annotated[dict[str, int], "By policy."]
+    changes: Annotated[int, "How often a drone's policy was replaced in flight."]
+    shield_interventions: Annotated[int, "Directives that the shield replaced, or could not put right."]
+    invariant_violations: Annotated[int, "Directives that broke an invariant all the same."]
+
+
+Transition = TypedDict(
+    "Transition",
+    {
+        "t_s": Annotated[float, "When."],
+        "drone": Annotated[int, "Whose links."],
+        "peers": Annotated[list[int], "To whom; links that change alike share an entry."],
+        "from": Annotated[str, "What they carried, in words."],
+        "to": Annotated[str, "What they carry now."],
+        "reason": Annotated[str, "The reason that decided it."],
+    },
+)
+
+
+class Phase(TypedDict):
+    phase: Annotated[str, "The mission's phase."]
+    begin_s: Annotated[float, "From when."]
+    end_s: Annotated[float, "Until when, exclusive."]
+    ap50: Annotated[Accuracy, "Accuracy within it."]
+    data_rate_mbps: Annotated[float, "Payload bytes captured in it, as Mb/s."]
+    feature_payload_bytes: Annotated[float | None, "Median size of a feature payload."]
+    deadline_miss_rate: Annotated[float | None, "As for the whole sortie."]
+
+
+class Event(TypedDict):
+    t_s: Annotated[float, "When."]
+    drone: Annotated[int, "Whose; −1 is the fleet's."]
+    kind: Annotated[str, "What kind."]
+    text: Annotated[str, "In words."]
+
+
+class Outcome(TypedDict):
+    """All of `outcome.json`; what is a ratio of nothing is null."""
+
+    scenario: Annotated[str, "Its name."]
+    policy: Annotated[str, "The policy flown."]
+    seed: Annotated[int, "Of every random draw."]
+    replication: Annotated[int, "Which draw of a campaign."]
+    version: Annotated[str, "Of this project."]
+    fingerprint: Annotated[str, "SHA-256 over the record's values; equal inputs give equal fingerprints."]
+    duration_s: Annotated[float, "Length of the sortie."]
+    frame_s: Annotated[float, "From one frame to the next."]
+    ap50: Annotated[Ap50, "Accuracy."]
+    bytes: Annotated[Bytes, "What was sent."]
+    context_share: Annotated[float | None, "Context bytes over all bytes."]
+    data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
+    deadline_miss_rate: Annotated[
+        float | None, "Payloads that expired or were replaced before delivery, over those whose fate is known."
+    ]
+    payload_fates: Annotated[dict[str, int], "Counts by status and reason."]
+    medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy."]
+    age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
+    data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
+    descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
+    battery: Annotated[dict[str, float], "State of charge at the end, by drone."]
+    drones: Annotated[dict[str, Drone], "Each at the end."]
+    energy_j: Annotated[dict[str, float], "By cause, and `total`; hover outweighs the radio about a hundredfold."]
+    policies: Annotated[Policies, "Who decided, and how often it was put right."]
+    switches: Annotated[float | None, "Changes of what a link carries, per link and minute."]
+    transitions: Annotated[list[Transition], "Each change of what links carry."]
+    phases: Annotated[list[Phase], "By mission phase."]
+    distrusted_by: Annotated[
+        dict[str, int], "For each drone that anyone came to doubt (`fleet/trust.py`), how many did."
+    ]
+    events: Annotated[list[Event], "What happened to the fleet: scenario events, landings, policies that took over."]
+    policy_eval_us: Annotated[Percentiles, "Wall time of a decision; no part of the fingerprint."]
+    wall_s: Annotated[float | None, "Wall time of the flight; no part of the fingerprint."]
+    realtime_factor: Annotated[float | None, "Simulated over wall time; no part of the fingerprint."]

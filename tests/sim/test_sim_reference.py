@@ -1,0 +1,93 @@
+"""The outcome's reference is what the code says, and what the code says is what a sortie gives."""
+
+from __future__ import annotations
+
+from types import UnionType
+from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
+
+import pytest
+from sim_examples import example
+
+from sim import reference
+from sim.outcome import outcome
+from sim.outcome_fields import Outcome
+from sim.record import ABOUT, TABLES
+from sim.sortie import run_sortie
+
+
+class Leaf(TypedDict):
+    x: Annotated[float | None, "A number."]
+
+
+class Tree(TypedDict):
+    one: Annotated[Leaf, "One."]
+    named: Annotated[dict[str, Leaf], "By name."]
+    many: Annotated[list[Leaf], "In a row."]
+    counts: Annotated[dict[str, int], "Counted."]
+
+
+def faults(value: Any, kind: Any, path: str) -> list[str]:
+    """Where a value is not of its kind; a typed dictionary has all of its keys and no other."""
+    origin, of = get_origin(kind), get_args(kind)
+    if is_typeddict(kind):
+        hints = get_type_hints(kind)
+        wrong = [f"{path}: keys {sorted(set(value) ^ set(hints))}"] if set(value) != set(hints) else []
+        return wrong + [f for k in set(value) & set(hints) for f in faults(value[k], hints[k], f"{path}.{k}")]
+    if origin is dict:
+        return [f for k, v in value.items() for f in faults(k, of[0], path) + faults(v, of[1], f"{path}.{k}")]
+    if origin is list:
+        return [f for k, v in enumerate(value) for f in faults(v, of[0], f"{path}[{k}]")]
+    if origin is UnionType:
+        return [] if any(not faults(value, member, path) for member in of) else [f"{path}: {value!r}"]
+    fits = type(value) in ((int, float) if kind is float else (kind,))
+    return [] if fits else [f"{path}: {value!r} is no {kind.__name__}"]
+
+
+def test_a_sortie_s_outcome_has_the_fields_of_the_reference() -> None:
+    flown = example(
+        "perception.detector=surrogate",
+        "events=[{kind: drone_lost, at_s: 2, drone: 3}, {kind: spoof, at_s: 1, drone: 1, until_s: 3}]",
+        "policy.changes=[{at_s: 4, name: best-2}]",
+    )
+    result = outcome(run_sortie(flown))
+    assert faults(result, Outcome, "outcome") == []
+    assert result["ap50"]["full_scene"] is not None
+    assert all(result[k] for k in ("transitions", "phases", "events", "drones", "descriptor_drops", "payload_fates"))
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"extra": 1}, "outcome: keys ['extra']"),
+        ({"seed": 1.0}, "outcome.seed: 1.0 is no int"),
+        ({"switches": "few"}, "outcome.switches: 'few'"),
+        ({"age_s": {"p50": 0.1}}, "outcome.age_s: keys ['p99']"),
+        ({"events": [{"t_s": 1.0, "drone": True, "kind": "", "text": ""}]}, "outcome.events[0].drone: True is no int"),
+    ],
+)
+def test_a_field_of_another_name_or_kind_is_found(change: dict[str, Any], fault: str) -> None:
+    result = outcome(run_sortie(example("duration_s=1")))
+    assert faults({**result, **change}, Outcome, "outcome") == [fault]
+
+
+def test_the_page_is_current() -> None:
+    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sim.reference"
+
+
+def test_every_table_is_told() -> None:
+    assert list(ABOUT) == list(TABLES)
+    assert all(ABOUT.values())
+    for name, columns in TABLES.items():
+        assert all(f"`{column}`" in reference.page() for column in columns), name
+
+
+def test_paths_lead_into_objects_keys_and_lists() -> None:
+    assert list(reference.fields(Tree)) == [
+        ("one", "object", "One."),
+        ("one.x", "number, null", "A number."),
+        ("named", "object", "By name."),
+        ("named.*.x", "number, null", "A number."),
+        ("many", "list", "In a row."),
+        ("many[].x", "number, null", "A number."),
+        ("counts", "object of whole numbers", "Counted."),
+    ]
