@@ -19,10 +19,12 @@ def changes_in_words(result: LiveResult) -> list[str]:
         f"times, and fresh again {counts[LinkHealth.FRESH]} times"
     )
     events = [(n.t_s, f"drone {n.drone}: {n.text}") for n in result.notices]
-    events += [
-        (o.t_s, f"drone {o.drone} → {o.peer}: {_carries(o.representation, o.rate_hz)}, because {o.reason}")
-        for o in result.orders
-    ]
+    carried: dict[tuple[int, int], str] = {}
+    for o in result.orders:  # a disc that moves with its target is no change worth a line
+        now = _carries(o.representation, o.rate_hz)
+        if carried.get((o.drone, o.peer)) != now:
+            events.append((o.t_s, f"drone {o.drone} → {o.peer}: {now}, because {o.reason}"))
+        carried[o.drone, o.peer] = now
     return said + [f"{t_s:6.1f} s  {text}" for t_s, text in sorted(events)]
 
 
