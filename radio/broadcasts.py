@@ -64,7 +64,8 @@ class Broadcasts:
         self._overrides = overrides
         self._n = n = channel.n
         self._access_streams = [stream(seed, replication, i, "access") for i in range(n)]
-        self._access: list[list[list[float]]] = [[] for _ in range(n)]
+        self._access: list[list[tuple[int, float]]] = [[] for _ in range(n)]  # backoff slots and residual
+        self._airtime_s: dict[int, float] = {}  # by payload, bytes
         self.phase_s = [
             float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
         ]
@@ -79,14 +80,16 @@ class Broadcasts:
             raise ValueError(f"payload_bytes is {payload_bytes}, must be in [1, {MAX_GROUP_PAYLOAD_BYTES}]")
         ready = self._access[sender]
         if not ready:
-            ready.extend(self._access_streams[sender].random((256, 2)).tolist()[::-1])
-        slot_u, residual = ready.pop()
-        airtime_s = group_frame_s(payload_bytes, self._rate_mbps)
-        mpdu_bytes = payload_bytes + _GROUP_OVERHEAD_BYTES
+            drawn = self._access_streams[sender].random((256, 2)).tolist()[::-1]
+            ready.extend([(int(slot_u * (CW_CONTEXT + 1)), residual) for slot_u, residual in drawn])
+        slots, residual = ready.pop()
+        airtime_s = self._airtime_s.get(payload_bytes)
+        if airtime_s is None:
+            airtime_s = self._airtime_s[payload_bytes] = group_frame_s(payload_bytes, self._rate_mbps)
         counters = self._counters
         counters.broadcasts += 1
         counters.context_sent_bytes += payload_bytes
-        return Broadcast(sender, airtime_s, int(slot_u * (CW_CONTEXT + 1)), residual, mpdu_bytes, on_heard)
+        return Broadcast(sender, airtime_s, slots, residual, payload_bytes + _GROUP_OVERHEAD_BYTES, on_heard)
 
     def end(self, frame: Broadcast, collided: bool) -> None:
         """The medium is through with a frame."""

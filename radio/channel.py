@@ -167,6 +167,7 @@ class Channel:
         self._reach_now: list[list[float]] = []
         # who hears whom in this frame, if every frame is of this length
         self._heard_bytes = -1
+        self._all_ids: IntArray
         self._heard_ids: Sequence[int] = []
         self._heard_from: list[int] = []
 
@@ -270,10 +271,13 @@ class Channel:
         if self._crowd is None:
             return [i for i, reach in enumerate(self._reach_now[sender]) if reach >= length_bytes]
         if self._heard_bytes != length_bytes:  # most frames of a moment have one length: look at all links together
-            through = (self.reach_bytes >= length_bytes)[links.by_sender]
-            self._heard_ids = cast(Sequence[int], links.receiver[links.by_sender[through]])
-            self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
             self._heard_bytes = length_bytes
+            if self.reach_bytes.min(initial=np.inf) >= length_bytes:
+                self._heard_ids, self._heard_from = cast(Sequence[int], self._all_ids), links.begin
+            else:
+                through = (self.reach_bytes >= length_bytes)[links.by_sender]
+                self._heard_ids = cast(Sequence[int], links.receiver[links.by_sender[through]])
+                self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
         return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
 
     def _reach(self, faded_db: AnyFloats, luck: AnyFloats) -> AnyFloats:
@@ -314,6 +318,7 @@ class Channel:
             safe_db = self._group_s50_db - self._group_gain_db + SAFE_DB - float(fade_table_db(c.rician_k_db)[0])
             risky = np.flatnonzero(self._snr_db.min(axis=0) < safe_db)
             fades_db, luck = self._crowd.chance(0, len(p), risky)
+            self._all_ids = self.links.receiver[self.links.by_sender]
             self._reach_bytes = np.full_like(self._snr_db, np.inf)
             self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, luck)
             return

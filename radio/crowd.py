@@ -80,21 +80,21 @@ class Crowd:
         n = self._n_early
         places = np.concatenate([low[:early] * n + high[:early], high[:early] * n + low[:early]])
         early_shadow_db, *chance = (x.reshape(len(p), -1) for x in self._early.block(EPOCH, len(p)))
-        self._early_fades_db, self._early_luck = (np.take(x, places, axis=1) for x in chance)
+        self._early_fades_db, self._early_luck = (np.take(x, places, axis=1, mode="clip") for x in chance)
         shadow_db: Array
         if self._field is not None:
             at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
             shadow_db = np.stack([square[low, high] for square in at])
         else:
             shadow_db = self._shadowing(low, high, len(p))
-            shadow_db[:, :early] = np.take(early_shadow_db, places[:early], axis=1)
+            shadow_db[:, :early] = np.take(early_shadow_db, places[:early], axis=1, mode="clip")
         gain_db = shadow_db - loss_db
         return Block(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
 
     def chance(self, first: int, frames: int, links: IntArray) -> tuple[Array, Array]:
         """Fades in dB and luck, [frames, L'], of some links in the block's frames from `first` on."""
         bits = numbers(self._link_keys[links], self._frame + first, frames)
-        fades_db, luck = np.take(self._fades, levels(bits, 0)), uniforms(bits)
+        fades_db, luck = np.take(self._fades, levels(bits, 0), mode="clip"), uniforms(bits)
         # the first drones' own numbers in their places; their pairs are the first ones
         back = links >= self._pairs
         pair = np.where(back, links - self._pairs, links)
@@ -121,7 +121,7 @@ class Crowd:
             where = np.minimum(np.searchsorted(self._last_pairs, pairs), len(self._last_pairs) - 1)
             known = self._last_pairs[where] == pairs
             begin_db[known] = self._last_db[where[known]]
-        z = np.take(normal_table(), levels(numbers(self._link_keys[: len(low)], self._frame, flown), 1))
+        z = np.take(normal_table(), levels(numbers(self._link_keys[: len(low)], self._frame, flown), 1), mode="clip")
         shadow_db = gauss_markov(z, self._config.shadowing_sigma_db, self._keep, begin_db)
         self._last_pairs, self._last_db = pairs, shadow_db[-1].copy()
         return shadow_db

@@ -437,6 +437,11 @@ class Medium(Generic[J, F]):
         now: float = self._env.now
         coming = self._coming
         if coming and -coming[-1][0] <= now:
+            minus_at_s, _, end_s, frame, _ = coming[-1]
+            if end_s <= now and not (self._waiting or self._heads) and (len(coming) == 1 or -coming[-2][0] > now):
+                coming.pop()
+                self._end_alone(frame, -minus_at_s, now)
+                return
             self._admit(now)
         if now < self._context_target_s:  # something holds it up
             self._aim(now)
@@ -464,6 +469,15 @@ class Medium(Generic[J, F]):
         for f in sent:
             self.transmit_s[f.sender] += f.airtime_s
             self._on_group_end(f, len(sent) > 1)
+
+    def _end_alone(self, frame: F, at_s: float, now: float) -> None:
+        """A frame had the channel to itself since it began to contend: `_join`, `_account` and the rest in one go."""
+        until = at_s + AIFS_CONTEXT_S + frame.slots * SLOT_S + frame.airtime_s
+        self.context_busy_s += min(now, until) - at_s
+        self._last_s = now
+        self._aim(now)
+        self.transmit_s[frame.sender] += frame.airtime_s
+        self._on_group_end(frame, False)
 
     # --- accounts --------------------------------------------------------------------------------
 
