@@ -27,7 +27,7 @@ MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")
 """Plots in which phase changes and events are marked."""
 EVENT_LANE: c.Rgba = (150, 108, 20, 255)
 RUNGS = ("nothing", "tracks", "detections", "features", "raw")
-FATES: dict[str, c.Rgba] = {"expired": (255, 120, 60, 255), "lost": (255, 50, 70, 255)}
+FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
 
 

@@ -25,6 +25,8 @@ MAX_LANES = 8
 """Lanes of more drones than this would push the plots out."""
 
 LEGEND = """
+**{name}**: {description}
+
 Each drone has one colour, here and in the plots; its label is its number and charge, the **ring** on the ground
 what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission disc.
 
@@ -52,7 +54,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         lanes_view(scenario),
         plot("battery, %", "battery", legend=False),
         plot("goodput, mean of a drone's links, Mb/s", "goodput", legend=False),
-        plot("traffic by representation and fate, Mb/s", "traffic"),
+        plot("traffic, Mb/s: features green, boxes orange; too late white, lost red", "traffic", legend=False),
         rrb.Horizontal(
             plot("age of descriptors, 99th percentile, ms", "age", legend=False),
             plot("channel busy, %", "medium", (0.0, 104.0), legend=False),
@@ -60,7 +62,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     ]
     shares = [1.0, 1.0, 1.2, 0.9]
     if scenario.perception.detector != "none":
-        plots.insert(1, plot("AP@0.5 of all drones over the last 5 s", "ap", (0.0, 1.0)))
+        plots.insert(1, plot("AP@0.5, last 5 s: full scene blue, mission disc pink", "ap", (0.0, 1.0), legend=False))
         shares.insert(0, 1.2)
     lanes_height = 0.07 + 0.048 * (
         min(scenario.fleet.drones, MAX_LANES) + 2
@@ -68,7 +70,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
     shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
     about = rrb.TextDocumentView(name="how to read this", contents=["/about"])
     left = rrb.Vertical(
-        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[5, 4]), row_shares=[3, 1]
+        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[1, 1]), row_shares=[12, 5]
     )
     body = rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2])
     return sheet(body, live=live)
@@ -153,4 +155,5 @@ def time_axis(scenario: Scenario) -> rrb.TimeAxis:
 def legend(scenario: Scenario) -> rr.TextDocument:
     """How to read the playback, for someone who has never seen one."""
     seen = "" if scenario.perception.detector == "none" else SEEN.format(ego=EGO)
-    return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen).strip(), media_type=rr.MediaType.MARKDOWN)
+    told = {"name": scenario.name, "description": " ".join(scenario.description.split()) or "no description."}
+    return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen, **told).strip(), media_type=rr.MediaType.MARKDOWN)
