@@ -6,17 +6,25 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from perception.detectors import DETECTORS
+from policies.conformance import conform
+from policies.contract import Directive, Representation
 from scenarios.load import load
 from sim.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = sorted((ROOT / "docs" / "guide").glob("*.md"))
+PAGES = [
+    *sorted(p for p in ROOT.glob("[!.]*/**/*.md") if "runs" not in p.parts),
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+]
 LANGUAGES = {"yaml", "python", "sh"}
 
 
@@ -67,8 +75,53 @@ def test_the_guide_is_there_and_has_examples() -> None:
     assert sum(len(examples(p)) for p in GUIDE) >= 12
 
 
-@pytest.mark.parametrize("page", [*GUIDE, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[\w-]+)?\)", page.read_text("utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def commands_in(page: Path) -> list[str]:
+    """Every `sortie …` of a page: on a line of its own in an example, or as code within a sentence."""
+    text = page.read_text("utf-8")
+    lines = re.findall(r"^\s*(?:\.venv/bin/)?(sortie .+)$", text, re.M)
+    return [c.replace("[", "").replace("]", "") for c in (*lines, *re.findall(r"`(sortie [^`\n]+)`", text))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_every_command_told_is_one_with_these_options(page: Path) -> None:
+    for told in commands_in(page):
+        words = shlex.split(told, comments=True)[1:]
+        if words[0] not in ("…", "..."):
+            assert fault(words) is None, told
+
+
+def fault(words: list[str]) -> str | None:
+    """What is wrong with a command's name and options; what is left out is not."""
+    command: Any = typer.main.get_command(app)
+    context: Any = None
+    try:
+        while True:
+            context = command.make_context(command.name or "sortie", list(words), parent=context)
+            words = [*context._protected_args, *context.args]  # a group may have put something before them
+            if not hasattr(command, "resolve_command") or not words:
+                return None
+            _, command, words = command.resolve_command(context, words)
+    except Exception as error:
+        return None if type(error).__name__ in ("MissingParameter", "NoArgsIsHelpError") else str(error)
+
+
+@pytest.mark.parametrize(
+    "words", [["soar"], ["fly", "track_target", "--speed", "3"], ["bench", "break"], ["live", "--loss", "lots"]]
+)
+def test_a_command_that_is_none_is_found(words: list[str]) -> None:
+    assert fault(words) is not None
+
+
+def test_the_readme_s_policy_is_one() -> None:
+    """It decides for every peer, within the contract."""
+    (code,) = re.findall(r"```python\n(def decide.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    names: dict[str, Any] = {"__name__": "readme", "Directive": Directive, "Representation": Representation}
+    exec(compile(code, "README.md", "exec"), names)  # noqa: S102 - our own page
+    assert {check.name: check.what for check in conform(names["decide"], count=50) if not check.holds} == {}
