@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.table import Table
 
 from policies.adaptive import ARMS, LEARNED
 from policies.registry import resolve
 from scenarios.contexts import Contexts
 from sim.console import bars, out
-from sim.contexts import best_fixed, fly_all, summarise
+from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
 from sim.folders import write_text
 from sim.tables import size
 
@@ -29,28 +30,67 @@ def compare_contexts(contexts: Contexts, policies: Sequence[str], sets: Sequence
         each = {p: bar(p, len(contexts.contexts)) for p in policies}
         cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k))
     rows = summarise(cells)
-    at = {(c.policy, c.context): c for c in cells}
-    table = Table("AP@0.5", "rho", *policies, title="by context; mission AP where the fleet tracks")
-    for c in contexts.contexts:
-        best = max(at[p, c.name].ap for p in policies)
-        figures = [at[p, c.name].ap for p in policies]
-        table.add_row(c.name, f"{c.rho:g}", *(f"[bold]{a:.3f}[/bold]" if a == best else f"{a:.3f}" for a in figures))
-    out.print(table)
+    for table in _by_context(contexts, policies, cells, out.width):
+        out.print(table)
     fixed = best_fixed(rows)
-    over = f"over {fixed}, AP points, 95 %"
-    table = Table("policy", "mean AP", over, "of the oracle", "data a sortie", "energy", "missed", title="all contexts")
+    table = Table(
+        "policy",
+        "AP",
+        f"over {fixed}, 95 %",
+        "oracle",
+        "data",
+        "kJ",
+        "missed",
+        title="all contexts",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
+    for column in table.columns:
+        column.no_wrap = True
     for r in rows:
         gain, low, high = (100 * g for g in r.gain)
         table.add_row(
             r.policy, f"{r.ap:.3f}", "–" if r.policy == fixed else f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]",
-            f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f} kJ", f"{r.miss_rate:.1%}",
+            f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}", f"{r.miss_rate:.1%}",
         )  # fmt: skip
     out.print(table)
-    out.print("[dim]the oracle takes the best fixed policy of each context; intervals resample contexts in pairs[/dim]")
+    flown = ", ".join(p for p in policies if p in FIXED)
+    out.print(
+        f"[dim]over {fixed}: AP points over the best fixed policy ({flown}), contexts resampled in pairs; oracle: of the AP of "
+        "the best fixed policy of each context; data and energy of a sortie; missed: payloads past their deadline[/dim]"
+    )
     if out_file is not None:
         found = {"summary": [asdict(r) for r in rows], "cells": [asdict(c) for c in cells]}
         write_text(out_file, json.dumps(found, indent=1) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
+
+
+def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cell], width: int) -> Iterator[Table]:
+    """AP of every policy in every context, in as many tables as the terminal is too narrow for one."""
+    at = {(c.policy, c.context): c.ap for c in cells}
+    left = width - max(len(c.name) for c in contexts.contexts) - 12
+    rest = list(policies)
+    while rest:
+        few = [rest.pop(0)]
+        while rest and sum(max(len(p), 5) + 2 for p in (*few, rest[0])) <= left:
+            few.append(rest.pop(0))
+        table = Table(
+            "context",
+            "rho",
+            *few,
+            title="AP@0.5; of the mission where the fleet tracks",
+            box=SIMPLE,
+            padding=(0, 1, 0, 0),
+        )
+        for column in table.columns:
+            column.no_wrap = True
+        for c in contexts.contexts:
+            best = max(at[p, c.name] for p in policies)
+            figures = (at[p, c.name] for p in few)
+            table.add_row(
+                c.name, f"{c.rho:g}", *(f"[bold]{a:.3f}[/bold]" if a == best else f"{a:.3f}" for a in figures)
+            )
+        yield table
 
 
 def learn(
