@@ -34,7 +34,7 @@ def comparison(scenario: Scenario, labels: Sequence[str]) -> rrb.Blueprint:
             scene_view(scenario, f"/{root}", label),
             lanes_view(scenario, f"/{root}", f"{label}: what each drone sends on its best link"),
             log_view(f"/{root}", f"{label}: who decided what, and why"),
-            row_shares=[3, 2.5, 1],
+            row_shares=[2.7, 2.7, 1.4],
         )
         for root, label in zip(roots(labels), labels, strict=True)
     ]
