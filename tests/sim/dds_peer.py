@@ -121,7 +121,7 @@ def main() -> None:
     last: dict[int, Context] = {}
     directives: list[Directive] = []
     sizes: list[int] = []
-    told, patient_until_s = 0, time.monotonic() + 60
+    told, patient_until_s = 0, time.monotonic() + 120
     say("listening")
     while time.monotonic() < patient_until_s:
         for c in hear.take(50):

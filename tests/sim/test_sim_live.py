@@ -170,10 +170,10 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flown() -> Flown:
-    """Three drones for four seconds; number 2 is killed at 2 s, and a peer of its own making says 12 contexts."""
+    """Three drones for five seconds; number 2 is killed at 2.5 s, and a peer of its own making says 10 contexts."""
     environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK}
     peer = subprocess.Popen(
-        [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "12"],
+        [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "10"],
         stdout=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     pids: dict[int, int] = {}
@@ -181,7 +181,7 @@ def flown() -> Flown:
         assert peer.stdout is not None
         assert peer.stdout.readline() == "listening\n"
         scenario = example("fleet.drones=3", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0.3}")
-        result = fly_live(scenario, duration_s=4.0, kill=(2, 2.0), domain=DOMAIN, begun=pids.update)
+        result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
         told, _ = peer.communicate(timeout=60)
     finally:
         peer.kill()
@@ -225,10 +225,10 @@ def test_a_killed_process_is_noticed_by_age_and_the_others_fly_on(flown: Flown) 
     assert result.noticed[0].by == 2
     for drone in (0, 1):
         seen = [c for c in result.health if (c.drone, c.peer) == (drone, 2)]
-        assert [c.health for c in seen][-2:] == [LinkHealth.DEGRADED, LinkHealth.DETACHED]
-        degraded, detached = seen[-2:]
-        assert 0.3 < degraded.age_s < detached.age_s
-        assert detached.age_s > 1.0
+        assert seen[-1].health == LinkHealth.DETACHED
+        assert seen[-1].age_s > 1.0
+        if seen[-2].health == LinkHealth.DEGRADED:  # a host that stalls for a second jumps over it
+            assert 0.3 < seen[-2].age_s < seen[-1].age_s
         last = [o for o in result.orders if (o.drone, o.peer) == (drone, 2)][-1]
         assert last.representation == "none"
         assert last.reason.startswith("detached")
