@@ -27,6 +27,8 @@ from perception.types import Capture
 from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
 from policies.damping import LinkState, damp
 
+_FRESH = LinkHealth.FRESH
+
 
 class Platform(NamedTuple):
     """What a drone knows about its own body, fractions 0 … 1."""
@@ -319,7 +321,7 @@ class Agent:
     def _enforce(self, link: _Link, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
         rules, before = self._rules, link.state
-        fidelity, link.asked, capped = LinkHealth.FRESH, asked, asked
+        fidelity, link.asked, capped = _FRESH, asked, asked
         if age_s > self._fresh_s:
             fidelity = health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
             link.asked, capped = None, cap_by_age(asked, fidelity, age_s)

@@ -35,6 +35,7 @@ MIN_KEY_BYTES = 16
 _STAMP = struct.Struct("<IQ")  # key id, counter
 TRAILER_BYTES = _STAMP.size + TAG_BYTES
 MAX_COUNTER = 2**64 - 1
+_COMPACT = bytes([MAGIC])
 
 
 class DropReason(StrEnum):
@@ -126,7 +127,7 @@ def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dro
     size = len(data) - trailer
     if size > MAX_DESCRIPTOR_BYTES:
         return Dropped(DropReason.OVERSIZED, f"payload of {size} B, must be at most {MAX_DESCRIPTOR_BYTES}")
-    least = MIN_COMPACT_BYTES if data[:1] == bytes([MAGIC]) else MIN_DESCRIPTOR_BYTES
+    least = MIN_COMPACT_BYTES if data[:1] == _COMPACT else MIN_DESCRIPTOR_BYTES
     if size < least:
         return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {least + trailer}")
     key_id, counter, payload = None, 0, data

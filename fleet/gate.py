@@ -22,6 +22,7 @@ RAW_BYTES = 5 * 800 * 450 * 3
 """Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
 _EPSILON_S = 1e-6
+_NONE, _FEATURES = Representation.NONE, Representation.FEATURES  # members of an enumeration are slow to look up
 _RELIABLE = tuple(rung in (Representation.TRACKS, Representation.DETECTIONS) for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
@@ -64,9 +65,9 @@ def make_payload(
     """
     rung, rho, roi = directive.representation, directive.rho, directive.roi
     cells = boxes = index_bytes = 0
-    if rung == Representation.NONE:
+    if rung == _NONE:
         return None
-    if rung == Representation.FEATURES:
+    if rung == _FEATURES:
         cells = budget.cells_sent(rho, roi, est_x_m, est_y_m, est_yaw_rad)
         if cells == 0:
             return None
@@ -131,7 +132,7 @@ class Gate:
         ready = []
         for peer, directive in self._directives.items():
             rate_hz = directive.rate_hz
-            if directive.representation == Representation.NONE or rate_hz <= 0:
+            if directive.representation == _NONE or rate_hz <= 0:
                 continue
             period_s = 1.0 / rate_hz
             slot_s = self._last_slot_s.get(peer, -1e9) + period_s

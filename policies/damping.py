@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from policies.contract import Directive, Disc, Representation
 
+_NONE = Representation.NONE
 SAME_DISC_M = 1.6
 """A disc that moved less, half a feature cell, is the same disc: it would select almost the same cells."""
 EPSILON_S = 1e-9
@@ -61,7 +62,7 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
 
 def _lower_of(current: Directive, proposed: Directive) -> Directive:
     """The directive that is nowhere above either: what may be enforced at once."""
-    if current.representation == Representation.NONE:
+    if current.representation == _NONE:
         # Nothing flows, so the duty cycle alone can be lowered.
         duty = min(current.duty_percent, proposed.duty_percent)
         return current if duty == current.duty_percent else current._replace(duty_percent=duty, reason=proposed.reason)

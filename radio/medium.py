@@ -42,6 +42,9 @@ class End(Enum):
     DEADLINE_IN_SERVICE = "deadline_in_service"
 
 
+_SERVED = End.SERVED  # members of an enumeration are slow to look up
+
+
 class Job:
     """One sample's claim on the air; subclassed by what knows the sample.
 
@@ -311,7 +314,7 @@ class Medium(Generic[J, F]):
         through = [job for job in heads.values() if n * job.remaining * job.need_s <= _EPS_S]
         if len(through) > 1:
             through.sort(key=_number)
-        ended = [(job, End.SERVED) for job in through]
+        ended = [(job, _SERVED) for job in through]
         for job in through:
             job.remaining = 0.0
             self._remove(job, now)

@@ -29,6 +29,7 @@ from scenarios.schema import Radio
 
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
+_DELIVERED = Status.DELIVERED  # members of an enumeration are slow to look up
 _GOLDEN = 0.6180339887498949
 _MAX_DEMANDS = 20_000
 
@@ -94,7 +95,9 @@ class Sample(Job):
     ) -> None:
         """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
         the sender had got through when this was written; the rest as in `Air.send`."""
-        super().__init__(number, sender, deadline_s)
+        self.number, self.sender, self.deadline_s = number, sender, deadline_s  # as Job, in one go
+        self.remaining, self.granted_s, self.t_start_s, self.live = 1.0, 0.0, nan, True
+        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = self.need_s = 0.0
         self.receiver = receiver  # of this hop, as `sender`
         self.origin, self.target = sender, receiver
         self.hops = 1
@@ -192,7 +195,8 @@ class Sample(Job):
 
     def row(self, status: Status, reason: str, t_done_s: float) -> Transmission:
         """Its row of the record; one that would be lost or expired while pieces of it have come is partial."""
-        arrived, missing = self.payload_bytes if status is Status.DELIVERED else 0, tuple[int, ...]()
+        arrived = self.payload_bytes if status is _DELIVERED else 0
+        missing: tuple[int, ...] = ()
         if self.arrived and self.receiver == self.target and status in (Status.LOST, Status.EXPIRED):
             here = np.concatenate(self.arrived)
             if len(here):
