@@ -11,15 +11,21 @@ small network that was fitted on simulated sorties (`sortie learn`) and is store
 from __future__ import annotations
 
 import json
-from math import isfinite, log10
+from collections.abc import Sequence
+from math import floor, fsum, isfinite, log2, log10
 from pathlib import Path
 from typing import NamedTuple
 
-from policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
+from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
 from policies.geometry import footprint_overlap, peers_by_overlap
 
-RATE_HZ, WEAK_RATE_HZ = 10.0, 2.0
-MIN_GOODPUT_MBPS = 5.0
+RATE_HZ = 10.0
+MAP_MB = 8 * 4096 * 160e-6
+"""All feature cells of one map, megabits."""
+CARRIED = 0.5
+"""A drone asks of the air no more than this part of its mean goodput: the others send as well."""
+STEPS_A_HALVING = 2
+"""What the air carries is rounded down in steps of √2, so that a goodput that wavers moves no directive."""
 EVERYONE = 255
 LEARNED = Path(__file__).with_name("learned.json")
 
@@ -45,13 +51,14 @@ class Arm(NamedTuple):
 ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, False), Arm(2, True, False), Arm(0, True, False))
 """What the adaptive policies choose from."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
-ENOUGH_TRACKING, ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.1, 0.03, 0.06
-"""Budgets from which on feature cells find more than boxes, as `sortie learn`'s training contexts had it."""
+ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.027, 0.034
+"""Budgets from which on feature cells find more than boxes: where the gains of `sortie learn`'s training contexts at
+0.01 and 0.04 cross zero, over log budget, for the searching ones below and above `MUCH_OVERLAP`."""
 MUCH_OVERLAP = 0.65
 
 
 def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
-    """The directives of an arm: the budget shared evenly by the chosen peers; a weak link carries boxes at 2 Hz.
+    """The directives of an arm: the budget shared evenly by the chosen peers, or what the air carries of it.
 
     Args:
         view: the fleet's latest descriptors.
@@ -64,20 +71,30 @@ def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
         return []
     ego, peers = view.ego, view.peers
     chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
-    per_link = min(1.0, rho * len(peers) / len(chosen)) if chosen else 0.0
+    per_link = min(1.0, rho * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
     roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
     reason = f"{why}: {arm.words}"
     directives = []
     for peer in peers:
-        weak = 0.0 < me.goodput_to(peer) < MIN_GOODPUT_MBPS  # 0 is not yet measured: nothing was sent
-        if peer in chosen and not weak:
+        if peer in chosen:
             directives.append(Directive(ego, peer, Representation.FEATURES, per_link, roi, RATE_HZ, reason=reason))
-        elif peer in chosen or arm.boxes:
-            rate_hz = WEAK_RATE_HZ if weak else RATE_HZ
-            directives.append(Directive(ego, peer, Representation.DETECTIONS, 0.0, None, rate_hz, reason=reason))
+        elif arm.boxes:
+            directives.append(Directive(ego, peer, Representation.DETECTIONS, 0.0, None, RATE_HZ, reason=reason))
         else:
             directives.append(nothing(ego, peer, reason))
     return directives
+
+
+def carried(me: Descriptor, peers: Sequence[int]) -> float:
+    """Share of a map that each of so many links carries in time, by the goodput that the drone measured to them.
+
+    More than that is sent in vain: samples wait for one another and miss their deadlines. 1 while nothing is measured.
+    """
+    measured = [mbps for mbps in map(me.goodput_to, peers) if mbps > 0.0]
+    if not measured:
+        return 1.0
+    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * MAP_MB * RATE_HZ)
+    return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
 
 
 def arm(view: FleetView, *, index: int = 0, rho: float = 0.25) -> list[Directive]:
@@ -106,24 +123,25 @@ def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
 
 def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Rules over budget, mission and coverage: cells where the budget carries enough of them, boxes where it does not.
+    """Rules over budget, mission, links and coverage: cells where enough of them get through, boxes where not.
 
-    A starved budget sends so few cells that boxes, at a fraction of the bytes, find more. A drone that tracks has to
-    find what stands in one small region, which boxes tell as well; one that searches gains by cells sooner, and later
-    where its peers see much the same as it does.
+    A starved budget sends so few cells that boxes, at a fraction of the bytes, find more; so do links that carry as
+    little. A drone that tracks has to find what stands in one small region: there boxes tell as well at any budget. One
+    that searches gains by cells, later where its peers see much the same as it does.
     """
-    if view.me is None:
+    me = view.me
+    if me is None:
         return []
     _, tracking, overlap, _, _ = features(view, rho)
     if tracking:
-        enough, why = ENOUGH_TRACKING, "track"
-    elif overlap >= MUCH_OVERLAP:
-        enough, why = ENOUGH_OVERLAPPING, "search, much overlap"
-    else:
-        enough, why = ENOUGH_SEARCHING, "search"
-    if rho < enough:
-        return spend(view, BOXES, rho, f"{why}, budget {rho:g} < {enough:g}")
-    return spend(view, MAPS, rho, f"{why}, budget {rho:g} ≥ {enough:g}")
+        return spend(view, BOXES, rho, "track")
+    through = min(rho, carried(me, view.peers))
+    enough, why = (
+        (ENOUGH_OVERLAPPING, "search, much overlap") if overlap >= MUCH_OVERLAP else (ENOUGH_SEARCHING, "search")
+    )
+    if through < enough:
+        return spend(view, BOXES, rho, f"{why}, budget and links {through:.3g} < {enough:g}")
+    return spend(view, MAPS, rho, f"{why}, budget and links {through:.3g} ≥ {enough:g}")
 
 
 def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:

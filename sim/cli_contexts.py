@@ -94,7 +94,7 @@ def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cel
 
 
 def learn(
-    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 15,
+    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 100,
     seed: Annotated[int, typer.Option(help="Of the training contexts.", min=0)] = 0,
     workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
     out_file: Annotated[
@@ -102,7 +102,7 @@ def learn(
     ] = LEARNED,
 ) -> None:
     """Fit the policy `learned`: fly every arm in drawn contexts with the surrogate detector, and regress AP on what a policy sees."""
-    from sim.learn import fly_lessons, save
+    from sim.learn import BUDGETS, fly_lessons, gains, save
 
     with bars() as bar:
         lessons = fly_lessons(seed, contexts, workers=workers, progress=bar("contexts", contexts))
@@ -111,5 +111,14 @@ def learn(
     for k, arm in enumerate(ARMS):
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
         table.add_row(arm.words, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
+    out.print(table)
+    table = Table("over the first arm, AP points", *(f"rho {rho:g}" for rho in BUDGETS))
+    for k, arm in enumerate(ARMS[1:], start=1):
+        found = gains(lessons, k)
+        for phase in ("search", "track"):
+            cells = (found.get((phase, rho)) for rho in BUDGETS)
+            table.add_row(
+                f"{arm.words}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
+            )
     out.print(table)
     out.print(f"kept in [bold]{out_file}[/bold]")

@@ -33,12 +33,27 @@ def test_arms_by_hand() -> None:
     assert rungs(a.spend(view, a.Arm(0, True, False), 0.1, "")) == [BOXES] * 4
     confined = a.spend(view, a.Arm(255, True, True), 0.1, "")
     assert {d.roi for d in confined} == {view.descriptors[0].region}
-    weak = a.spend(fleet_of(5, goodput=1.0), a.Arm(255, True, False), 0.1, "")
-    assert rungs(weak) == [BOXES] * 4
-    assert {d.rate_hz for d in weak} == {2.0}
 
 
-@pytest.mark.parametrize("goodput", [0.0, 100.0])
+def test_no_more_is_sent_than_the_air_carries() -> None:
+    """Half a drone's goodput for all its links, rounded down in steps of √2; by hand, a map is 5.24 Mb."""
+    assert a.MAP_MB == pytest.approx(5.24288)
+    me = fleet_of(5, goodput=52.4288).descriptors[0]
+    assert a.carried(me, (1, 2, 3, 4)) == pytest.approx(0.125)  # 26.2 of 4 × 52.4 Mb/s, exactly a step
+    assert a.carried(me, (1, 2)) == pytest.approx(0.25)
+    assert a.carried(fleet_of(5, goodput=52.0).descriptors[0], (1, 2, 3, 4)) == pytest.approx(0.125 / 2**0.5)
+    assert a.carried(fleet_of(5, goodput=1e6).descriptors[0], (1, 2, 3, 4)) == 1.0
+    assert a.carried(fleet_of(5, goodput=0.0).descriptors[0], (1, 2, 3, 4)) == 1.0, "unmeasured is not weak"
+    some = me._replace(peer_goodput_mbps=(0.0, 104.8576, 0.0, 0.0))
+    assert a.carried(some, (1, 2, 3, 4)) == pytest.approx(0.25), "by the links that were measured"
+    tight = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.4, "")
+    assert rungs(tight) == [FEATURES] * 4
+    assert sum(d.rho for d in tight) * a.MAP_MB * 10 <= 0.5 * 5.0
+    roomy = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.005, "")
+    assert sum(d.rho for d in roomy) == pytest.approx(4 * 0.005), "a budget below it is spent whole"
+
+
+@pytest.mark.parametrize("goodput", [0.0, 200.0])
 def test_maps_to_all_are_what_the_fixed_policy_sends(goodput: float) -> None:
     """An unmeasured link (goodput 0) is not a weak one: waiting for a measure would cost the climb of a rung."""
     view = fleet_of(5, goodput=goodput)
@@ -58,12 +73,11 @@ def spread(view: FleetView, by: float) -> FleetView:
 @pytest.mark.parametrize(
     ("phase", "apart", "rho", "expected"),
     [
-        (TaskPhase.SEARCH, 3.0, 0.029, BOXES),
-        (TaskPhase.SEARCH, 3.0, 0.03, FEATURES),
-        (TaskPhase.SEARCH, 0.5, 0.059, BOXES),
-        (TaskPhase.SEARCH, 0.5, 0.06, FEATURES),
-        (TaskPhase.TRACK, 0.5, 0.099, BOXES),
-        (TaskPhase.TRACK, 0.5, 0.1, FEATURES),
+        (TaskPhase.SEARCH, 3.0, 0.026, BOXES),
+        (TaskPhase.SEARCH, 3.0, 0.027, FEATURES),
+        (TaskPhase.SEARCH, 0.5, 0.033, BOXES),
+        (TaskPhase.SEARCH, 0.5, 0.034, FEATURES),
+        (TaskPhase.TRACK, 0.5, 1.0, BOXES),
     ],
 )
 def test_budget_mission_and_coverage_decide_together(
@@ -71,6 +85,12 @@ def test_budget_mission_and_coverage_decide_together(
 ) -> None:
     view = spread(fleet_of(5, phase=phase), apart)
     assert set(rungs(a.adaptive(view, rho=rho))) == {expected}
+
+
+def test_links_that_carry_no_cells_carry_boxes() -> None:
+    view = spread(fleet_of(5, goodput=8.0), 3.0)  # carries 0.019 of a map a link
+    assert set(rungs(a.adaptive(view, rho=0.2))) == {BOXES}
+    assert set(rungs(a.adaptive(spread(fleet_of(5, goodput=20.0), 3.0), rho=0.2))) == {FEATURES}
 
 
 def test_the_learned_policy_takes_the_arm_of_the_highest_prediction() -> None:
