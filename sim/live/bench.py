@@ -10,7 +10,7 @@ from fleet.cdr import MalformedDatagram
 from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, links
 from sim.live.messages import unpack_bytes
 from sim.live.node import opened
-from sim.live.reports import Count, Report
+from sim.live.reports import Count, News, Report
 
 PAYLOAD_DEPTH = 16
 """Samples kept of a payload topic until they are taken: a bench that is late by more loses count."""
@@ -75,13 +75,13 @@ def _size(cdr: bytes, kind: Kind) -> int:
 
 
 class Fleet:
-    """What each drone reported, put together."""
+    """What the drones reported, put together."""
 
-    def __init__(self, drones: int) -> None:
+    def __init__(self) -> None:
         self.last: dict[int, Report] = {}
-        self.all: dict[int, list[Report]] = {i: [] for i in range(drones)}
+        self.news: list[News] = []
 
     def add(self, report: Report) -> None:
         """The next report of its drone."""
         self.last[report.drone] = report
-        self.all[report.drone].append(report)
+        self.news.append(report.new)

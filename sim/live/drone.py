@@ -121,9 +121,9 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
 def _with_notices(report: Report, recorder: Recorder) -> Report:
     """The report with what the audit wrote since the last one."""
     for t_s, drone, _, text in recorder.rows["events"]:
-        report.notices.append(Notice(t_s, drone, text))
+        report.new.notices.append(Notice(t_s, drone, text))
     for t_s, drone, peer, _, kind, text in recorder.rows["interventions"]:
-        report.notices.append(Notice(t_s, drone, f"{kind} → {peer}: {text}"))
+        report.new.notices.append(Notice(t_s, drone, f"{kind} → {peer}: {text}"))
     recorder.rows["events"].clear()
     recorder.rows["interventions"].clear()
     return report

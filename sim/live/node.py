@@ -29,7 +29,7 @@ from policies.contract import Descriptor, Directive, FleetView, Policy
 from scenarios.streams import stream
 from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, Writer
 from sim.live.messages import pack_bytes, unpack_bytes
-from sim.live.reports import Count, HealthChange, Order, Report
+from sim.live.reports import Count, HealthChange, News, Order, Report
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `fleet.gate`."""
@@ -94,7 +94,7 @@ class LiveNode:
         self._refused: Counter[str] = Counter()
         self._sent = dict.fromkeys((Kind.DIRECTIVE, *PAYLOADS), Count())
         self._received = dict.fromkeys(PAYLOADS, Count())
-        self._new = Report(drone, 0.0, 0.0, 0, 0, 0, {}, 0.0, {}, {})
+        self._new = News()
         self._began_cpu_s = 0.0
 
     def all_found(self, drones: int) -> bool:
@@ -138,11 +138,10 @@ class LiveNode:
 
     def report(self, t_s: float) -> Report:
         """How it stands; what is new in it will not be told again."""
-        new, self._new = self._new, Report(self.drone, 0.0, 0.0, 0, 0, 0, {}, 0.0, {}, {})
+        new, self._new = self._new, News()
         return Report(
             self.drone, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
-            dict(self._refused), self._late_s, dict(self._sent), dict(self._received),
-            new.decide_ns, new.data_age_s, new.health, new.orders,
+            dict(self._refused), self._late_s, dict(self._sent), dict(self._received), new,
         )  # fmt: skip
 
     # --- fleet.agent.Modem -----------------------------------------------------------------------

@@ -50,9 +50,22 @@ class Notice(NamedTuple):
     text: str
 
 
+@dataclass(slots=True)
+class News:
+    """What happened since the last report."""
+
+    decide_ns: list[int] = field(default_factory=list)
+    """Processor time of each decision."""
+    data_age_s: list[float] = field(default_factory=list)
+    """Age of each payload's capture when it came in."""
+    health: list[HealthChange] = field(default_factory=list)
+    orders: list[Order] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+
+
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One drone so far: counts since the begin, and what is new since the last report."""
+    """One drone so far: counts since the begin, and what is new."""
 
     drone: int
     t_s: float
@@ -69,13 +82,7 @@ class Report:
     """From a frame's begin until its descriptor was published, at most; a tenth of a frame is meant."""
     sent: dict[Kind, Count]
     received: dict[Kind, Count]
-    decide_ns: list[int] = field(default_factory=list)
-    """New: processor time of each decision."""
-    data_age_s: list[float] = field(default_factory=list)
-    """New: age of each payload's capture when it came in."""
-    health: list[HealthChange] = field(default_factory=list)
-    orders: list[Order] = field(default_factory=list)
-    notices: list[Notice] = field(default_factory=list)
+    new: News
 
 
 class Ready(NamedTuple):

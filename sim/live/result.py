@@ -126,10 +126,9 @@ def summary(
     interrupted: bool,
 ) -> LiveResult:
     """Put the bench's counts and the drones' reports together; `flown_s` is the wall's time in the air."""
-    reports = [r for of_drone in fleet.all.values() for r in of_drone]
-    decide_ms = np.array([ns for r in reports for ns in r.decide_ns]) / 1e6
-    data_age_ms = np.array([s for r in reports for s in r.data_age_s]) * 1e3
-    health = sorted((c for r in reports for c in r.health), key=lambda c: c.t_s)
+    decide_ms = np.array([ns for new in fleet.news for ns in new.decide_ns]) / 1e6
+    data_age_ms = np.array([s for new in fleet.news for s in new.data_age_s]) * 1e3
+    health = sorted(c for new in fleet.news for c in new.health)
     context, directives = bench.of(Kind.CONTEXT), bench.of(Kind.DIRECTIVE)
     data_bytes = sum(bench.of(kind).bytes for kind in PAYLOADS)
     context_bytes = context.bytes + directives.bytes
@@ -164,8 +163,8 @@ def summary(
         lost=list(lost),
         noticed=[_noticed(gone, health) for gone in lost],
         health=health,
-        orders=sorted((o for r in reports for o in r.orders), key=lambda o: o.t_s),
-        notices=sorted((n for r in reports for n in r.notices), key=lambda n: n.t_s),
+        orders=sorted(o for new in fleet.news for o in new.orders),
+        notices=sorted(n for new in fleet.news for n in new.notices),
     )
 
 

@@ -75,7 +75,7 @@ def fly_live(
         scenario.model_copy(update={"duration_s": end_s}), lambda t_s: tell("flying for the context", t_s, end_s)
     )
     drones = scenario.fleet.drones
-    bench, fleet = Bench(domain, drones), Fleet(drones)
+    bench, fleet = Bench(domain, drones), Fleet()
     flown: list[_Drone] = []
     lost: list[Lost] = []
     interrupted = False
@@ -105,6 +105,8 @@ def fly_live(
             interrupted = True
             _stop(flown)
             _collect(flown, fleet, lost, t_s)
+        if not fleet.last:
+            raise RunError("no drone's process lived long enough to report" + (f": {lost[0].how}" if lost else ""))
         return summary(
             scenario,
             bench,

@@ -309,6 +309,14 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
             os.kill(pid, 0)
 
 
+def test_a_fleet_that_is_gone_before_it_reports_is_an_error() -> None:
+    def killed(pids: dict[int, int]) -> None:
+        os.kill(pids[0], signal.SIGKILL)
+
+    with pytest.raises(RunError, match=r"^no drone's process lived long enough to report: was killed by SIGKILL$"):
+        fly_live(example("fleet.drones=1"), domain=DOMAIN, begun=killed)
+
+
 @pytest.mark.parametrize(
     ("sets", "options", "message"),
     [
