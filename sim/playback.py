@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -193,7 +194,7 @@ def to_new_viewer(recording: rr.RecordingStream, scenario: Scenario) -> None:
             raise RunError(f"{binary}: the viewer cannot be started: {error.strerror}") from error
         up = listens(port, viewer)
         if viewer.poll() is not None or not up:
-            viewer.kill()
+            end(viewer)
             said.seek(0)
             raise RunError(f"{binary}: the viewer does not come up: {_last_line(said.read())}")
     recording.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint(scenario, live=True))
@@ -215,6 +216,13 @@ def listens(port: int, viewer: subprocess.Popen[bytes]) -> bool:
                 return True
         time.sleep(0.1)
     return False
+
+
+def end(viewer: subprocess.Popen[bytes]) -> None:
+    """End a viewer that was started in a session of its own: the `rerun` command is a script, and the viewer its child."""
+    with suppress(ProcessLookupError):
+        os.killpg(viewer.pid, signal.SIGKILL)
+    viewer.wait()
 
 
 def viewer_binary() -> str:

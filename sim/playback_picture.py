@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.folders import RunError
-from sim.playback import listens, viewer_binary
+from sim.playback import end, listens, viewer_binary
 from sim.playback_canvas import SIM_TIME
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def take_picture(recording: Path, picture: Path, at_s: float, *, size: tuple[int
         "--window-size", f"{size[0]}x{size[1]}", str(recording.absolute()),
     ]  # fmt: skip
     with tempfile.TemporaryFile() as said:
-        viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)  # noqa: S603
+        viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         try:
             if not listens(port, viewer):
                 raise RuntimeError("it does not come up")
@@ -58,8 +58,7 @@ def take_picture(recording: Path, picture: Path, at_s: float, *, size: tuple[int
             said.seek(0)
             raise RunError(f"the viewer gives no picture of {recording}: {_why(said.read()) or error}") from error
         finally:
-            viewer.kill()
-            viewer.wait()
+            end(viewer)
 
 
 def _ask(port: int, picture: Path, at_s: float) -> list[str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import struct
+import subprocess
+import time
 import zlib
 from pathlib import Path
 
@@ -73,6 +75,36 @@ def test_the_viewer_draws_a_sortie_and_a_comparison_without_complaint(tmp_path: 
         scene = seen[40:200, 20:280].reshape(-1, 3)
         assert len(np.unique(scene // 16, axis=0)) > 30  # a town, not an empty panel
         assert ((scene[:, 1] > scene[:, 0] + 8) & (scene[:, 1] > scene[:, 2] + 8)).mean() > 0.03  # its lawns and trees
+
+
+def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command is a script that starts the viewer: both have to go."""
+    (tmp_path / "there.rrd").touch()
+    fake, pid = tmp_path / "rerun", tmp_path / "pid"
+    fake.write_text(f"#!/bin/sh\nsleep 600 &\necho $! > {pid}.part\nmv {pid}.part {pid}\nwait\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(playback_picture, "viewer_binary", lambda: str(fake))
+
+    def never(port: int, viewer: subprocess.Popen[bytes]) -> bool:
+        while not pid.exists():
+            time.sleep(0.01)
+        return False
+
+    monkeypatch.setattr(playback_picture, "listens", never)
+    with pytest.raises(RunError, match=r"it does not come up$"):
+        take_picture(tmp_path / "there.rrd", tmp_path / "p.png", 0.0)
+    until_s = time.monotonic() + 30.0  # killed at once, but somebody has to collect it
+    while alive(int(pid.read_text())):
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that is dead and not collected does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_what_cannot_be_pictured_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
