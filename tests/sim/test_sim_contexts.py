@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from policies.adaptive import ARMS, FEATURES, read_model
 from policies.registry import POLICIES
 from scenarios.contexts import Contexts
 from scenarios.load import ScenarioError, context_sets, library, load_contexts
-from sim import learn
+from sim import cli_contexts, learn
 from sim.cli import main
 from sim.contexts import Cell, best_fixed, paired_interval, scenario_of, summarise
 from sim.learn import Lesson, draw_context, fit, save
@@ -27,16 +29,20 @@ contexts:
 """
 
 
-def held_out() -> Contexts:
-    contexts = load_contexts("contexts")
+SETS = ("contexts", "contexts_second")
+
+
+def held_out(name: str) -> Contexts:
+    contexts = load_contexts(name)
     assert contexts is not None
     return contexts
 
 
-def test_the_held_out_contexts_load_under_every_policy_at_their_budget() -> None:
-    assert "contexts" in context_sets()
-    assert "contexts" not in library()
-    contexts = held_out()
+@pytest.mark.parametrize("name", SETS)
+def test_the_held_out_contexts_load_under_every_policy_at_their_budget(name: str) -> None:
+    assert name in context_sets()
+    assert name not in library()
+    contexts = held_out(name)
     for context in contexts.contexts:
         for policy in POLICIES:
             scenario = scenario_of(contexts, context, policy)
@@ -44,12 +50,16 @@ def test_the_held_out_contexts_load_under_every_policy_at_their_budget() -> None
         assert (context.metric == "mission") == (scenario.mission.phases[0].phase == "track")
 
 
-def test_no_held_out_context_is_one_of_training() -> None:
-    for context in held_out().contexts:
-        scenario = scenario_of(held_out(), context, "all-4")
+def test_no_held_out_context_is_one_of_training_or_of_the_other_set() -> None:
+    first, second = (held_out(name).contexts for name in SETS)
+    assert not {c.name for c in first} & {c.name for c in second}
+    assert not {c.rho for c in first} & {c.rho for c in second}
+    for contexts, context in [(held_out(name), c) for name in SETS for c in held_out(name).contexts]:
+        scenario = scenario_of(contexts, context, "all-4")
         assert context.rho not in learn.BUDGETS
         assert scenario.fleet.formation.shape not in learn.SHAPES
         assert scenario.perception.scene.seed not in range(1000, 10**6)
+        assert (scenario.radio.tx_power_dbm, scenario.radio.path_loss_exponent) != (5, 2.4), "training's weak links"
 
 
 def test_an_unknown_field_of_a_context_is_named(tmp_path: Path) -> None:
@@ -102,6 +112,21 @@ def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: p
     assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
 
 
+def test_the_tables_fit_a_narrow_terminal() -> None:
+    """As many policies side by side as there is room for; no figure is cut off."""
+    contexts = held_out("contexts")
+    policies = list(POLICIES)
+    cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in contexts.contexts]
+    tables = list(cli_contexts._by_context(contexts, policies, cells, 80))
+    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("context", "rho")] == policies
+    console = Console(width=80, record=True, file=io.StringIO())
+    for table in tables:
+        console.print(table)
+    printed = console.export_text()
+    assert "…" not in printed
+    assert len(tables) < 8
+
+
 # --- learning ------------------------------------------------------------------------------------
 
 
@@ -125,7 +150,7 @@ def planted(rng: np.random.Generator, noise: float) -> Lesson:
 
 def test_the_fit_finds_planted_gains(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    lessons = [planted(rng, 0.002) for _ in range(200)]
+    lessons = [planted(rng, 0.002) for _ in range(3000)]
     save(tmp_path / "model.json", lessons, 0)
     model = read_model(tmp_path / "model.json")
     assert model.weights[1][0] == pytest.approx(-0.1, abs=0.002)
@@ -133,6 +158,19 @@ def test_the_fit_finds_planted_gains(tmp_path: Path) -> None:
     assert slope == pytest.approx(-0.05, abs=0.003)
     assert np.abs(np.array(model.weights[1][1:])).max() < 0.002, "what does not matter has no slope"
     assert model.weights[0] == (0.0,) * 6, "gains are over the first arm"
+
+
+def test_gains_by_phase_and_budget_by_hand() -> None:
+    def lesson(rho: float, tracking: float, *ap: float) -> Lesson:
+        return Lesson((np.log10(rho), tracking, 0.6, 2.0, 0.9), ap, "")
+
+    lessons = [
+        lesson(0.01, 0.0, 0.2, 0.1, 0.23), lesson(0.01, 0.0, 0.2, 0.1, 0.21), lesson(0.2, 1.0, 0.5, 0.5, 0.4),
+    ]  # fmt: skip
+    found = learn.gains(lessons, 2)
+    assert found.keys() == {("search", 0.01), ("track", 0.2)}
+    assert found["search", 0.01] == (pytest.approx(0.02), pytest.approx(0.01 / 2**0.5), 2)
+    assert found["track", 0.2] == (pytest.approx(-0.1), 0.0, 1)
 
 
 def test_one_lesson_leaves_no_slope() -> None:
