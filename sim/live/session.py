@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -141,9 +143,23 @@ def _start(orders: Orders) -> _Drone:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=fly_one, args=(orders, theirs), name=f"drone {orders.drone}", daemon=True)
-    process.start()
+    with _deaf():
+        process.start()
     theirs.close()  # so that our end shows when the process is gone
     return _Drone(process, ours)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """What is started here never hears Ctrl-C, not even while it still loads: a signal ignored stays so in a new process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's; `fly_one` ignores it a little later
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _meet(flown: list[_Drone], tell: Progress) -> None:
