@@ -2,14 +2,14 @@
 
 | topic | type | QoS |
 |---|---|---|
-| `/drone_0/context` | `sortie_msgs/msg/ContextDescriptor` | best effort, keep last 1 |
-| `/drone_0/directives` | `sortie_msgs/msg/DataPlaneDirective` | reliable, keep last 1 |
+| `/fleet/context` | `sortie_msgs/msg/ContextDescriptor` | best effort, keep last 1 |
+| `/drone_0/to_drone_1/directive` | `sortie_msgs/msg/DataPlaneDirective` | reliable, keep last 1 |
 | `/drone_0/pose`, `/tf` | `geometry_msgs/msg/PoseStamped`, `tf2_msgs/msg/TFMessage` | reliable, keep last 10 |
 | `/drone_0/battery` | `sensor_msgs/msg/BatteryState` | reliable, keep last 10 |
 | `/decisions` | `rcl_interfaces/msg/Log` | reliable, keep last 100 |
 
-The frame `world` is ENU in metres, `drone_0` its body in FLU. A topic a drone, since keep-last-1 on one topic of them
-all would keep one descriptor in all. The record holds no estimated pose, so a descriptor's is the true one here.
+The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sim.topics`). The
+record holds no estimated pose, so a descriptor's is the true one here.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from policies.contract import Descriptor, Directive, Disc, Representation, TaskP
 from sim.folders import replacing
 from sim.outcome import transitions
 from sim.record import SortieRecord
+from sim.topics import CONTEXT, Kind, Topic
 from sim.words import decision_in_words, event_in_words
 
 POSE, TF, BATTERY, LOG = (
@@ -176,9 +177,10 @@ def _makers(types: Any) -> SimpleNamespace:
 
 def _messages(record: SortieRecord, make: SimpleNamespace, begin_ns: int) -> Iterator[Message]:
     for t_s, d in descriptors(record):
-        yield Message(t_s, f"/drone_{d.agent_id}/context", DESCRIPTOR_NAME, encode_descriptor(d))
+        yield Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, encode_descriptor(d))
     for t_s, order in directives(record):
-        yield Message(t_s, f"/drone_{order.source}/directives", DIRECTIVE_NAME, encode_directive(order))
+        topic = Topic(Kind.DIRECTIVE, order.source, order.destination)
+        yield Message(t_s, topic.name, DIRECTIVE_NAME, encode_directive(order))
 
     def header(t_s: float, frame: str) -> Any:
         return make.Header(_time(t_s), frame)

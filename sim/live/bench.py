@@ -7,10 +7,11 @@ from collections import Counter
 
 from fleet.auth import Opened
 from fleet.cdr import MalformedDatagram
-from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, links
+from sim.live.bus import MAX_DEPTH, Bus, Reader
 from sim.live.messages import unpack_bytes
 from sim.live.node import opened
 from sim.live.reports import Count, News, Report
+from sim.topics import CONTEXT, PAYLOADS, Kind, Topic, links
 
 PAYLOAD_DEPTH = 16
 """Samples kept of a payload topic until they are taken: a bench that is late by more loses count."""

@@ -1,22 +1,9 @@
-"""The bus: topics as ROS 2 names them, their QoS as the paper maps it, and one participant's ends of them.
-
-| topic in ROS 2 | in DDS | type | QoS |
-|---|---|---|---|
-| `/fleet/context` | `rt/fleet/context` | `sortie_msgs/msg/ContextDescriptor` | best effort, keep last 1 |
-| `/drone_0/to_drone_1/directive` | `rt/drone_0/…` | `sortie_msgs/msg/DataPlaneDirective` | reliable, keep last 1 |
-| `/drone_0/to_drone_1/features` | `rt/drone_0/…` | `std_msgs/msg/UInt8MultiArray` | best effort, keep last 1 |
-| `/drone_0/to_drone_1/compact` | `rt/drone_0/…` | `std_msgs/msg/UInt8MultiArray` | reliable, keep last 1 |
-
-ROS 2 messages have no keys, so keep-last-1 keeps one sample a topic: directives and payloads have a topic a link. The
-context is one topic for the whole fleet, that who joins need not know its roster; its writers keep one sample each, as
-the paper has it, and its readers as many as there may be drones.
-"""
+"""The bus: one participant's ends of the topics of `sim.topics`, on loopback unless told otherwise."""
 
 from __future__ import annotations
 
 import os
-from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
@@ -25,8 +12,8 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME
-from sim.live.messages import BYTES_NAME, dds_type
+from sim.live.messages import dds_type
+from sim.topics import Kind, Topic
 
 LOOPBACK = """\
 <CycloneDDS><Domain Id="any">
@@ -47,56 +34,6 @@ LOOPBACK = """\
 """Cyclone's configuration where `CYCLONEDDS_URI` names none: this host alone, fragments as large as a datagram may be."""
 MAX_DEPTH = 64
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
-
-
-class Kind(StrEnum):
-    """What a topic carries."""
-
-    CONTEXT = "context"
-    DIRECTIVE = "directive"
-    FEATURES = "features"
-    COMPACT = "compact"
-
-    @property
-    def ros_type(self) -> str:
-        """The ROS 2 name of its messages' type."""
-        return {Kind.CONTEXT: DESCRIPTOR_NAME, Kind.DIRECTIVE: DIRECTIVE_NAME}.get(self, BYTES_NAME)
-
-    @property
-    def reliable(self) -> bool:
-        """Small things that must arrive go reliably, the frequent and the large best effort."""
-        return self in (Kind.DIRECTIVE, Kind.COMPACT)
-
-
-PAYLOADS = (Kind.FEATURES, Kind.COMPACT)
-
-
-class Topic(NamedTuple):
-    """One topic; a link's where it has a source and a destination."""
-
-    kind: Kind
-    source: int | None = None
-    destination: int | None = None
-
-    @property
-    def name(self) -> str:
-        """As ROS 2 nodes call it."""
-        if self.source is None:
-            return "/fleet/context"
-        return f"/drone_{self.source}/to_drone_{self.destination}/{self.kind}"
-
-    @property
-    def dds_name(self) -> str:
-        """As it is called on the bus."""
-        return f"rt{self.name}"
-
-
-CONTEXT = Topic(Kind.CONTEXT)
-
-
-def links(drones: int) -> list[tuple[int, int]]:
-    """Every (source, destination) of a fleet."""
-    return [(i, j) for i in range(drones) for j in range(drones) if i != j]
 
 
 class Reader:

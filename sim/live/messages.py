@@ -17,8 +17,8 @@ from cyclonedds.idl.types import array, float32, int32, sequence, uint8, uint16,
 
 from fleet.cdr import ENCAPSULATION, MalformedDatagram
 from fleet.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
+from sim.topics import BYTES_NAME
 
-BYTES_NAME = "std_msgs/msg/UInt8MultiArray"
 DEFINITIONS = {
     DESCRIPTOR_NAME: DESCRIPTOR_MSG,
     DIRECTIVE_NAME: DIRECTIVE_MSG,

@@ -27,9 +27,10 @@ from fleet.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
 from perception.types import Capture
 from policies.contract import Descriptor, Directive, FleetView, Policy
 from scenarios.streams import stream
-from sim.live.bus import CONTEXT, MAX_DEPTH, PAYLOADS, Bus, Kind, Reader, Topic, Writer
+from sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sim.live.messages import pack_bytes, unpack_bytes
 from sim.live.reports import Count, HealthChange, News, Order, Report
+from sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `fleet.gate`."""

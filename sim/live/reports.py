@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fleet.staleness import LinkHealth
-from sim.live.bus import Kind
+from sim.topics import Kind
 
 
 class HealthChange(NamedTuple):

@@ -12,9 +12,9 @@ from fleet.staleness import LinkHealth
 from perception.harness.claims import OVERHEAD
 from scenarios.schema import Scenario
 from sim.live.bench import Bench, Fleet
-from sim.live.bus import CONTEXT, PAYLOADS, Kind, Topic
 from sim.live.reports import HealthChange, Notice, Order
 from sim.plane import machine
+from sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
 PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
 """The paper's figures, by the claim that states them."""

@@ -24,13 +24,14 @@ from policies.contract import Descriptor, Directive, Disc, Representation, TaskP
 from sim.cli import app
 from sim.folders import RunError
 from sim.live import messages
-from sim.live.bus import CONTEXT, LOOPBACK, Bus, Kind, Topic, links
+from sim.live.bus import LOOPBACK, Bus
 from sim.live.clock import WallClock
-from sim.live.messages import BYTES_NAME, dds_name, dds_type, pack_bytes, unpack_bytes
+from sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
 from sim.live.node import opened
 from sim.live.result import LiveResult, overhead_rows
 from sim.live.session import MAX_DRONES, fly_live
 from sim.live.words import changes_in_words
+from sim.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
 
 ROOT = Path(__file__).resolve().parents[2]
 DOMAIN = os.getpid() % 200 + 20

@@ -72,11 +72,14 @@ def bag(path: Path) -> Bag:
 def test_the_reader_finds_every_message_of_the_record(bag: Bag, record: SortieRecord) -> None:
     tables = record.tables
     counts = {topic: len(messages) for topic, messages in bag.items()}
-    for topic, table in (("context", "descriptors"), ("directives", "directives"), ("pose", "states")):
-        by_drone = Counter(tables[table]["drone"].to_pylist())
-        assert {d: counts[f"/drone_{d}/{topic}"] for d in by_drone} == by_drone, topic
+    poses = Counter(tables["states"]["drone"].to_pylist())
+    assert {d: counts[f"/drone_{d}/pose"] for d in poses} == poses
+    said = Counter(tables["descriptors"]["drone"].to_pylist())
+    assert Counter(m.agent_id for _, m in bag["/fleet/context"]) == said
+    links = Counter(zip(*(tables["directives"][k].to_pylist() for k in ("drone", "peer")), strict=True))
+    assert {link: counts["/drone_{}/to_drone_{}/directive".format(*link)] for link in links} == links
     assert counts["/tf"] == tables["states"].num_rows
-    times = [t_ns for t_ns, _ in bag["/drone_2/context"]]
+    times = [t_ns for t_ns, m in bag["/fleet/context"] if m.agent_id == 2]
     expected = [d["t_s"] for d in tables["descriptors"].to_pylist() if d["drone"] == 2]
     assert [t * 1e-9 for t in times] == pytest.approx(expected, abs=1e-9)
 
@@ -104,13 +107,13 @@ def test_a_descriptor_is_the_one_that_was_sent_but_for_where_the_drone_thought_i
 
 def test_fields_come_out_as_the_record_has_them(bag: Bag, record: SortieRecord) -> None:
     row = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1][40]
-    _, m = bag["/drone_1/context"][40]
+    m = [m for _, m in bag["/fleet/context"] if m.agent_id == 1][40]
     assert (m.agent_id, m.task_phase, m.stamp.sec * 1_000_000_000 + m.stamp.nanosec) == (1, 2, row["stamp_ns"])
     assert list(m.peer_goodput) == pytest.approx(row["goodput_mbps"], rel=1e-6)
     assert list(m.region) == pytest.approx([row["region_x_m"], row["region_y_m"], 32.0, 1.0], rel=1e-6)
     assert bytes(m.coverage_grid) == row["coverage_grid"]
     order = [d for d in record.tables["directives"].to_pylist() if d["drone"] == 1][-1]
-    _, m = bag["/drone_1/directives"][-1]
+    _, m = bag[f"/drone_1/to_drone_{order['peer']}/directive"][-1]
     assert (m.source, m.destination, m.rate) == (1, order["peer"], pytest.approx(order["rate_hz"]))
     state = [s for s in record.tables["states"].to_pylist() if s["drone"] == 3][7]
     _, pose = bag["/drone_3/pose"][7]
@@ -136,19 +139,20 @@ def test_as_a_folder_it_is_a_bag_of_ros_2_with_the_paper_s_qos(path: Path, recor
     """Read by rosbags from metadata.yaml, as `ros2 bag` would; payload bytes decode by the fleet's own strict rules."""
     with AnyReader([path]) as reader:
         offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
-        assert (offered["/drone_0/context"].reliability.name, offered["/drone_0/context"].depth) == ("BEST_EFFORT", 1)
-        assert (offered["/drone_0/directives"].reliability.name, offered["/drone_0/directives"].depth) == (
-            "RELIABLE",
-            1,
-        )
+        for topic, expected in (
+            ("/fleet/context", ("BEST_EFFORT", 1)),
+            ("/drone_0/to_drone_1/directive", ("RELIABLE", 1)),
+        ):
+            assert (offered[topic].reliability.name, offered[topic].depth) == expected
         sizes = set()
         for connection, _, data in reader.messages():
             if connection.topic.endswith("/context"):
                 sizes.add(len(data))
-                assert decode_descriptor(data).agent_id == int(connection.topic[7])
-            elif connection.topic.endswith("/directives"):
+                assert 0 <= decode_descriptor(data).agent_id < 5
+            elif connection.topic.endswith("/directive"):
                 assert len(data) == 36
-                assert decode_directive(data).source == int(connection.topic[7])
+                order = decode_directive(data)
+                assert connection.topic == f"/drone_{order.source}/to_drone_{order.destination}/directive"
         assert sizes <= {180, 182}  # one priority target more is two bytes
         assert 180 in sizes
 
