@@ -13,6 +13,7 @@ from perception.harness.claims import OVERHEAD
 from scenarios.schema import Scenario
 from sim.live.bench import Bench, Fleet
 from sim.live.reports import HealthChange, Notice, Order
+from sim.pilot import named
 from sim.plane import machine
 from sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
@@ -140,7 +141,7 @@ def summary(
     ]  # fmt: skip
     return LiveResult(
         scenario=scenario.name,
-        policy=scenario.policy.name,
+        policy=named(scenario.policy.name, scenario.policy.params).name,
         drones=scenario.fleet.drones,
         begin_s=begin_s,
         flown_s=flown_s,

@@ -282,7 +282,7 @@ def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path) -> None
     for drone in result["each"]:
         came = drone["heard"] + drone["dropped_by_loss"]
         assert abs(drone["dropped_by_loss"] - came / 2) < 4 * (came / 4) ** 0.5  # four standard deviations
-    assert result["policy"] == "all-4"
+    assert result["policy"] == "all-4(rho=0.02)"
     assert {row["health"] for row in result["health"]} >= {"fresh"}
 
 
@@ -295,7 +295,8 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
 
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
-        scenario = example("fleet.drones=2", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0}")
+        changing = "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {rho: 0.05}}]}"
+        scenario = example("fleet.drones=2", changing)
         result = fly_live(scenario, loss=1.0, domain=DOMAIN, begun=interrupt)
     finally:
         signal.signal(signal.SIGALRM, before)
@@ -305,6 +306,8 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
     assert [d.heard for d in result.each] == [0, 0]
     assert all(d.published > 0 and d.dropped_by_loss > 0 for d in result.each)
     assert (result.data_bytes_per_s, result.context_share, result.health) == (0, None, [])
+    took_over = "all-4 → best-2(rho=0.05): time 0.3 s"
+    assert sorted((n.drone, n.text) for n in result.notices) == [(0, took_over), (1, took_over)]
     for pid in pids.values():
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
