@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -61,7 +62,7 @@ def test_whatever_is_flown(knobs: dict[str, Any], asked: tuple[Representation, f
     # ages: between two arrivals a descriptor grows older by the time that passes, and an arrival makes none older
     for (ego, _), seen in read.items():
         assert all(age_s >= 0.0 for *_, age_s in seen)
-        for (t0, stamp0, age0), (t1, stamp1, age1) in zip(seen, seen[1:], strict=False):
+        for (t0, stamp0, age0), (t1, stamp1, age1) in pairwise(seen):
             passed_s = (t1 - t0) * 1e-9
             jumped = ego == 1 and abs(passed_s - scenario.frame_s) > 1e-6  # its clock was set in between
             if stamp1 == stamp0 and not jumped:
