@@ -29,7 +29,7 @@ LEAST_MOVE_M = 2.0
 """A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
 SHARES = (1.0, 0.75, 0.5, 0.25)
 """What is tried of a wish before it is refused, the most first."""
-INSTANTS_S = 0.05
+INSTANTS_S = 0.1
 """At which two moves are held against each other."""
 JITTERS = 5.0
 """Places keep so many standard deviations of the pose jitter off the bounds, so that the drones keep them."""
@@ -234,22 +234,37 @@ def _too_near(drone: int, move: Move, plans: Sequence[Plan], course: Course, bou
             if _distance_m(apart + move.start_m, apart + move.end_m) < least:
                 return other
             continue
+        last = plan[-1]
+        if math.dist(*_middles(course, drone, move, other, last)) - (move.length_m + last.length_m) / 2 >= least:
+            continue
+        if move.begin_s == last.begin_s and math.isclose(move.width_s, last.width_s, rel_tol=1e-12):
+            begin, end = (apart + np.subtract(a, b) for a, b in zip(move[2:], last[2:], strict=True))
+            if _distance_m(begin, end) < least:  # in step: one moves straight past the other
+                return other
+            continue
         # both move: instants, and no nearer in between than speed and acceleration allow
         end_s = max(move.end_s, plan[-1].end_s)
         time_s = np.linspace(move.begin_s, end_s, max(2, math.ceil((end_s - move.begin_s) / INSTANTS_S) + 1))
         ours, theirs = shifts((move,), time_s), shifts(plan, time_s)
         way, rate = apart + move.start_m + ours[0] - theirs[0], np.linalg.norm(ours[1] - theirs[1], axis=-1)
         half_s = 0.5 * (time_s[1] - time_s[0])
-        between_m = rate * half_s + (move.acceleration_mps2 + plan[-1].acceleration_mps2) * half_s**2 / 2
+        between_m = rate * half_s + (move.acceleration_mps2 + last.acceleration_mps2) * half_s**2 / 2
         if float((np.linalg.norm(way, axis=-1) - between_m).min()) < least:
             return other
     return None
 
 
+def _middles(course: Course, drone: int, move: Move, other: int, theirs: Move) -> tuple[Array, Array]:
+    """The middles of two drones' moves, in the formation's frame."""
+    ours_m = course.slot_m[drone] + 0.5 * np.add(move.start_m, move.end_m)
+    return ours_m, course.slot_m[other] + 0.5 * np.add(theirs.start_m, theirs.end_m)
+
+
 def _distance_m(a: Array, b: Array) -> float:
     """From the origin to a segment."""
     along = b - a
-    t = float(np.clip(-(a @ along) / (along @ along), 0.0, 1.0))
+    length2 = float(along @ along)
+    t = min(1.0, max(0.0, -float(a @ along) / length2)) if length2 > 0.0 else 0.0
     return float(np.hypot(*(a + t * along)))
 
 

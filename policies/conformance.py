@@ -249,6 +249,7 @@ def _looks(policy: Policy, view: FleetView) -> str | None:
     """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
     look = viewpoint_of(policy)
     if look is None:
+        _ask(policy, view)
         return None
     shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
     try:

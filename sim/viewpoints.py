@@ -14,6 +14,8 @@ from policies.contract import Reposition
 from scenarios.schema import Scenario
 from sim.world import World
 
+RETRY_S = 1.0
+"""A wish that was refused is looked at again after so long: the others have hardly moved on before."""
 EVENT = "viewpoint"
 """The kind under which grants and refusals stand among the record's events."""
 
@@ -34,6 +36,8 @@ class Choreography:
         self._frame = 0
         self._wishes: dict[int, tuple[float, float, str]] = {}
         self._told: dict[int, str] = {}
+        self._again_at: dict[int, int] = {}
+        self._retry_frames = max(1, round(RETRY_S / scenario.frame_s))
         self.plans: list[Plan] = [()] * scenario.fleet.drones
 
     def ask(self, drone: int, asked: Reposition | None) -> None:
@@ -49,7 +53,8 @@ class Choreography:
     def renew(self, frame: int) -> None:
         """Grant what can be granted, to begin with this frame; call it before anything else looks at the frame."""
         self._frame = frame
-        asking = [i for i in sorted(self._wishes) if self._world.agents[i].airborne]
+        agents, again_at = self._world.agents, self._again_at
+        asking = [i for i in sorted(self._wishes) if agents[i].airborne and frame >= again_at.get(i, 0)]
         if self._fixed:
             for drone in asking:
                 self._tell(drone, "holds its slot: a drone of the fleet flies a recorded pose")
@@ -81,6 +86,7 @@ class Choreography:
             self._told.pop(drone, None)
             self._world.note(drone, EVENT, f"{what}, to {x_m:+.1f} m ahead and {y_m:+.1f} m left of its slot: {reason}")
         elif answer is not None:
+            self._again_at[drone] = self._frame + self._retry_frames
             self._tell(drone, f"stays, {answer}: {reason}")
 
     def _tell(self, drone: int, text: str) -> None:

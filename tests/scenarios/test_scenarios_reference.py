@@ -109,6 +109,7 @@ def test_units_stand_in_names() -> None:
         "s",
         "hz",
         "mps",
+        "mps2",
         "db",
         "dbm",
         "ghz",
