@@ -44,6 +44,10 @@ def paper(
     against: Annotated[
         Path | None, typer.Option(help="Another report's folder: tell which verdicts differ from its.")
     ] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(help="What `sortie live --out` wrote: processor time and data plane of real processes."),
+    ] = None,
     readme: Annotated[Path | None, typer.Option(help="Write this file's results section anew.")] = None,
     frame: Annotated[
         int | None, typer.Option(help="Only open this frame in Rerun, as in the paper's data figure.", min=0)
@@ -68,7 +72,7 @@ def paper(
     try:
         asked = Asked(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
-        job = making.Job(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context))
+        job = making.Job(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live)
         if frame is not None:
             _open_frame(
                 making.frame_picture(job, work, frame, ego),
@@ -178,7 +182,10 @@ def _command(context: typer.Context) -> str:
     given = []
     for parameter in context.command.params:
         name, value = parameter.name, context.params.get(parameter.name or "")
-        if name in ("frames", "seed", "weights", "unsent", "cells_by", "tau", "scenes") and value != parameter.default:
+        if (
+            name in ("frames", "seed", "weights", "unsent", "cells_by", "tau", "scenes", "live")
+            and value != parameter.default
+        ):
             shown = value.name if isinstance(value, Path) else value
             given.append(parameter.opts[0] if value is True else f"{parameter.opts[0]} {shown}")
     return " ".join(["sortie paper", *given])

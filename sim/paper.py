@@ -20,7 +20,7 @@ from perception.harness.picture import PAPER_BUDGETS, Picture, picture
 from perception.harness.rows import Point, Row
 from perception.harness.sensitivity import Varied, sensitivity
 from sim.folders import ensure_folder, put_between, replacing
-from sim.plane import machine, measure_plane
+from sim.plane import machine, measure_plane, measured_live
 from sim.sortie import VERSION
 
 REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
@@ -49,6 +49,8 @@ class Job:
     """Frames worked on side by side; nothing but time depends on it."""
     command: str = "sortie paper"
     """As it was given, for the report."""
+    live: Path | None = None
+    """What `sortie live --out` wrote: it answers two claims that a simulated flight cannot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,7 @@ def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None
         ValueError: weights that are missing or do not fit, more frames than the split has.
     """
     wall_s, cpu_s = time.perf_counter(), _cpu_s()
+    on_the_bus = {} if job.live is None else measured_live(job.live)
     instrument = CarNetInstrument.load(job.weights)
     frames = bench_frames(job.seed, job.frames, work / "bench", lambda done, of: progress("test scenes", done, of))
     found = measure(
@@ -79,7 +82,7 @@ def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None
         workers=job.workers,
         progress=lambda done, of: progress("frames", done, of),
     )
-    plane = measure_plane(lambda t_s: progress("replay", round(t_s), 120))
+    plane = {**measure_plane(lambda t_s: progress("replay", round(t_s), 120)), **on_the_bus}
     progress("verdicts", 0, 1)
     scores = found.all_scores()
     table, points = rows.judge(scores, plane), rows.points(scores)

@@ -7,6 +7,7 @@ its payloads handed to a radio. Names are those that the claims ask for (`percep
 from __future__ import annotations
 
 import gc
+import json
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -135,6 +136,29 @@ def latency(decide: Policy, views: Sequence[FleetView], scenario: Scenario) -> d
         "policy_ms_p99": Measured(p99, note=note),
         "deadline_over_p50": Measured(PAPER_DEADLINE_MS / p50),
     }
+
+
+def measured_live(path: Path) -> dict[str, Measured]:
+    """What a live flight measured of the claims that take real processes on a real bus; the file is `sortie live --out`'s.
+
+    Raises:
+        ValueError: the file cannot be read, or is none of these.
+    """
+    try:
+        told = json.loads(path.read_text("utf-8"))
+        note = (
+            f"{told['drones']} processes on Cyclone DDS, {told['policy']}, {told['flown_s']:.0f} s, {told['machine']}"
+        )
+        core = Measured(
+            float(told["drones_cpu_percent"]), note=f"{note}; the bench took {told['bench_cpu_percent']:.0f} %"
+        )
+        data = Measured(float(told["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not what sortie live --out writes") from error
+    on_x86 = platform.machine().lower() in ("x86_64", "amd64")
+    return {"ros2_core_percent": core, **({"x86_container_mb_per_s": data} if on_x86 else {})}
 
 
 def machine() -> str:

@@ -15,6 +15,8 @@ from test_sim_cli import command
 
 from perception.geometry import CELLS, FULL
 from perception.harness import report, rows
+from perception.harness.claims import OVERHEAD
+from perception.harness.measures import Elsewhere
 from perception.harness.picture import Picture
 from perception.harness.sensitivity import Varied
 from perception.types import Boxes
@@ -70,6 +72,33 @@ def test_rates_are_those_of_the_record() -> None:
     flown = sum(record.tables["descriptors"]["wire_bytes"].to_pylist()) + 36 * record.totals["directives"]
     assert got["context_kb_per_s"].value == pytest.approx(flown / 6 / 1e3)
     assert got["context_percent"].value == pytest.approx(100 * flown / sent)
+
+
+def test_a_live_flight_answers_what_takes_real_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = tmp_path / "live.json"
+    told.write_text(
+        '{"drones": 4, "policy": "worked", "flown_s": 120.0, "machine": "a computer", "drones_cpu_percent": 11.4, '
+        '"bench_cpu_percent": 4.6, "data_bytes_per_s": 18002300.0}'
+    )
+    monkeypatch.setattr(plane.platform, "machine", lambda: "x86_64")
+    found = plane.measured_live(told)
+    assert (found["ros2_core_percent"].value, found["x86_container_mb_per_s"].value) == (11.4, 18.0023)
+    assert found["ros2_core_percent"].note == (
+        "4 processes on Cyclone DDS, worked, 120 s, a computer; the bench took 5 %"
+    )
+    names = {c.measure.name for c in OVERHEAD if isinstance(c.measure, Elsewhere)}
+    assert set(found) <= names
+    monkeypatch.setattr(plane.platform, "machine", lambda: "aarch64")
+    assert set(plane.measured_live(told)) == {"ros2_core_percent"}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"drones": 4}'])
+def test_a_file_that_no_live_flight_wrote_is_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "live.json").write_text(text)
+    with pytest.raises(ValueError, match=r"live\.json: not what sortie live --out writes$"):
+        plane.measured_live(tmp_path / "live.json")
+    with pytest.raises(ValueError, match=r"gone\.json: No such file or directory$"):
+        plane.measured_live(tmp_path / "gone.json")
 
 
 def test_latency_is_of_a_tick_of_the_whole_fleet() -> None:
