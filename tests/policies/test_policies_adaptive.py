@@ -37,7 +37,7 @@ def test_arms_by_hand() -> None:
 
 def test_no_more_is_sent_than_the_air_carries() -> None:
     """Half a drone's goodput for all its links, rounded down in steps of √2; by hand, a map is 5.24 Mb."""
-    assert a.MAP_MB == pytest.approx(5.24288)
+    assert pytest.approx(5.24288) == a.MAP_MB
     me = fleet_of(5, goodput=52.4288).descriptors[0]
     assert a.carried(me, (1, 2, 3, 4)) == pytest.approx(0.125)  # 26.2 of 4 × 52.4 Mb/s, exactly a step
     assert a.carried(me, (1, 2)) == pytest.approx(0.25)
