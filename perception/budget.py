@@ -8,6 +8,7 @@ pose and directive alone, so traffic is exact without running the detector.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -36,10 +37,8 @@ def index_bytes(cells: int) -> int:
     return 0 if cells >= CELLS else min(CELLS // 8, math.ceil(cells * 12 / 8))
 
 
-@lru_cache(maxsize=1)
-def _centres_m() -> np.ndarray:
-    """[64] centres along either axis of the sender's levelled frame: x forward (rows), y left (columns)."""
-    return (np.arange(GRID) + 0.5 - GRID / 2) * CELL_M
+_CENTRES_M = tuple((i + 0.5 - GRID / 2) * CELL_M for i in range(GRID))
+"""Along either axis of the sender's levelled frame: x forward (rows), y left (columns)."""
 
 
 def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> np.ndarray:
@@ -47,8 +46,8 @@ def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw
     if roi is None:
         return np.ones((GRID, GRID), bool)
     mask = np.zeros((GRID, GRID), bool)
-    rows, columns, inside = _window(roi, x_m, y_m, yaw_rad)
-    mask[rows, columns] = inside
+    rows, columns, room, aside = _window(roi, x_m, y_m, yaw_rad)
+    mask[rows, columns] = np.array(aside) <= np.array(room)[:, None]
     return mask
 
 
@@ -58,7 +57,9 @@ def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y
     budget = math.floor(rho * CELLS + 1e-9)
     if roi is None or budget == 0:
         return budget
-    return min(budget, int(np.count_nonzero(_window(roi, x_m, y_m, yaw_rad)[2])))
+    _, _, room, aside = _window(roi, x_m, y_m, yaw_rad)
+    aside.sort()
+    return min(budget, sum([bisect_right(aside, left) for left in room]))
 
 
 def must_choose(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
@@ -67,15 +68,18 @@ def must_choose(rho: float, roi: tuple[float, float, float] | None, x_m: float, 
     return math.floor(rho * CELLS + 1e-9) < candidates
 
 
-def _window(roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float) -> tuple[slice, slice, np.ndarray]:
-    """The rows and columns that a disc can touch, and which of their cells have their centres in it."""
+def _window(
+    roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float
+) -> tuple[slice, slice, list[float], list[float]]:
+    """The rows and columns that a disc can touch; what each row leaves of the squared radius, and each column's squared
+    distance from the centre: a cell is inside where the second is at most the first. Lists: there are some twenty."""
     dx, dy, radius_m = roi[0] - x_m, roi[1] - y_m, roi[2]
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     forward_m, left_m = c * dx + s * dy, -s * dx + c * dy
     rows, columns = _span(forward_m, radius_m), _span(left_m, radius_m)
-    along = _centres_m()
-    ahead, aside = along[rows] - forward_m, along[columns] - left_m
-    return rows, columns, np.add.outer(ahead * ahead, aside * aside) <= radius_m**2
+    square = radius_m * radius_m
+    room = [square - (x - forward_m) * (x - forward_m) for x in _CENTRES_M[rows]]
+    return rows, columns, room, [(y - left_m) * (y - left_m) for y in _CENTRES_M[columns]]
 
 
 def _span(centre_m: float, radius_m: float) -> slice:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,7 @@ class Block:
     bodies: Bodies
 
 
+@lru_cache(maxsize=1024)  # sorties that are compared fly over the same town
 def block(scene: Scene, i: int, j: int) -> Block:
     """The content of block (i, j).
 
