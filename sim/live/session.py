@@ -80,7 +80,6 @@ def fly_live(
     bench, fleet = Bench(domain, drones), Fleet()
     flown: list[_Drone] = []
     lost: list[Lost] = []
-    interrupted = False
     t_s = begin_s
     try:
         for i, trace in enumerate(found):
@@ -93,8 +92,8 @@ def fly_live(
         time.sleep(LEAD_S)
         if begun is not None:
             begun({i: d.process.pid or 0 for i, d in enumerate(flown)})
-        try:
-            while not all(d.over for d in flown):
+        with _told_to_stop() as stop:
+            while not (stop.is_set() or all(d.over for d in flown)):
                 t_s = min(end_s, begin_s + time.monotonic() - go.monotonic_s)
                 if kill is not None and t_s >= kill[1]:
                     _kill(flown[kill[0]].process)
@@ -103,8 +102,8 @@ def fly_live(
                 bench.take()
                 _collect(flown, fleet, lost, t_s)
                 tell("in the air", t_s - begin_s, end_s - begin_s)
-        except KeyboardInterrupt:
-            interrupted = True
+        interrupted = stop.is_set()
+        if interrupted:
             _stop(flown)
             _collect(flown, fleet, lost, t_s)
         if not fleet.last:
@@ -147,6 +146,20 @@ def _start(orders: Orders) -> _Drone:
         process.start()
     theirs.close()  # so that our end shows when the process is gone
     return _Drone(process, ours)
+
+
+@contextmanager
+def _told_to_stop() -> Iterator[threading.Event]:
+    """Ctrl-C as something to ask for: an exception would be lost where it strikes while the bus frees a sample."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: stop.set())
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
