@@ -18,7 +18,9 @@ def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> f
 
     Source: the lens formula (Weisstein, "Circle-Circle Intersection").
     """
-    small, large = (radius_a_m, radius_b_m) if radius_a_m <= radius_b_m else (radius_b_m, radius_a_m)
+    small, large = radius_a_m, radius_b_m
+    if small > large:
+        small, large = large, small
     if small <= 0 or distance_m >= small + large:
         return 0.0
     if distance_m <= large - small:

@@ -10,6 +10,8 @@ LOW_BATTERY = 0.30
 FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
 MIN_GOODPUT_MBPS = 5.0
 TOP_PEERS = 2
+TRACK = TaskPhase.TRACK
+FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS  # slow to look up, each time
 NOT_CHOSEN = f"not among the {TOP_PEERS} most overlapping peers"
 
 
@@ -27,23 +29,23 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     if me is None:
         return []
     if me.battery_soc >= HIGH_BATTERY:
-        rung, rate_hz, why = Representation.FEATURES, FULL_RATE_HZ, "battery ≥ 60 %"
+        rung, rate_hz, why = FEATURES, FULL_RATE_HZ, "battery ≥ 60 %"
     elif me.battery_soc >= LOW_BATTERY:
-        rung, rate_hz, why = Representation.FEATURES, HALF_RATE_HZ, "battery < 60 %"
+        rung, rate_hz, why = FEATURES, HALF_RATE_HZ, "battery < 60 %"
     else:
-        rung, rate_hz, why = Representation.DETECTIONS, SLOW_RATE_HZ, "battery < 30 %"
-    roi = me.region if me.task_phase == TaskPhase.TRACK else None
+        rung, rate_hz, why = DETECTIONS, SLOW_RATE_HZ, "battery < 30 %"
+    roi = me.region if me.task_phase == TRACK else None
     if roi is not None:
         why += f", track: ROI {roi.radius_m:.0f} m"
     ego, chosen = view.ego, peers_by_overlap(view)[:TOP_PEERS]
-    budget = rho if rung == Representation.FEATURES else 0.0
+    budget = rho if rung == FEATURES else 0.0
     directives = []
     for peer in view.peers:
         if peer not in chosen:
             directives.append(nothing(ego, peer, NOT_CHOSEN))
         elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
             weak = f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
-            low = min(rung, Representation.DETECTIONS)
+            low = min(rung, DETECTIONS)
             directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
         else:
             directives.append(Directive(ego, peer, rung, budget, roi, rate_hz, reason=why))
