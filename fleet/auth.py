@@ -26,7 +26,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from fleet.cdr import MalformedDatagram
-from fleet.compact import MAGIC, MIN_COMPACT_BYTES
+from fleet.compact import MARK, MIN_COMPACT_BYTES
 from fleet.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
 from policies.contract import Descriptor
 
@@ -35,7 +35,6 @@ MIN_KEY_BYTES = 16
 _STAMP = struct.Struct("<IQ")  # key id, counter
 TRAILER_BYTES = _STAMP.size + TAG_BYTES
 MAX_COUNTER = 2**64 - 1
-_COMPACT = bytes([MAGIC])
 
 
 class DropReason(StrEnum):
@@ -127,7 +126,7 @@ def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dro
     size = len(data) - trailer
     if size > MAX_DESCRIPTOR_BYTES:
         return Dropped(DropReason.OVERSIZED, f"payload of {size} B, must be at most {MAX_DESCRIPTOR_BYTES}")
-    least = MIN_COMPACT_BYTES if data[:1] == _COMPACT else MIN_DESCRIPTOR_BYTES
+    least = MIN_COMPACT_BYTES if data[:1] == MARK else MIN_DESCRIPTOR_BYTES
     if size < least:
         return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {least + trailer}")
     key_id, counter, payload = None, 0, data

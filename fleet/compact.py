@@ -22,6 +22,7 @@ from fleet.coverage import pack_grid, unpack_grid
 from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
 
 MAGIC = 0xC0
+MARK = bytes([MAGIC])
 GRID_CELLS, GRID_BITS, NUMBER_BITS = (0, 4, 8, 16), (1, 2), (8, 10, 12, 16, 24, 32)
 _HEAD = struct.Struct("<4BiI5B")
 MIN_COMPACT_BYTES = _HEAD.size

@@ -110,13 +110,11 @@ def judge(
     seen_per_metre = _metres_seen_per_metre_up(known)
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / s.seconds for i, s in before.items()}
-    in_order = sorted(fell_per_s.values())
     after = dict(standings)
     for peer, claim in known.items():
         standing = before[peer]
-        others = in_order.copy()
-        others.remove(fell_per_s[peer])
-        others_fell = _middle(others) * standing.seconds if others else 0.0
+        others = [rate for i, rate in fell_per_s.items() if i != peer]
+        others_fell = median(others) * standing.seconds if others else 0.0
         doubt = peer != ego and (
             (math.isfinite(form.blur_m) and coverage_doubt(claim, seen_per_metre, form.blur_m))
             or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
@@ -204,12 +202,6 @@ def battery_doubt(
     if others_fell >= FALL + 3 * soc_step and fell < FALL_SHARE * others_fell:
         return f"battery: fell by {fell:.1%} while the fleet's fell by {others_fell:.1%}"
     return ""
-
-
-def _middle(ascending: Sequence[float]) -> float:
-    """The median of what is sorted already, at least one number."""
-    half = len(ascending) // 2
-    return ascending[half] if len(ascending) % 2 else (ascending[half - 1] + ascending[half]) / 2
 
 
 def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:

@@ -13,7 +13,7 @@ from importlib.resources import files
 from math import isfinite
 
 from fleet.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
-from fleet.compact import MAGIC, decode_compact
+from fleet.compact import MARK, decode_compact
 from policies.contract import (
     MAX_DEADLINE_S,
     MAX_RATE_HZ,
@@ -37,7 +37,6 @@ DIRECTIVE_MSG = (_MSGS / "DataPlaneDirective.msg").read_text("utf-8")
 _TIME = [("i", 1), ("I", 1)]
 _FRONT = [*_TIME, ("B", 1), ("f", 3), ("f", 4), ("f", 3), ("f", 1), ("f", 3)]
 _BACK = [("s", COVERAGE_BYTES), ("B", 1), ("B", 1), ("f", 4), ("I", 1)]
-_COMPACT = bytes([MAGIC])  # CDR begins with 0
 _COUNT = struct.Struct("<I")
 _GOODPUT_COUNT_AT = layout(*_FRONT, ("I", 1))[1][-1]
 _TARGET_COUNT_AT = layout(*_FRONT, ("I", 1), *_BACK)[1][-1]  # without peers; each moves it by 4 B
@@ -120,7 +119,7 @@ def decode_descriptor(data: bytes) -> Descriptor:
     size = len(data)
     if size > MAX_DESCRIPTOR_BYTES:
         raise MalformedDatagram(f"{size} B, must be at most {MAX_DESCRIPTOR_BYTES}")
-    if data[:1] == _COMPACT:
+    if data[:1] == MARK:
         return decode_compact(data)
     if size < MIN_DESCRIPTOR_BYTES:
         raise MalformedDatagram(f"{size} B, must be at least {MIN_DESCRIPTOR_BYTES}")

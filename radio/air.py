@@ -25,7 +25,8 @@ from radio.broadcasts import Broadcast, Broadcasts, OnHeard
 from radio.channel import Channel, FloatArray, Jammer, SampleLuck
 from radio.counters import Counters
 from radio.goodput import Goodput
-from radio.medium import End, Medium
+from radio.jobs import End
+from radio.medium import Medium
 from radio.overrides import Overrides
 from radio.relay import Routes
 from radio.sample import IntArray, Sample, Service

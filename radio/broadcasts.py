@@ -8,7 +8,8 @@ from math import inf
 from radio.airtime import frame_bytes, group_frame_s
 from radio.channel import Channel
 from radio.counters import Counters
-from radio.medium import CW_CONTEXT, GroupFrame
+from radio.jobs import GroupFrame
+from radio.medium import CW_CONTEXT
 from radio.overrides import Overrides
 from scenarios.schema import Radio
 from scenarios.streams import stream

@@ -20,7 +20,7 @@ from radio.airtime import (
     tries,
 )
 from radio.contention import contention
-from radio.medium import Job
+from radio.jobs import Job
 from radio.overrides import LinkNow
 from radio.rate_control import Minstrel
 from radio.rates import STANDARDS, rate_table, rescale
@@ -95,9 +95,7 @@ class Sample(Job):
     ) -> None:
         """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
         the sender had got through when this was written; the rest as in `Air.send`."""
-        self.number, self.sender, self.deadline_s = number, sender, deadline_s  # as Job, in one go
-        self.remaining, self.granted_s, self.t_start_s, self.live = 1.0, 0.0, nan, True
-        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = self.need_s = 0.0
+        super().__init__(number, sender, deadline_s)
         self.receiver = receiver  # of this hop, as `sender`
         self.origin, self.target = sender, receiver
         self.hops = 1

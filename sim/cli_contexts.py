@@ -33,20 +33,9 @@ def compare_contexts(contexts: Contexts, policies: Sequence[str], sets: Sequence
     for table in _by_context(contexts, policies, cells, out.width):
         out.print(table)
     fixed = best_fixed(rows)
-    table = Table(
-        "policy",
-        "AP",
-        f"over {fixed}, 95 %",
-        "oracle",
-        "data",
-        "kJ",
-        "missed",
-        title="all contexts",
-        box=SIMPLE,
-        padding=(0, 1, 0, 0),
-    )
-    for column in table.columns:
-        column.no_wrap = True
+    table = _figures(
+        "all contexts", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
+    )  # fmt: skip
     for r in rows:
         gain, low, high = (100 * g for g in r.gain)
         table.add_row(
@@ -74,16 +63,7 @@ def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cel
         few = [rest.pop(0)]
         while rest and sum(max(len(p), 5) + 2 for p in (*few, rest[0])) <= left:
             few.append(rest.pop(0))
-        table = Table(
-            "context",
-            "rho",
-            *few,
-            title="AP@0.5; of the mission where the fleet tracks",
-            box=SIMPLE,
-            padding=(0, 1, 0, 0),
-        )
-        for column in table.columns:
-            column.no_wrap = True
+        table = _figures("AP@0.5; of the mission where the fleet tracks", "context", "rho", *few)
         for c in contexts.contexts:
             best = max(at[p, c.name] for p in policies)
             figures = (at[p, c.name] for p in few)
@@ -91,6 +71,14 @@ def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cel
                 c.name, f"{c.rho:g}", *(f"[bold]{a:.3f}[/bold]" if a == best else f"{a:.3f}" for a in figures)
             )
         yield table
+
+
+def _figures(title: str, *columns: str) -> Table:
+    """A narrow table whose cells stay whole."""
+    table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0))
+    for column in columns:
+        table.add_column(column, no_wrap=True)
+    return table
 
 
 def learn(

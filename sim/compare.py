@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from perception.ap import Matched
 from perception.harness.statistics import compare as bootstrap
 from policies.registry import resolve
 from scenarios.schema import Scenario
@@ -52,17 +53,44 @@ def compare(
     return rows
 
 
+def pair_up(
+    a: Sequence[SortieRecord],
+    b: Sequence[SortieRecord],
+    *,
+    mission: bool,
+    begin_s: float = 0.0,
+    leaving_out: Collection[int] = (),
+    whole_sorties: bool = False,
+) -> tuple[list[Matched], list[Matched], list[int]]:
+    """Fusions that two arms of sorties both scored, side by side, and what the bootstrap may not part.
+
+    Args:
+        a, b: records in pairs.
+        mission, begin_s: as for `matched`.
+        leaving_out: drones that are not counted.
+        whole_sorties: those of one sortie stand or fall together; else those of one instant.
+    """
+    first: list[Matched] = []
+    second: list[Matched] = []
+    groups: list[int] = []
+    instants: dict[tuple[int, float], int] = {}
+    for k, (one, other) in enumerate(zip(a, b, strict=True)):
+        ours, theirs = (matched(r, mission=mission, begin_s=begin_s) for r in (one, other))
+        for t_s, drone in ours:
+            if (t_s, drone) in theirs and drone not in leaving_out:
+                first.append(ours[t_s, drone])
+                second.append(theirs[t_s, drone])
+                groups.append(k if whole_sorties else instants.setdefault((k, t_s), len(instants)))
+    return first, second, groups
+
+
 def _gain(record: SortieRecord, first: SortieRecord | None) -> dict[str, tuple[float, float, float] | None]:
-    """Paired over fusions that both sorties scored; those of one instant stand or fall together in the bootstrap."""
     gains: dict[str, tuple[float, float, float] | None] = {"full_scene": None, "mission": None}
     if first is None:
         return gains
     for name, mission in (("full_scene", False), ("mission", True)):
-        ours, theirs = matched(record, mission=mission), matched(first, mission=mission)
-        both = [key for key in ours if key in theirs]
-        if both:
-            instants = {t_s: i for i, t_s in enumerate(dict.fromkeys(t_s for t_s, _ in both))}
-            groups = [instants[t_s] for t_s, _ in both]
-            d = bootstrap([theirs[k] for k in both], [ours[k] for k in both], groups)
+        theirs, ours, groups = pair_up([first], [record], mission=mission)
+        if groups:
+            d = bootstrap(theirs, ours, groups)
             gains[name] = (d.delta, d.low, d.high)
     return gains

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from perception.ap import Matched
 from perception.harness.statistics import Difference, compare
 from scenarios.load import library, load
-from sim.outcome import matched, outcome
+from sim.compare import pair_up
+from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
@@ -42,18 +42,18 @@ class LiarRow:
 def measure(seeds: Sequence[int], duration_s: float, policies: Sequence[str] = POLICIES) -> Iterator[LiarRow]:
     """One row a policy and lie."""
     for policy in policies:
-        honest = {seed: _flown(policy, seed, duration_s, "true") for seed in seeds}
+        honest = [_flown(policy, seed, duration_s, "true") for seed in seeds]
         for about, claim in LIES:
             lie = f"events=[{{kind: lie, at_s: {SINCE_S}, drone: {LIAR}, about: {about}, claim: {claim}}}]"
             without, trusting = (
-                {seed: _flown(policy, seed, duration_s, trust, lie) for seed in seeds} for trust in ("false", "true")
+                [_flown(policy, seed, duration_s, trust, lie) for seed in seeds] for trust in ("false", "true")
             )
-            doubts = [outcome(r)["distrusted_by"] for r in trusting.values()]
+            doubts = [outcome(r)["distrusted_by"] for r in trusting]
             yield LiarRow(
                 policy,
                 f"{about}: {claim}",
-                _difference(honest, without),
-                _difference(honest, trusting),
+                _lost(honest, without),
+                _lost(honest, trusting),
                 sum(d.get(str(LIAR), 0) for d in doubts),
                 sum(n for d in doubts for peer, n in d.items() if peer != str(LIAR)),
             )
@@ -84,17 +84,9 @@ def _flown(policy: str, seed: int, duration_s: float, trust: str, *more: str) ->
     return run_sortie(scenario, None, seed)
 
 
-def _difference(a: dict[int, SortieRecord], b: dict[int, SortieRecord]) -> Difference:
-    pairs: list[tuple[Matched, Matched]] = []
-    groups: list[int] = []
-    instants: dict[tuple[int, float], int] = {}
-    for seed, first in a.items():
-        ours, theirs = matched(first, mission=False, begin_s=SINCE_S), matched(b[seed], mission=False, begin_s=SINCE_S)
-        for t_s, drone in ours:
-            if drone != LIAR and (t_s, drone) in theirs:
-                pairs.append((ours[t_s, drone], theirs[t_s, drone]))
-                groups.append(instants.setdefault((seed, t_s), len(instants)))
-    return compare([p for p, _ in pairs], [p for _, p in pairs], groups)
+def _lost(honest: Sequence[SortieRecord], lied_to: Sequence[SortieRecord]) -> Difference:
+    """AP of the others, from when the liar begins."""
+    return compare(*pair_up(honest, lied_to, mission=False, begin_s=SINCE_S, leaving_out={LIAR}))
 
 
 def table(rows: Sequence[LiarRow], sorties: int) -> str:

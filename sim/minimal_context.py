@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from perception.ap import Matched
 from perception.harness.statistics import Difference, compare
 from scenarios.load import load
-from sim.outcome import matched, outcome
+from sim.compare import pair_up
+from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
@@ -66,26 +66,13 @@ def measure(
                 form,
                 sum(f["context_descriptors"] for f in figures) / over_s,
                 sum(f["data_sent"] for f in figures) / over_s,
-                _difference(first, records),
+                compare(*pair_up(first, records, mission=False)),
             )
 
 
 def _flown(policy: str, seed: int, duration_s: float, settings: Sequence[str]) -> SortieRecord:
     fixed = [f"duration_s={duration_s:g}", "perception.detector=surrogate", "expect=[]", "expect_decisions=[]"]
     return run_sortie(load(SCENARIO, [*fixed, *settings]), policy, seed)
-
-
-def _difference(a: Sequence[SortieRecord], b: Sequence[SortieRecord]) -> Difference:
-    pairs: list[tuple[Matched, Matched]] = []
-    instants: dict[tuple[int, float], int] = {}
-    groups: list[int] = []
-    for k, (first, second) in enumerate(zip(a, b, strict=True)):
-        ours, theirs = matched(first, mission=False), matched(second, mission=False)
-        for key in ours:
-            if key in theirs:
-                pairs.append((ours[key], theirs[key]))
-                groups.append(instants.setdefault((k, key[0]), len(instants)))
-    return compare([p for p, _ in pairs], [p for _, p in pairs], groups)
 
 
 def table(rows: Sequence[ContextRow]) -> str:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.coverage import footprint_radius_m
-from perception.ap import Matched
 from perception.harness.statistics import Difference, compare
 from scenarios.load import load
 from scenarios.schema import Scenario
+from sim.compare import pair_up
 from sim.contexts import paired_interval
-from sim.outcome import matched, outcome
+from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 from sim.viewpoints import EVENT
@@ -142,14 +142,7 @@ def _gain(arms: np.ndarray) -> Interval:
 
 def _difference(a: Sequence[SortieRecord], b: Sequence[SortieRecord], *, mission: bool) -> Difference:
     """AP while tracking; whole sorties are resampled."""
-    pairs: list[tuple[Matched, Matched]] = []
-    groups: list[int] = []
-    for k, (first, second) in enumerate(zip(a, b, strict=True)):
-        ours, theirs = (matched(r, mission=mission, begin_s=TRACKING_FROM_S) for r in (first, second))
-        for key in sorted(ours.keys() & theirs.keys()):
-            pairs.append((ours[key], theirs[key]))
-            groups.append(k)
-    return compare([p for p, _ in pairs], [p for _, p in pairs], groups)
+    return compare(*pair_up(a, b, mission=mission, begin_s=TRACKING_FROM_S, whole_sorties=True))
 
 
 def table(rows: Sequence[RepositionRow]) -> str:

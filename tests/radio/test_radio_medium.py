@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from radio.airtime import Exchanges
 from radio.contention import DIFS_S, SLOT_S, contention
-from radio.medium import AIFS_CONTEXT_S, End, GroupFrame, Job, Medium
+from radio.jobs import End, GroupFrame, Job
+from radio.medium import AIFS_CONTEXT_S, Medium
 
 ONE_MS = Exchanges(4, 0.9e-3, 1e-3)
 
