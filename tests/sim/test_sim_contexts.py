@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -29,7 +30,7 @@ contexts:
 """
 
 
-SETS = ("contexts", "contexts_second")
+SETS = ("contexts", "contexts_second", "contexts_third")
 
 
 def held_out(name: str) -> Contexts:
@@ -50,10 +51,10 @@ def test_the_held_out_contexts_load_under_every_policy_at_their_budget(name: str
         assert (context.metric == "mission") == (scenario.mission.phases[0].phase == "track")
 
 
-def test_no_held_out_context_is_one_of_training_or_of_the_other_set() -> None:
-    first, second = (held_out(name).contexts for name in SETS)
-    assert not {c.name for c in first} & {c.name for c in second}
-    assert not {c.rho for c in first} & {c.rho for c in second}
+def test_no_held_out_context_is_one_of_training_or_of_another_set() -> None:
+    for first, second in itertools.combinations([held_out(name).contexts for name in SETS], 2):
+        assert not {c.name for c in first} & {c.name for c in second}
+        assert not {c.rho for c in first} & {c.rho for c in second}
     for contexts, context in [(held_out(name), c) for name in SETS for c in held_out(name).contexts]:
         scenario = scenario_of(contexts, context, "all-4")
         assert context.rho not in learn.BUDGETS
