@@ -21,6 +21,7 @@ from perception.surrogate.judge import THRESHOLD, WITHIN, Verdict, judge
 from perception.surrogate.model import Parameters, save
 from perception.surrogate.plan import Split, draw_scene, scene_model
 from perception.surrogate.rows import Rows, rows_of
+from perception.surrogate.together import hang_together
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)
 LOST = 0.003
@@ -71,9 +72,10 @@ def calibrate(
         "scenes": scenes,
         "held_out": held_out,
     }
-    digest = hashlib.blake2b(
-        b"".join(np.ascontiguousarray(w).tobytes() for n in parameters.nets.values() for w in n.weight), digest_size=4
-    )
+    parameters = replace(parameters, card={**facts, "id": ""})
+    parameters = hang_together(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("together", done, of))
+    arrays = [parameters.alike, *(w for n in parameters.nets.values() for w in n.weight)]
+    digest = hashlib.blake2b(b"".join(np.ascontiguousarray(w).tobytes() for w in arrays), digest_size=4)
     facts["id"] = f"{config.fusion}-{key}-{digest.hexdigest()}"
     parameters = replace(parameters, card=facts)
     verdict = judge(parameters, judged, seed)

@@ -150,7 +150,7 @@ class SurrogateDetector:
             return found
         boxes = list(found)
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
-        joined = [_join(own, shares, alone) for own, (_, shares, _) in zip(boxes, jobs, strict=False)]
+        joined = [join(own, shares, alone) for own, (_, shares, _) in zip(boxes, jobs, strict=False)]
         return Found(np.cumsum([0, *(len(b) for b in joined)]), Boxes.join(joined))
 
     def _fuse(
@@ -216,7 +216,7 @@ def _joined(parts: Sequence[Found]) -> Found:
     return Found(np.cumsum(counts), Boxes.join([p.boxes for p in parts]))
 
 
-def _join(own: Boxes, shares: Sequence[Share], alone: dict[Capture, Boxes]) -> Boxes:
+def join(own: Boxes, shares: Sequence[Share], alone: dict[Capture, Boxes]) -> Boxes:
     """The ego's boxes and those that its peers sent, suppressed as the detector does."""
     late = []
     for s in shares:

@@ -17,7 +17,7 @@ from scenarios.schema import Perception
 THRESHOLD = 0.1
 WITHIN = 0.02
 """The error of AP that a calibration is to keep."""
-REPEATS = 4
+REPEATS = 8
 CONTRASTS = (
     ("alone", "all-4, ρ = 0.01"), ("alone", "all-4, ρ = 0.25"), ("alone", "all-4, ρ = 0.25, 32 m"), ("alone", "detections"),
     ("all-4, ρ = 0.05", "all-4, ρ = 0.25"), ("all-4, ρ = 0.25", "all-4, ρ = 1"), ("detections", "all-4, ρ = 0.25"),
@@ -74,7 +74,8 @@ class Verdict:
 
 
 def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> Verdict:
-    """Both detectors' AP under every condition of the held-out scenes; the surrogate's with several draws of its luck."""
+    """Both detectors' AP under every condition of the held-out scenes; the surrogate's with several draws of its luck,
+    other ones in every scene."""
     theirs: dict[str, list[Matched]] = {}
     ours: dict[str, list[Matched]] = {}
     scenes: dict[str, list[int]] = {}
@@ -85,7 +86,7 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
             config = Perception(unsent_cells=rules[0], cells_by=rules[1], score_threshold=THRESHOLD)
             mine = [i for i, j in enumerate(asked.jobs) if (j.unsent, j.cells_by) == rules]
             for repeat in range(REPEATS):
-                detector = SurrogateDetector.of(scene, config, parameters, seed, repeat)
+                detector = SurrogateDetector.of(scene, config, parameters, scene.config.seed, repeat)
                 if truths is None:
                     truths = list(detector.truth_many([j.ego.t_s for j in asked.jobs], [j.ego for j in asked.jobs]))
                 jobs = [[(asked.jobs[i].ego, asked.jobs[i].shares)] for i in mine]

@@ -26,7 +26,7 @@ _GAMMA = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Of looks l and captures c: `look` [l, 2] and `rank` [l] normal, `find` [l, 2] uniform and normal, `residual` [l] uniform,
+    """Of looks l and captures c: `look` [l] uniform, `rank` [l] normal, `find` [l, 2] uniform and normal, `residual` [l] uniform,
     `alarm_at` [c, 8, 24] arrivals of processes of rate 1, `alarm_which` [c, 8, 24] uniform."""
 
     look: NDArray[np.float32]
@@ -38,26 +38,26 @@ class Drawn:
 
 
 class Luck:
-    """Draws of one sortie; `alike` [2] is what part of a look's luck belongs to the car."""
+    """Draws of one sortie; `alike` [3] is the part of the cars whose luck is their own, whoever looks: see `Parameters`."""
 
     def __init__(self, seed: int, replication: int, cars: int, alike: NDArray[np.float32]) -> None:
         self._key, self._drones = (seed, replication), dict[int, int]()
         rng = stream(seed, replication, (), "surrogate.car")
         self._car: Words = rng.integers(2**64, size=cars, dtype=np.uint64)
-        self._alike, self._own = np.sqrt(alike), np.sqrt(1.0 - alike)
+        own = [uniform(self._car, k + 3) < part for k, part in enumerate(alike)]
+        self._fate = np.where(own, [uniform(self._car, k) for k in range(3)], np.nan)
 
     def of(self, captures: Sequence[Capture], looks: Looks) -> Drawn:
         """Everything that the captures' looks need."""
         moment = mixed(np.array([self._drone(c.drone) ^ max(round(c.t_s * 1e3), 0) for c in captures], np.uint64))
         one = mixed(moment[looks.capture] ^ self._car[looks.car])
-        normal = [ndtri(uniform(one, k)) for k in range(4)]
-        car = [ndtri(uniform(self._car, k)) for k in range(2)]
-        look = np.stack([self._alike[k] * car[k][looks.car] + self._own[k] * normal[k] for k in range(2)], axis=1)
+        fate = self._fate[:, looks.car]
+        look, found, placed = np.where(np.isnan(fate), [uniform(one, k) for k in range(3)], fate)
+        ranked, scored = (ndtri(uniform(one, k)) for k in (3, 4))
         alarm = moment[:, None] + np.arange(1, 2 * BANDS * ALARMS + 1, dtype=np.uint64) * np.uint64(_GAMMA)
         drawn = uniform(alarm, 8).reshape(len(captures), 2, BANDS, ALARMS)
         arrivals = np.cumsum(-np.log(drawn[:, 0]), axis=-1)
-        find = np.stack([uniform(one, 4), normal[3]], axis=1)
-        singles = (look, normal[2], find, uniform(one, 5), arrivals, drawn[:, 1])
+        singles = (look, ranked, np.stack([found, scored], axis=1), placed, arrivals, drawn[:, 1])
         return Drawn(*(np.asarray(v, np.float32) for v in singles))
 
     def _drone(self, drone: int) -> int:

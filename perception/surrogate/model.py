@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
-from scipy.special import expit, ndtr
+from scipy.special import expit, ndtri
 
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES
 
 Singles = NDArray[np.float32]
-FORMAT = 1
+FORMAT = 2
 RANK_COVARIATES = ("confidence", "range", "visible", "nadir", "cars", "brightness", "shade")
 PLACE_COVARIATES = (*FUSED_COVARIATES, "score")
 ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")
@@ -44,8 +44,8 @@ SHIPPED = Path(__file__).parent / "weights" / "surrogate.safetensors"
 
 SPREAD = (-3.5, 2.0)
 """Bounds of log deviations."""
-WINDOW = 0.08
-"""Part of the residuals, those nearest in score, from which a box's is drawn."""
+BAND = 64
+"""Residuals that were predicted as vaguely: a box's is one of these, and the best luck draws the one that lay best."""
 _ROWS = 192
 
 
@@ -80,8 +80,9 @@ class Net:
 class Parameters:
     """Everything that a calibration leaves behind.
 
-    `alike` [2]: what part of a look's luck belongs to the car (whoever looks), by component and within it. `residuals`
-    [2, r, 6]: how boxes were off in units of the predicted deviations, together, and their scores, ascending; alone and shared. `alarm_edges` [b + 1]: scores
+    `alike` [3]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies.
+    `residuals` [2, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
+    first in each, and how vague (`vague`) predictions are from which on a band stands for them; alone and shared. `alarm_edges` [b + 1]: scores
     between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [b, p, 5] where and how large they
     were (`ALARM_COLUMNS`, ego's frame); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
     above each, and how many boxes of nothing there are.
@@ -109,12 +110,15 @@ class Parameters:
     # --- the five parts ---------------------------------------------------------------------------
 
     def confidence(self, covariates: Singles, luck: Singles) -> Singles:
-        """How sure each drone is of each car on its own, a logit [n]; `luck` [n, 2] standard normal."""
+        """How sure each drone is of each car on its own, a logit [n]; `luck` [n] uniform: the worst falls to the lower
+        of the two normals, and within each to its lower end."""
         out = self.nets["look"](covariates)
-        high = ndtr(luck[:, 0]) < expit(out[:, 0])
+        u, low = luck.astype(np.float64), expit(-out[:, 0].astype(np.float64))
+        high = u >= low
+        within = ndtri(np.clip(np.where(high, (u - low) / (1.0 - low), u / low), 1e-6, 1.0 - 1e-6))
         mean = np.where(high, out[:, 1], out[:, 2])
         spread = _spread(np.where(high, out[:, 3], out[:, 4]))
-        return np.asarray(mean + spread * luck[:, 1], np.float32)
+        return np.asarray(mean + spread * within, np.float32)
 
     def rank(self, covariates: Singles, luck: Singles, by: str = "confidence") -> Singles:
         """The fraction [n] of the drone's cells that rank above; `luck` [n] standard normal."""
@@ -130,18 +134,13 @@ class Parameters:
     def place(self, covariates: Singles, luck: Singles) -> tuple[Singles, Singles]:
         """How boxes are off, [n, 5]: along the car and across it (m), heading (rad), log length, log width (see
         `features.axes`); and what part [n] of
-        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals near the box's score."""
+        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals that were as vague."""
         out = self.nets["place"](covariates)
-        score, shared = (
-            covariates[:, PLACE_COVARIATES.index("score")],
-            covariates[:, PLACE_COVARIATES.index("senders")] > 0,
-        )
-        count = self.residuals.shape[1]
-        window = max(1, int(WINDOW * count))
-        drawn = np.empty((len(score), 5), np.float32)
+        shared, unsure = covariates[:, PLACE_COVARIATES.index("senders")] > 0, vague(out)
+        drawn = np.empty((len(out), 5), np.float32)
         for kind, pool in ((~shared, self.residuals[0]), (shared, self.residuals[1])):
-            first = np.clip(np.searchsorted(pool[:, 5], score[kind]) - window // 2, 0, count - window)
-            drawn[kind] = pool[np.minimum(first + (luck[kind] * window).astype(np.intp), count - 1), :5]
+            band = np.maximum(np.searchsorted(pool[::BAND, 5], unsure[kind], side="right") - 1, 0)
+            drawn[kind] = pool[band * BAND + np.minimum((luck[kind] * BAND).astype(np.intp), BAND - 1), :5]
         return np.asarray(out[:, :5] + _spread(out[:, 5:10]) * drawn, np.float32), expit(out[:, 10])
 
     def alarm_rates(self, covariates: Singles) -> Singles:
@@ -151,6 +150,11 @@ class Parameters:
 
 def _spread(log: Singles) -> Singles:
     return np.asarray(np.exp(np.clip(log, *SPREAD)))
+
+
+def vague(place: NDArray[Any]) -> NDArray[Any]:
+    """How unsure the place network's outputs [n, 11] are of where a box lies: the log deviations along and across."""
+    return np.asarray(np.clip(place[:, 5:7], *SPREAD).sum(axis=1))
 
 
 def rank_covariates(look: Singles, confidence: Singles, cars: NDArray[Any]) -> Singles:
@@ -226,7 +230,7 @@ def load(path: Path) -> Parameters:
             name: _net(take, name, *sizes, layers=sum(t.startswith(f"{name}.") for t in tensors) // 2)
             for name, sizes in NETS.items()
         },
-        take("alike", 2),
+        take("alike", 3),
         take("residuals", 2, None, 6),
         edges,
         take("alarm_rate", 1 + len(ALARM_COVARIATES), bands),

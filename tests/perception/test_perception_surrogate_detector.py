@@ -101,6 +101,20 @@ def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
     np.testing.assert_array_equal(a.alarm_at[1:3], b.alarm_at)
 
 
+@pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
+def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, part: float) -> None:
+    eyes = Eyes(scene)
+    luck = Luck(3, 0, eyes.traffic.count, np.full(3, part, np.float32))
+    fleet = [c for t in TIMES for c in cross(10.0, 20.0, 0.3, t_s=float(t))]
+    looks = eyes.look(Fleet.of(fleet))
+    drawn = luck.of(fleet, looks)
+    cars = [looks.car == c for c in np.unique(looks.car) if (looks.car == c).sum() > 5]
+    for values in (drawn.look, drawn.find[:, 0], drawn.residual):
+        alike = np.mean([np.ptp(values[of]) == 0.0 for of in cars])
+        assert alike == pytest.approx(part, abs=0.1)
+        assert values.mean() == pytest.approx(0.5, abs=0.1)
+
+
 def test_uniform_draws_are_uniform_and_unlike_across_purposes() -> None:
     words = np.arange(100_000, dtype=np.uint64)
     u, v = uniform(words, 0), uniform(words, 1)
@@ -183,14 +197,18 @@ def test_truth_is_the_detectors(scene: SceneModel, detector: SurrogateDetector) 
 
 
 def test_boxes_that_are_sent_are_the_peers_own(detector: SurrogateDetector) -> None:
+    """What is joined is the ego's or the peer's, of tracks the best 12; a box goes only where another lies on it."""
     fleet = cross(10.0, 20.0, 0.3)
-    for kind, most in (("detections", 10_000), ("tracks", 12)):
-        own, joined = detector.detect([(fleet[0], ())])[0], detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
-        assert (
-            len(own) - (kind == "tracks")
-            < len(joined)
-            <= len(own) + min(most, len(detector.detect([(fleet[1], ())])[0]))
-        )
+    own, theirs = detector.detect([(fleet[0], ()), (fleet[1], ())])
+    for kind, most in (("detections", len(theirs)), ("tracks", 12)):
+        joined = detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
+        every = Boxes.join([own, theirs.take(np.arange(min(most, len(theirs))))])
+        kept = (every.xy_m[:, None] == joined.xy_m[None]).all(axis=-1)
+        assert (kept.sum(axis=0) == 1).all()
+        assert kept[len(own) :].any()
+        lost = ~kept.any(axis=1)
+        nearest = np.linalg.norm(every.xy_m[lost][:, None] - joined.xy_m[None], axis=-1).min(axis=1)
+        assert (nearest < 6.0).all()
 
 
 def test_counts_grow_with_the_disc_and_shrink_with_the_threshold(

@@ -8,18 +8,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from perception_examples import EMPTY
+from perception_examples import EMPTY, cross
 from safetensors.numpy import load_file, save_file
+from scipy.special import expit
 
 from perception.scene import SceneModel
-from perception.surrogate.fit import _poisson, _train
+from perception.surrogate.exchange import Exchange, covariates, pair
+from perception.surrogate.features import Eyes, Fleet
+from perception.surrogate.fit import _in_common, _iou, _pairs, _poisson, _train
 from perception.surrogate.luck import BANDS
-from perception.surrogate.model import NETS, PLACE_COVARIATES, RANK_COVARIATES, SHIPPED, Net, Parameters, load, save
+from perception.surrogate.model import (
+    BAND,
+    NETS,
+    PLACE_COVARIATES,
+    RANK_COVARIATES,
+    SHIPPED,
+    SPREAD,
+    Net,
+    Parameters,
+    load,
+    save,
+)
 from perception.surrogate.sight import CAR_TOP_M, HeightField
 from scenarios.schema import Scene
 
 RNG = np.random.Generator(np.random.PCG64(5))
-CARD = {"format": 1, "id": "x", "fusion": "disconet"}
+CARD = {"format": 2, "id": "x", "fusion": "disconet"}
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +54,16 @@ def broken(path: Path, card: object = CARD, **changes: np.ndarray | None) -> Pat
     [
         (None, {}, "holds no calibration; `sortie calibrate` makes one"),
         ("{", {}, "its card is no JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
-        ({**CARD, "format": 7}, {}, "format is 7, must be 1; calibrate again"),
+        ({**CARD, "format": 7}, {}, "format is 7, must be 2; calibrate again"),
         ({**CARD, "fusion": 3}, {}, "card.fusion is 3, must be text"),
         (CARD, {"alike": None}, "tensor alike is missing"),
-        (CARD, {"alike": np.zeros(3, np.float32)}, "tensor alike has shape [3], must be [2]"),
+        (CARD, {"alike": np.zeros(2, np.float32)}, "tensor alike has shape [2], must be [3]"),
         (
             CARD,
             {"look.0.weight": np.zeros((2, 2), np.float32)},
             "tensor look.0.weight has shape [2, 2], must be [14, any]",
         ),
-        (CARD, {"alike": np.array([np.nan, 0], np.float32)}, "tensor alike holds values that are not finite"),
+        (CARD, {"alike": np.array([np.nan, 0, 0], np.float32)}, "tensor alike holds values that are not finite"),
     ],
 )
 def test_a_broken_calibration_is_named(
@@ -118,13 +132,64 @@ def test_surer_drones_find_more(parameters: Parameters) -> None:
 
 
 def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
-    x = np.zeros((2000, len(PLACE_COVARIATES)), np.float32)
-    x[:, 1:4], x[:, 11], x[:, 12] = -8.0, 0.7, 1.0
+    """Of the cars about a cross of drones, alone: were they found weakly, and were they found surely."""
+    fleet = Fleet.of(cross(10.0, 20.0, 0.3))
+    looks = Eyes(SceneModel(Scene(), None, (-50, -50, 50, 50))).look(fleet)
+    alone = Exchange.of([(c, ()) for c in cross(10.0, 20.0, 0.3)], {c: i for i, c in enumerate(cross(10.0, 20.0, 0.3))})
+    pairs = pair(alone, looks, fleet)
+    n = len(pairs.row)
+    none = np.zeros((n, 0), np.float32)
     spread = []
     for own, score in ((-1.5, 0.25), (1.5, 0.8)):
-        x[:, 0], x[:, -1] = own, score
-        spread.append(float(np.abs(parameters.place(x, RNG.random(2000).astype(np.float32))[0][:, :2]).mean()))
+        sure = np.full(len(looks.car), own, np.float32)
+        x = covariates(pairs, alone, looks, sure, none.astype(bool), none, np.zeros(n, bool))
+        x = np.concatenate([x, np.full((n, 1), score, np.float32)], axis=1)
+        spread.append(float(np.abs(parameters.place(x, RNG.random(n).astype(np.float32))[0][:, :2]).mean()))
+    assert n > 100
     assert spread[0] > 1.3 * spread[1]
+
+
+def test_confidence_is_drawn_from_the_two_normals_that_it_is_said_to_be(parameters: Parameters) -> None:
+    """Even luck, [0, 1], against the mixture's own mean and variance; and better luck is never less sure."""
+    x = np.zeros((20_000, NETS["look"][0]), np.float32)
+    drawn = parameters.confidence(x, ((np.arange(20_000) + 0.5) / 20_000).astype(np.float32))
+    high, up, down, wide, narrow = (float(v) for v in parameters.nets["look"](x[:1])[0])
+    p, a, b = expit(high), np.exp(np.clip(wide, *SPREAD)), np.exp(np.clip(narrow, *SPREAD))
+    mean = p * up + (1 - p) * down
+    variance = p * (a**2 + up**2) + (1 - p) * (b**2 + down**2) - mean**2
+    assert drawn.mean() == pytest.approx(mean, abs=0.01)
+    assert drawn.var() == pytest.approx(variance, rel=0.02)
+
+
+def test_best_luck_places_best_among_what_was_predicted_as_vaguely(parameters: Parameters) -> None:
+    x = np.zeros((4000, len(PLACE_COVARIATES)), np.float32)
+    x[:, 1:4], x[:, 11], x[:, 12], x[:, -1] = -8.0, 0.7, 1.0, 0.5
+    off, _ = parameters.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32))
+    fits = _iou(off.astype(np.float64))
+    assert fits[:1000].mean() + 0.2 < fits[-1000:].mean()
+    rows = parameters.residuals.reshape(2, -1, BAND, 6)
+    assert (rows[..., 5] == rows[..., :1, 5]).all()
+    assert (np.diff(rows[:, :, 0, 5], axis=1) >= 0).all()
+
+
+def test_what_pairs_have_in_common_is_found_again() -> None:
+    """Cars whose luck is their own in 0, 40 and 80 of 100, seen by five drones at other chances."""
+    rng = np.random.default_rng(0)
+    car = np.repeat(np.arange(40_000), 5)
+    chance = rng.uniform(0.2, 0.9, len(car))
+    for part in (0.0, 0.4, 0.8):
+        own, each = rng.random(40_000), rng.random(len(car))
+        happened = np.where((rng.random(40_000) < part)[car], own[car], each) < chance
+        assert _in_common(happened, chance, car) == pytest.approx(part, abs=0.02)
+
+
+def test_pairs_are_every_two_of_a_group() -> None:
+    group = RNG.integers(0, 7, 40)
+    a, b = _pairs(group)
+    found = {(min(i, j), max(i, j)) for i, j in zip(a.tolist(), b.tolist(), strict=True)}
+    wanted = {(i, j) for i in range(40) for j in range(i + 1, 40) if group[i] == group[j]}
+    assert found == wanted
+    assert len(a) == len(wanted)
 
 
 def test_sight_is_a_ray_against_boxes() -> None:
