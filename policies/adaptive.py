@@ -51,9 +51,9 @@ class Arm(NamedTuple):
 ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, False), Arm(2, True, False), Arm(0, True, False))
 """What the adaptive policies choose from."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
-ENOUGH_SEARCHING, ENOUGH_OVERLAPPING = 0.027, 0.034
+ENOUGH_SEARCHING, ENOUGH_OVERLAPPING, ENOUGH_TRACKING = 0.010, 0.021, 0.019
 """Budgets from which on feature cells find more than boxes: where the gains of `sortie learn`'s training contexts at
-0.01 and 0.04 cross zero, over log budget, for the searching ones below and above `MUCH_OVERLAP`."""
+0.01 and 0.04 cross zero, over log budget: searching, below and above `MUCH_OVERLAP`, and tracking."""
 MUCH_OVERLAP = 0.65
 
 
@@ -126,19 +126,20 @@ def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
     """Rules over budget, mission, links and coverage: cells where enough of them get through, boxes where not.
 
     A starved budget sends so few cells that boxes, at a fraction of the bytes, find more; so do links that carry as
-    little. A drone that tracks has to find what stands in one small region: there boxes tell as well at any budget. One
-    that searches gains by cells, later where its peers see much the same as it does.
+    little. Where a drone tracks what stands in one small region, or its peers see much the same as it does, it takes
+    twice the cells until they find more than boxes.
     """
     me = view.me
     if me is None:
         return []
     _, tracking, overlap, _, _ = features(view, rho)
-    if tracking:
-        return spend(view, BOXES, rho, "track")
     through = min(rho, carried(me, view.peers))
-    enough, why = (
-        (ENOUGH_OVERLAPPING, "search, much overlap") if overlap >= MUCH_OVERLAP else (ENOUGH_SEARCHING, "search")
-    )
+    if tracking:
+        enough, why = ENOUGH_TRACKING, "track"
+    elif overlap >= MUCH_OVERLAP:
+        enough, why = ENOUGH_OVERLAPPING, "search, much overlap"
+    else:
+        enough, why = ENOUGH_SEARCHING, "search"
     if through < enough:
         return spend(view, BOXES, rho, f"{why}, budget and links {through:.3g} < {enough:g}")
     return spend(view, MAPS, rho, f"{why}, budget and links {through:.3g} ≥ {enough:g}")

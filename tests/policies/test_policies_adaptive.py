@@ -73,11 +73,12 @@ def spread(view: FleetView, by: float) -> FleetView:
 @pytest.mark.parametrize(
     ("phase", "apart", "rho", "expected"),
     [
-        (TaskPhase.SEARCH, 3.0, 0.026, BOXES),
-        (TaskPhase.SEARCH, 3.0, 0.027, FEATURES),
-        (TaskPhase.SEARCH, 0.5, 0.033, BOXES),
-        (TaskPhase.SEARCH, 0.5, 0.034, FEATURES),
-        (TaskPhase.TRACK, 0.5, 1.0, BOXES),
+        (TaskPhase.SEARCH, 3.0, 0.009, BOXES),
+        (TaskPhase.SEARCH, 3.0, 0.010, FEATURES),
+        (TaskPhase.SEARCH, 0.5, 0.020, BOXES),
+        (TaskPhase.SEARCH, 0.5, 0.021, FEATURES),
+        (TaskPhase.TRACK, 3.0, 0.018, BOXES),
+        (TaskPhase.TRACK, 3.0, 0.019, FEATURES),
     ],
 )
 def test_budget_mission_and_coverage_decide_together(
@@ -88,7 +89,7 @@ def test_budget_mission_and_coverage_decide_together(
 
 
 def test_links_that_carry_no_cells_carry_boxes() -> None:
-    view = spread(fleet_of(5, goodput=8.0), 3.0)  # carries 0.019 of a map a link
+    view = spread(fleet_of(5, goodput=3.0), 3.0)  # carries 0.007 of a map a link
     assert set(rungs(a.adaptive(view, rho=0.2))) == {BOXES}
     assert set(rungs(a.adaptive(spread(fleet_of(5, goodput=20.0), 3.0), rho=0.2))) == {FEATURES}
 
