@@ -28,10 +28,10 @@ def hang_together(
     parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
     """The parameters with `alike` times that factor of 1 … 3.5 with which joined boxes gain most nearly what they should."""
-    wanted, found = _gain(None, parameters, asked, seed, threshold), list[float]()
+    wanted, found = _gain(parameters, asked, seed, threshold, own=True), list[float]()
     for k, factor in enumerate(FACTORS):
         tell(k, len(FACTORS))
-        found.append(_gain(_times(parameters, factor), parameters, asked, seed, threshold))
+        found.append(_gain(_times(parameters, factor), asked, seed, threshold))
         if found[-1] <= wanted:
             break
     tell(len(FACTORS), len(FACTORS))
@@ -44,31 +44,25 @@ def _times(parameters: Parameters, factor: float) -> Parameters:
     return replace(parameters, alike=np.minimum(parameters.alike * factor, MOST).astype(np.float32))
 
 
-def _gain(
-    surrogate: Parameters | None, parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float
-) -> float:
-    """AP of every drone's boxes joined with all others', minus AP of each alone; None asks for the detector's own."""
+def _gain(parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, *, own: bool = False) -> float:
+    """AP of every drone's boxes joined with all others', minus AP of each alone: the surrogate's, or the detector's `own`."""
     alone, together = list[Matched](), list[Matched]()
     config = Perception(score_threshold=threshold)
     for a in asked:
         scene = scene_model(draw_scene(seed, a.split, a.scene))
-        boxes = {
-            job.ego: b.take(b.score >= threshold) for job, b in zip(a.jobs, a.boxes, strict=True) if not job.shares
-        }
-        egos = list(boxes)
+        answers = [(j.ego, b) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
+        egos = [ego for ego, _ in answers]
         shares = [_from_others(ego, egos) for ego in egos]
-        for repeat in range(REPEATS if surrogate else 1):
-            detector = SurrogateDetector.of(scene, config, surrogate or parameters, scene.config.seed, repeat)
-            truths = list(detector.truth_many([e.t_s for e in egos], egos))
-            if surrogate is None:
-                single = list(boxes.values())
-                joined = [join(b, s, boxes) for b, s in zip(single, shares, strict=True)]
+        for repeat in range(1 if own else REPEATS):
+            detector = SurrogateDetector.of(scene, config, parameters, scene.config.seed, repeat)
+            truths = detector.truth_many([e.t_s for e in egos], egos)
+            if own:
+                boxes = [b.take(b.score >= threshold) for _, b in answers]
             else:
-                jobs = [[(e, ())] for e in egos] + [[(e, s)] for e, s in zip(egos, shares, strict=True)]
-                out = list(detector.detect_many(jobs))
-                single, joined = out[: len(egos)], out[len(egos) :]
-            alone += [match(b, t) for b, t in zip(single, truths, strict=True)]
-            together += [match(b, t) for b, t in zip(joined, truths, strict=True)]
+                boxes = list(detector.detect_many([[(ego, ())] for ego in egos]))
+            by_drone = dict(zip(egos, boxes, strict=True))
+            alone += [match(b, t) for b, t in zip(boxes, truths, strict=True)]
+            together += [match(join(b, s, by_drone), t) for b, s, t in zip(boxes, shares, truths, strict=True)]
     return average_precision(together) - average_precision(alone)
 
 
