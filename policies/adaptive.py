@@ -52,8 +52,8 @@ ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, False), Arm(2, True, False), Arm(0,
 """What the adaptive policies choose from."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
 ENOUGH_SEARCHING, ENOUGH_OVERLAPPING, ENOUGH_TRACKING = 0.010, 0.021, 0.019
-"""Budgets from which on feature cells find more than boxes: where the gains of `sortie learn`'s training contexts at
-0.01 and 0.04 cross zero, over log budget: searching, below and above `MUCH_OVERLAP`, and tracking."""
+"""Budgets from which on feature cells find more than boxes, as `sortie learn` prints them for its training contexts:
+searching, below and above `MUCH_OVERLAP`, and tracking."""
 MUCH_OVERLAP = 0.65
 
 

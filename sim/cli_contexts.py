@@ -90,7 +90,7 @@ def learn(
     ] = LEARNED,
 ) -> None:
     """Fit the policy `learned`: fly every arm in drawn contexts with the surrogate detector, and regress AP on what a policy sees."""
-    from sim.learn import BUDGETS, fly_lessons, gains, save
+    from sim.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     with bars() as bar:
         lessons = fly_lessons(seed, contexts, workers=workers, progress=bar("contexts", contexts))
@@ -109,4 +109,6 @@ def learn(
                 f"{arm.words}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
             )
     out.print(table)
+    enough = ", ".join(f"{name} {rho:.3f}" for name, rho in thresholds(lessons).items())
+    out.print(f"maps find more than boxes from a budget of: {enough}")
     out.print(f"kept in [bold]{out_file}[/bold]")

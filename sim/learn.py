@@ -8,6 +8,7 @@ policy sees (`policies.adaptive.features`). The result is a few numbers in a JSO
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.ap import average_precision
-from policies.adaptive import ARMS, features, spend
+from policies.adaptive import ARMS, FEATURES, MUCH_OVERLAP, features, spend
 from policies.contract import Directive, FleetView
 from scenarios.load import load
 from scenarios.schema import Scenario
@@ -137,6 +138,33 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
             if len(gained):
                 found[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
     return found
+
+
+def thresholds(lessons: list[Lesson]) -> dict[str, float]:
+    """Budgets from which on the first arm (maps to all) finds more than the last (boxes to all), for the cases that
+    `policies.adaptive` tells apart; cases without lessons are left out.
+
+    Where the mean gain of boxes falls through zero, by its slope over log budget between the two budgets flown; the least
+    budget where boxes never gain, infinity where they gain at every one.
+    """
+    overlap = FEATURES.index("mean overlap of peers")
+    search, track = ([s for s in lessons if (s.features[1] > 0.5) == tracking] for tracking in (False, True))
+    cases = {
+        "search": [s for s in search if s.features[overlap] < MUCH_OVERLAP],
+        "search, much overlap": [s for s in search if s.features[overlap] >= MUCH_OVERLAP],
+        "track": track,
+    }
+    return {name: _falls_through_zero(some) for name, some in cases.items() if some}
+
+
+def _falls_through_zero(lessons: list[Lesson]) -> float:
+    rho = np.array([10 ** s.features[0] for s in lessons])
+    gain = np.array([s.ap[-1] - s.ap[0] for s in lessons])
+    flown = [(b, float(gain[np.isclose(rho, b)].mean())) for b in BUDGETS if np.isclose(rho, b).any()]
+    for (a, up), (b, down) in itertools.pairwise(flown):
+        if up > 0 >= down:
+            return float(a * (b / a) ** (up / (up - down)))
+    return flown[0][0] if flown[0][1] <= 0 else float("inf")
 
 
 def save(path: Path, lessons: list[Lesson], seed: int) -> None:

@@ -174,6 +174,18 @@ def test_gains_by_phase_and_budget_by_hand() -> None:
     assert found["track", 0.2] == (pytest.approx(-0.1), 0.0, 1)
 
 
+def test_boxes_are_worth_it_up_to_where_their_gain_falls_through_zero() -> None:
+    def lesson(rho: float, tracking: float, overlap: float, gain: float) -> Lesson:
+        return Lesson((np.log10(rho), tracking, overlap, 2.0, 0.9), (0.3, 0.2, 0.3 + gain), "")
+
+    falls = [lesson(0.01, 1.0, 0.5, 0.03), lesson(0.01, 1.0, 0.9, 0.01), lesson(0.04, 1.0, 0.5, -0.02)]
+    never = [lesson(0.01, 0.0, 0.5, -0.01), lesson(0.2, 0.0, 0.5, -0.03)]
+    always = [lesson(0.01, 0.0, 0.9, 0.01), lesson(0.6, 0.0, 0.9, 0.02)]
+    found = learn.thresholds([*falls, *never, *always])
+    assert found == pytest.approx({"search": 0.01, "search, much overlap": np.inf, "track": 0.02})
+    assert learn.thresholds(falls) == pytest.approx({"track": 0.02})
+
+
 def test_one_lesson_leaves_no_slope() -> None:
     fitted = fit([planted(np.random.default_rng(1), 0.0)])
     assert np.allclose(np.array(fitted["weights"])[:, 1:], 0)
