@@ -41,3 +41,18 @@ def test_the_factor_of_a_known_detector_is_found_again(of_theirs: float, low: fl
     np.testing.assert_allclose(found.alike, np.minimum(factor * BASE, 0.95), rtol=1e-5)
     assert told[0][0] == 0
     assert told[-1][0] == told[-1][1]
+
+
+@pytest.mark.parametrize(("wanted", "factor"), [(0.06, 1.0), (0.035, 1.5), (0.0325, 1.625), (-1.0, 3.5)])
+def test_between_two_factors_the_gain_is_straight(
+    monkeypatch: pytest.MonkeyPatch, wanted: float, factor: float
+) -> None:
+    """Gains of 0.055 − 0.02 (factor − 0.5), planted: found on the line, at either end where they do not reach so far."""
+    parameters = replace(load(SHIPPED), alike=BASE)
+
+    def gain(of: Parameters, *_: object, own: bool = False) -> float:
+        return wanted if own else 0.055 - 0.02 * (float(of.alike[0] / BASE[0]) - 0.5)
+
+    monkeypatch.setattr("perception.surrogate.together._gain", gain)
+    found = hang_together(parameters, [], 0, 0.1, lambda done, of: None)
+    assert float(found.alike[0] / BASE[0]) == pytest.approx(factor, rel=1e-4)
