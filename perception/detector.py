@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,9 +26,10 @@ from perception.checkpoint import load_weights
 from perception.decode import decode
 from perception.errors import InputError
 from perception.fusion.base import takes_part
-from perception.fusion.late import join_boxes, sendable
+from perception.fusion.late import sendable
 from perception.fusion.registry import FUSIONS
 from perception.geometry import CELLS, FULL
+from perception.joining import NMS_IOU, Told, joined, told
 from perception.model import folded
 from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
@@ -39,7 +40,6 @@ from scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
-NMS_IOU = 0.15
 KEPT_CAPTURES = 64
 MAPS, LATE = ("features", "raw"), ("detections", "tracks")
 Pose = tuple[float, float, float]
@@ -253,8 +253,8 @@ class TorchDetector:
             own = self._alone(ego)
         else:
             own = self._place(out, ego.est_pose)
-        late = [self._sent_boxes(s, now) for s in shares if not self._is_fused(s) and s.weight > 0.0]
-        return join_boxes(own, late) if late else own
+        late = [self._told(s, now) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+        return joined(ego.est_pose, own, out is not None, late, self._config.join)
 
     def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> Tensor | None:
         """The head's output after fusion; None where no peer has a say in any cell."""
@@ -278,14 +278,14 @@ class TorchDetector:
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
         return capture.est_pose
 
-    def _sent_boxes(self, share: Share, now: Mapping[int, Capture]) -> Boxes:
+    def _told(self, share: Share, now: Mapping[int, Capture]) -> Told:
         """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
         if share.representation in MAPS:
-            return sendable(self._place(self._head_in_part(share), self._lies(share, now)))
-        boxes = self._alone(share.capture).inside(share.roi)
-        if share.representation == "tracks":
-            boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))  # they are best first
-        return sendable(boxes) if self._fusion.shares == "boxes" else boxes
+            lies = self._lies(share, now)
+            said = Told(self._place(self._head_in_part(share), lies), share.weight, lies, share.roi, share.rho < 1.0)
+        else:
+            said = told(share, self._alone(share.capture))
+        return replace(said, boxes=sendable(said.boxes)) if self._fusion.shares == "boxes" else said
 
     def _head_in_part(self, share: Share) -> Tensor:
         """The head's output [7, 128, 128] from what was sent of a map, worked out once for a capture and a budget."""

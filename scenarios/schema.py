@@ -417,6 +417,10 @@ class Perception(Section):
     motion_compensation: bool = Field(
         True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
     )
+    join: Literal["nms", "average"] = Field(
+        "nms",
+        description="How boxes of several drones become one list: the best of those that overlap, or their weighted mean.",
+    )
     score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
     unsent_cells: Literal["masked", "zero"] = Field(

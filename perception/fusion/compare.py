@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from perception.ap import suppress
 from perception.decode import decode
-from perception.fusion.late import NMS_IOU, sendable
+from perception.fusion.late import sendable
 from perception.fusion.registry import FUSIONS
 from perception.fusion.traffic import boxes_of
 from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
@@ -21,6 +22,7 @@ from perception.harness.evaluate import evaluate
 from perception.harness.instrument import CarNetInstrument
 from perception.harness.selection import link_bytes
 from perception.harness.statistics import Difference, compare
+from perception.joining import NMS_IOU, Pose, Rule, Told, joined
 from perception.model import CarNet, folded
 from perception.types import Boxes
 
@@ -44,12 +46,12 @@ class MethodRow:
 class LateInstrument:
     """Late fusion in the harness: each drone's own boxes, and its peers' that are sure, whatever the budget of cells."""
 
-    def __init__(self, net: CarNet) -> None:
-        self.fingerprint = "late:" + CarNetInstrument(net).fingerprint
+    def __init__(self, net: CarNet, rule: Rule = "nms") -> None:
+        self.fingerprint = f"late, {rule}:" + CarNetInstrument(net).fingerprint
         self.geometry = net.config.geometry
         self.sent: list[int] = []
         """Boxes that went over all links, frame by frame."""
-        self._net = folded(net)
+        self._net, self._rule = folded(net), rule
 
     def look(self, frames: FleetFrames, frame: int) -> LateView:
         """Every drone's boxes of one fleet-frame."""
@@ -62,32 +64,33 @@ class LateInstrument:
             for out, pose in zip(outs, poses, strict=True)
         ]
         self.sent.append(sum(len(sendable(boxes)) for boxes in found) * (len(found) - 1))
-        return LateView(found, poses)
+        return LateView(found, poses, self._rule)
 
 
 class LateView:
     """One fleet-frame's boxes in the world."""
 
-    def __init__(self, found: Sequence[Boxes], poses: Sequence[tuple[float, float, float]]) -> None:
-        self._found, self._poses = found, poses
+    def __init__(self, found: Sequence[Boxes], poses: Sequence[Pose], rule: Rule) -> None:
+        self._found, self._poses, self._rule = found, poses, rule
 
     def rank(self, by: CellsBy) -> NDArray[np.floating]:
         """Nothing is ranked: cells are not sent."""
         return np.zeros((len(self._found), 64, 64))
 
     def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[Floats]:
-        """The ego's boxes and its peers' in the ego's frame; the evaluator joins them by suppression."""
+        """The ego's boxes and its peers' as one list, in the ego's frame."""
         out = []
         for e in exchanges:
-            own = self._found[e.ego]
-            joined = Boxes.join([own.take(own.score >= floor), *(sendable(self._found[p]) for p in e.peers)])
-            x, y, yaw = self._poses[e.ego]
+            own, pose = self._found[e.ego], self._poses[e.ego]
+            theirs = [Told(sendable(self._found[p]), 1.0, self._poses[p]) for p in e.peers]
+            boxes = joined(pose, own.take(own.score >= floor), False, theirs, self._rule)
+            x, y, yaw = pose
             c, s = np.cos(yaw), np.sin(yaw)
-            table = joined.table()
+            table = boxes.table()
             dx, dy = table[:, 0] - x, table[:, 1] - y
             table[:, 0], table[:, 1] = c * dx + s * dy, c * dy - s * dx
             table[:, 4] -= yaw
-            out.append(np.concatenate([table, joined.score[:, None].astype(np.float64)], axis=1))
+            out.append(np.concatenate([table, boxes.score[:, None].astype(np.float64)], axis=1))
         return out
 
 
@@ -117,10 +120,11 @@ def measure(weights: Mapping[str, CarNet], frames: FleetFrames) -> list[MethodRo
             rows.append(MethodRow(name, condition.rho, gain, float(sent.total * drones * (drones - 1))))
         if name == "disconet":
             rows.append(MethodRow("none", 0.0, compare(alone, alone, scene), 0.0))
-            late = LateInstrument(net)
-            joined = evaluate(late, frames, (FULL_SHARING,), regions=("full",)).at(TAU)
-            mean = float(np.mean([boxes_of(boxes).total for boxes in late.sent]))
-            rows.append(MethodRow("late", 0.0, compare(alone, joined.matched(FULL_SHARING), scene), mean))
+            for rule in get_args(Rule):
+                late = LateInstrument(net, rule)
+                found = evaluate(late, frames, (FULL_SHARING,), regions=("full",)).at(TAU)
+                mean = float(np.mean([boxes_of(boxes).total for boxes in late.sent]))
+                rows.append(MethodRow(f"late, {rule}", 0.0, compare(alone, found.matched(FULL_SHARING), scene), mean))
     return rows
 
 

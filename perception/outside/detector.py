@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 from perception import budget
 from perception.ap import suppress
 from perception.geometry import CELLS, CHANNELS, FULL
+from perception.joining import NMS_IOU, Told, joined, told
 from perception.outside.exchange import Sent, fused, load_fusion, reaching
 from perception.outside.recorded import RecordingError, open_recording
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception
 
-NMS_IOU = 0.15
 LATE_SCORE = 0.2
 """In late fusion peers send boxes with a score above this, as `fusion/late.py` has it."""
 MAPS = ("features", "raw")
@@ -92,8 +93,9 @@ class RecordedDetector:
         else:
             local = reaching(self._recording, at, pose, maps)
         found = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
-        late = [self._boxes_of(s) for s in heard if s.representation not in MAPS]
-        return suppress(Boxes.join([found, *late]), NMS_IOU)
+        found = suppress(found, NMS_IOU)
+        late = [self._told(s) for s in heard if s.representation not in MAPS]
+        return joined(pose, found, bool(maps), late, config.join)
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:
         capture, config = share.capture, self._config
@@ -108,11 +110,11 @@ class RecordedDetector:
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight)
 
-    def _boxes_of(self, share: Share) -> Boxes:
-        boxes = self._alone(share.capture, self._pose(share.capture)).inside(share.roi)
-        if share.representation == "tracks":
-            boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))  # they are best first
-        return boxes.take(boxes.score > LATE_SCORE) if self._config.fusion == "late" else boxes
+    def _told(self, share: Share) -> Told:
+        said = told(share, self._alone(share.capture, self._pose(share.capture)))
+        if self._config.fusion != "late":
+            return said
+        return replace(said, boxes=said.boxes.take(said.boxes.score > LATE_SCORE))
 
     def _alone(self, capture: Capture, pose: tuple[float, float, float]) -> Boxes:
         local = self._recording.boxes(self._frame(capture), capture.drone)

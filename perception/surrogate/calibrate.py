@@ -17,11 +17,11 @@ from perception.detector import SHIPPED_WEIGHTS, ground_truth
 from perception.geometry import FULL
 from perception.surrogate.collect import FLOOR, Asked, collect, read
 from perception.surrogate.fit import fit
-from perception.surrogate.judge import THRESHOLD, WITHIN, Verdict, judge
+from perception.surrogate.judge import WITHIN, Verdict, judge
 from perception.surrogate.model import Parameters, save
-from perception.surrogate.plan import Split, draw_scene, scene_model
+from perception.surrogate.plan import THRESHOLD, Split, draw_scene, scene_model
 from perception.surrogate.rows import Rows, rows_of
-from perception.surrogate.together import hang_together
+from perception.surrogate.together import hang_together, seen_by_several
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)
 LOST = 0.003
@@ -72,9 +72,9 @@ def calibrate(
         "scenes": scenes,
         "held_out": held_out,
     }
-    parameters = replace(parameters, card={**facts, "id": ""})
+    parameters = replace(parameters, mirages=seen_by_several(fitted, floor, seed), card={**facts, "id": ""})
     parameters = hang_together(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("together", done, of))
-    arrays = [parameters.alike, *(w for n in parameters.nets.values() for w in n.weight)]
+    arrays = [parameters.alike, parameters.mirages, *(w for n in parameters.nets.values() for w in n.weight)]
     digest = hashlib.blake2b(b"".join(np.ascontiguousarray(w).tobytes() for w in arrays), digest_size=4)
     facts["id"] = f"{config.fusion}-{key}-{digest.hexdigest()}"
     parameters = replace(parameters, card=facts)

@@ -14,7 +14,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from perception.detector import TorchDetector
 from perception.scene import SceneModel
-from perception.surrogate.plan import Job, Split, draw_scene, moment, scene_model, scene_seed
+from perception.surrogate.plan import THRESHOLD, Job, Split, draw_scene, moment, scene_model, scene_seed
 from perception.types import Boxes, Capture
 from scenarios.schema import Perception
 
@@ -29,8 +29,12 @@ class Probe(TorchDetector):
         super().__init__(scene, Perception(score_threshold=FLOOR), seed, weights)
 
     def ask(self, job: Job) -> Boxes:
-        """Its boxes, best first."""
-        self._config = Perception(score_threshold=FLOOR, unsent_cells=job.unsent, cells_by=job.cells_by)
+        """Its boxes, best first. Where boxes are averaged, weak ones would move those that count: they stay away."""
+        least = FLOOR if job.join == "nms" else THRESHOLD
+        if least != self._config.score_threshold:
+            for known in self._kept.values():
+                known.boxes = None
+        self._config = Perception(score_threshold=least, unsent_cells=job.unsent, cells_by=job.cells_by, join=job.join)
         return self.detect([(job.ego, job.shares)])[0]
 
     def ranks(self, capture: Capture) -> NDArray[np.float32]:

@@ -8,21 +8,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from perception.ap import suppress
 from perception.geometry import FULL
+from perception.joining import joined, told
 from perception.scene import SceneModel
 from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
 from perception.surrogate.features import Eyes, Fleet, Looks, axes, off_axes, turned
 from perception.surrogate.luck import Drawn, Luck
+from perception.surrogate.mirages import Mirages
 from perception.surrogate.model import SHIPPED, Parameters, load, rank_covariates
+from perception.surrogate.words import mixed, uniform
 from perception.town import Floats
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception
 
 Job = tuple[Capture, Sequence[Share]]
 LATE = ("detections", "tracks")
-NMS_IOU, MAX_TRACKS = 0.15, 12
 BATCH = 400
 """Jobs worked out together; memory grows with it."""
 
@@ -57,19 +59,27 @@ class SurrogateDetector:
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:
         path = SHIPPED if weights is None else weights
-        self._set(scene, config, load(path), seed, replication, str(path))
+        self._set(scene, config, load(path), seed, replication, scene.config.seed, str(path))
 
     @classmethod
-    def of(
-        cls, scene: SceneModel, config: Perception, parameters: Parameters, seed: int, replication: int = 0
-    ) -> SurrogateDetector:
-        """The same from parameters in memory."""
+    def of(cls, scene: SceneModel, config: Perception, parameters: Parameters, draw: int) -> SurrogateDetector:
+        """The same from parameters in memory, for one of many draws of everything: of what is the town's as well, which is
+        the same for all sorties over it."""
         made = cls.__new__(cls)
-        made._set(scene, config, parameters, seed, replication, "the calibration")
+        made._set(
+            scene, config, parameters, scene.config.seed, draw, scene.config.seed + (draw << 40), "the calibration"
+        )
         return made
 
     def _set(
-        self, scene: SceneModel, config: Perception, parameters: Parameters, seed: int, replication: int, name: str
+        self,
+        scene: SceneModel,
+        config: Perception,
+        parameters: Parameters,
+        seed: int,
+        replication: int,
+        town: int,
+        name: str,
     ) -> None:
         fitted = str(parameters.card["fusion"])
         if config.fusion not in (fitted, "none"):
@@ -79,7 +89,8 @@ class SurrogateDetector:
         self.parameters, self.calibration = parameters, parameters.id
         self._scene, self._config = scene, config
         self._eyes = Eyes(scene)
-        self._luck = Luck(seed, replication, self._eyes.traffic.count, parameters.alike)
+        self._luck = Luck(seed, replication, town, self._eyes.traffic.count, parameters.alike)
+        self._mirages = Mirages(town)
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own look and what it was sent, ENU, best first."""
@@ -150,8 +161,18 @@ class SurrogateDetector:
             return found
         boxes = list(found)
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
-        joined = [join(own, shares, alone) for own, (_, shares, _) in zip(boxes, jobs, strict=False)]
-        return Found(np.cumsum([0, *(len(b) for b in joined)]), Boxes.join(joined))
+        fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
+        out = [
+            joined(
+                ego.est_pose,
+                own,
+                f,
+                [told(s, alone[s.capture]) for s in shares if s.capture in alone and s.representation in LATE],
+                self._config.join,
+            )
+            for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False)
+        ]
+        return Found(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(
         self, exchange: Exchange, looks: Looks, fleet: Fleet, confidence: NDArray[np.float32], luck: Drawn
@@ -170,10 +191,13 @@ class SurrogateDetector:
         score = p.find(x, luck.find[pairs.look])
         here = np.flatnonzero(score >= max(p.floor, config.score_threshold))
         look, row, x, score = pairs.look[here], pairs.row[here], x[here], score[here]
-        off, follow = p.place(np.concatenate([x, score[:, None]], axis=1), luck.residual[look])
         at, own = looks.xy_m[look], exchange.ego[row]
         heading = looks.yaw_rad[look] - fleet.yaw_rad[own]
         angle, hand = axes(heading, at)
+        thrown = luck.thrown[look].copy()
+        along = np.where(angle == heading, 1.0, -1.0)  # what lies to one side of a car does so for all who look
+        thrown[:, 1:] *= np.stack([along, along * hand, hand], axis=1)
+        off, follow = p.place(np.concatenate([x, score[:, None]], axis=1), luck.residual[look], thrown)
         at = (
             at
             + off_axes(off[:, :2].astype(np.float64), angle, hand)
@@ -181,7 +205,7 @@ class SurrogateDetector:
         )
         size = self._eyes.traffic.size_m[looks.car[look]] * np.exp(off[:, 3:5])
         yaw = heading + hand * off[:, 2]
-        also = self._alarms(exchange, looks, zeros, luck)
+        also = self._alarms(exchange, looks, fleet, zeros, luck)
         row, score = np.concatenate([row, also.job]), np.concatenate([score, also.drawn[:, 5]])
         at, size = np.concatenate([at, also.drawn[:, :2]]), np.concatenate([size, also.drawn[:, 2:4]])
         yaw = np.concatenate([yaw, also.drawn[:, 4]])
@@ -192,15 +216,37 @@ class SurrogateDetector:
         first = np.searchsorted(row, np.arange(len(exchange.ego) + 1))
         return Found(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
 
-    def _alarms(self, exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_], luck: Drawn) -> _Alarms:
-        """False alarms. One that comes at a rate also comes at a higher one."""
-        p = self.parameters
+    def _alarms(self, exchange: Exchange, looks: Looks, fleet: Fleet, zeros: NDArray[np.bool_], luck: Drawn) -> _Alarms:
+        """False alarms: a drone's own, and those of things that others may see as well. One that comes at a rate also comes at
+        a higher one."""
+        p, ego = self.parameters, exchange.ego
+        part, chance, spread_m, spread_rad = p.mirages.astype(np.float64)
         rate = p.alarm_rates(alarm_covariates(exchange, looks, zeros, self._scene.config))
-        job, band, k = np.nonzero(luck.alarm_at[exchange.ego, : rate.shape[1]] < rate[:, :, None])
-        which = (luck.alarm_which[exchange.ego[job], band, k] * p.alarm_pool.shape[1]).astype(np.intp)
-        drawn = p.alarm_pool[band, np.minimum(which, p.alarm_pool.shape[1] - 1)].astype(np.float64)
+        job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - part) * rate)[:, :, None])
+        drawn = self._pooled(band, luck.alarm_which[ego[job], band, k])
+        # a thing is there for everybody; whether a drone takes it for a car, how surely and where exactly, is its own affair
+        expected = rate.sum(axis=1, dtype=np.float64) * part / chance
+        things = self._mirages.about(fleet, float(expected.max(initial=0.0)))
+        one = mixed(luck.moment[:, None] ^ things.word)
+        seen = things.there & (uniform(one, 0) < chance)
+        also, thing = np.nonzero(seen[ego] & (things.rarity < expected[:, None]))
+        capture, own = ego[also], one[ego[also], thing]
+        sure = np.cumsum(rate[also], axis=1) > (uniform(own, 1) * rate[also].sum(axis=1))[:, None]
+        mirage = self._pooled(np.where(sure.any(axis=1), sure.argmax(axis=1), rate.shape[1] - 1), uniform(own, 2))
+        off = np.stack([ndtri(uniform(own, k)) for k in (3, 4, 5)], axis=1)
+        away = things.xy_m[thing] - fleet.position_m[capture, :2]
+        mirage[:, :2] = turned(away, -fleet.yaw_rad[capture]) * fleet.stretch[capture, None] + spread_m * off[:, :2]
+        mirage[:, 4] = things.yaw_rad[thing] - fleet.yaw_rad[capture] + spread_rad * off[:, 2]
+        job, drawn = np.concatenate([job, also]), np.concatenate([drawn, mirage])
         loud = drawn[:, 5] >= self._config.score_threshold
         return _Alarms(job[loud], drawn[loud])
+
+    def _pooled(self, band: NDArray[np.intp], luck: NDArray[np.floating]) -> Floats:
+        """Alarms [a, 6] that the detector had, of the given bands; `luck` [a] uniform."""
+        pool = self.parameters.alarm_pool
+        which = np.minimum((luck * pool.shape[1]).astype(np.intp), pool.shape[1] - 1)
+        out: Floats = pool[band, which].astype(np.float64)
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,13 +260,3 @@ class _Alarms:
 def _joined(parts: Sequence[Found]) -> Found:
     counts = np.concatenate([np.zeros(1, np.int64), *(np.diff(p.first) for p in parts)])
     return Found(np.cumsum(counts), Boxes.join([p.boxes for p in parts]))
-
-
-def join(own: Boxes, shares: Sequence[Share], alone: dict[Capture, Boxes]) -> Boxes:
-    """The ego's boxes and those that its peers sent, suppressed as the detector does."""
-    late = []
-    for s in shares:
-        if s.representation in LATE and s.weight > 0.0:
-            boxes = alone[s.capture].inside(s.roi)
-            late.append(boxes.take(np.arange(min(len(boxes), MAX_TRACKS))) if s.representation == "tracks" else boxes)
-    return suppress(Boxes.join([own, *late]), NMS_IOU) if late else own

@@ -30,6 +30,7 @@ START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0]}
 CAR_M = (4.5, 1.9)
 """A car, about the towns' mean: to tell which boxes would count."""
 RESIDUALS, POOL, REACH = 2048, 512, 10.0
+NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
 BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.94, 0.975, 0.99])
 """Quantiles of the alarms' scores between which they are counted."""
 
@@ -41,7 +42,7 @@ def fit(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Parameters:
-    """All parameters, without a card.
+    """All parameters, without a card, and without what several drones have in common (`together`).
 
     Args:
         rows: of the fitted scenes, made with the same `floor`.
@@ -82,9 +83,9 @@ def fit(
     alike.append(_in_common(fits[only] >= 0.5, _chance(fits[only] >= 0.5, unsure[only]), car[found][only]))
     tell("alarms")
     edges, rate, pool = _alarms(rows, floor, rng)
-    singles = (np.array(alike), np.stack(pools), edges, rate, pool, boxes)
-    a, r, e, q, p, n = (np.asarray(v, np.float32) for v in singles)
-    return Parameters(nets, a, r, e, q, p, n, card={})
+    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, rate, pool, NO_MIRAGES, boxes)
+    a, r, e, q, p, m, n = (np.asarray(v, np.float32) for v in singles)
+    return Parameters(nets, a, r, e, q, p, m, n, card={})
 
 
 def _bands(residuals: Array, unsure: Array, fits: Array) -> Array:

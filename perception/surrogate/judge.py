@@ -11,10 +11,9 @@ from perception.harness.statistics import compare
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import draw_scene, scene_model
+from perception.surrogate.plan import THRESHOLD, draw_scene, scene_model
 from scenarios.schema import Perception
 
-THRESHOLD = 0.1
 WITHIN = 0.02
 """The error of AP that a calibration is to keep."""
 REPEATS = 8
@@ -22,6 +21,7 @@ CONTRASTS = (
     ("alone", "all-4, ρ = 0.01"), ("alone", "all-4, ρ = 0.25"), ("alone", "all-4, ρ = 0.25, 32 m"), ("alone", "detections"),
     ("all-4, ρ = 0.05", "all-4, ρ = 0.25"), ("all-4, ρ = 0.25", "all-4, ρ = 1"), ("detections", "all-4, ρ = 0.25"),
     ("nearest 2, ρ = 0.5", "all-4, ρ = 0.25"), ("farthest 2, ρ = 0.5", "all-4, ρ = 0.25"),
+    ("detections", "detections, averaged"), ("all-4, ρ = 1", "detections, averaged"),
     ("nearest 2, ρ = 0.5", "farthest 2, ρ = 0.5"), ("all-4, ρ = 0.25, 0.4 s older", "all-4, ρ = 0.25"),
     ("all-4, ρ = 0.25, zeros", "all-4, ρ = 0.25"),
 )  # fmt: skip
@@ -82,11 +82,11 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
     for asked in held_out:
         scene = scene_model(draw_scene(seed, asked.split, asked.scene))
         truths = None
-        for rules in dict.fromkeys((j.unsent, j.cells_by) for j in asked.jobs):
-            config = Perception(unsent_cells=rules[0], cells_by=rules[1], score_threshold=THRESHOLD)
-            mine = [i for i, j in enumerate(asked.jobs) if (j.unsent, j.cells_by) == rules]
+        for rules in dict.fromkeys((j.unsent, j.cells_by, j.join) for j in asked.jobs):
+            config = Perception(unsent_cells=rules[0], cells_by=rules[1], join=rules[2], score_threshold=THRESHOLD)
+            mine = [i for i, j in enumerate(asked.jobs) if (j.unsent, j.cells_by, j.join) == rules]
             for repeat in range(REPEATS):
-                detector = SurrogateDetector.of(scene, config, parameters, scene.config.seed, repeat)
+                detector = SurrogateDetector.of(scene, config, parameters, repeat)
                 if truths is None:
                     truths = list(detector.truth_many([j.ego.t_s for j in asked.jobs], [j.ego for j in asked.jobs]))
                 jobs = [[(asked.jobs[i].ego, asked.jobs[i].shares)] for i in mine]

@@ -27,7 +27,7 @@ from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES
 
 Singles = NDArray[np.float32]
-FORMAT = 2
+FORMAT = 3
 RANK_COVARIATES = ("confidence", "range", "visible", "nadir", "cars", "brightness", "shade")
 PLACE_COVARIATES = (*FUSED_COVARIATES, "score")
 ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")
@@ -80,11 +80,13 @@ class Net:
 class Parameters:
     """Everything that a calibration leaves behind.
 
-    `alike` [3]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies.
+    `alike` [4]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies;
+    and the part of those whose boxes lie off to the same side for all.
     `residuals` [2, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
     first in each, and how vague (`vague`) predictions are from which on a band stands for them; alone and shared. `alarm_edges` [b + 1]: scores
     between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [b, p, 5] where and how large they
-    were (`ALARM_COLUMNS`, ego's frame); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
+    were (`ALARM_COLUMNS`, ego's frame); `mirages` [4]: the part of the alarms that are of things which others may take for cars
+    as well, the chance that a drone does, and how far it puts them off, as deviations (m, rad); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
     above each, and how many boxes of nothing there are.
     """
 
@@ -94,6 +96,7 @@ class Parameters:
     alarm_edges: Singles
     alarm_rate: Singles
     alarm_pool: Singles
+    mirages: Singles
     boxes: Singles
     card: Mapping[str, Any]
 
@@ -131,16 +134,19 @@ class Parameters:
         score = expit(out[:, 1] + _spread(out[:, 2]) * luck[:, 1])
         return np.where((luck[:, 0] < expit(out[:, 0])) & (score >= self.floor), score, 0.0).astype(np.float32)
 
-    def place(self, covariates: Singles, luck: Singles) -> tuple[Singles, Singles]:
+    def place(self, covariates: Singles, luck: Singles, thrown: Singles) -> tuple[Singles, Singles]:
         """How boxes are off, [n, 5]: along the car and across it (m), heading (rad), log length, log width (see
         `features.axes`); and what part [n] of
-        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals that were as vague."""
+        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals that were as vague; `thrown` [n, 4]: as
+        `Drawn.thrown`, the sides as seen from here."""
         out = self.nets["place"](covariates)
         shared, unsure = covariates[:, PLACE_COVARIATES.index("senders")] > 0, vague(out)
         drawn = np.empty((len(out), 5), np.float32)
         for kind, pool in ((~shared, self.residuals[0]), (shared, self.residuals[1])):
             band = np.maximum(np.searchsorted(pool[::BAND, 5], unsure[kind], side="right") - 1, 0)
             drawn[kind] = pool[band * BAND + np.minimum((luck[kind] * BAND).astype(np.intp), BAND - 1), :5]
+        common = thrown[:, 0] < self.alike[3]
+        drawn[common, :3] = np.abs(drawn[common, :3]) * thrown[common, 1:]
         return np.asarray(out[:, :5] + _spread(out[:, 5:10]) * drawn, np.float32), expit(out[:, 10])
 
     def alarm_rates(self, covariates: Singles) -> Singles:
@@ -170,7 +176,7 @@ def save(path: Path, parameters: Parameters) -> None:
     """Write them as safetensors with the card in the metadata, under a temporary name first."""
     tensors: dict[str, Singles] = {
         name: getattr(parameters, name)
-        for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "boxes")
+        for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "mirages", "boxes")
     }
     for name, net in parameters.nets.items():
         for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
@@ -230,11 +236,12 @@ def load(path: Path) -> Parameters:
             name: _net(take, name, *sizes, layers=sum(t.startswith(f"{name}.") for t in tensors) // 2)
             for name, sizes in NETS.items()
         },
-        take("alike", 3),
+        take("alike", 4),
         take("residuals", 2, None, 6),
         edges,
         take("alarm_rate", 1 + len(ALARM_COVARIATES), bands),
         take("alarm_pool", bands, None, len(ALARM_COLUMNS)),
+        take("mirages", 4),
         take("boxes", 3, None),
         card,
     )

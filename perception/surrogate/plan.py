@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from perception.joining import Rule
 from perception.scene import SceneModel
 from perception.types import Capture, Share
 from scenarios.schema import Scene
@@ -19,6 +20,8 @@ SPLITS: dict[Split, int] = {"fit": 1, "held-out": 2}
 AREA_M = 60.0
 """The fleet's middle lies within ± this of the scene's origin."""
 DRONES = 5
+THRESHOLD = 0.1
+"""Boxes count from this score on."""
 BUDGETS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 AGES_S = (0.1, 0.2, 0.4)
 """How much older than the ego's a share may be."""
@@ -40,6 +43,7 @@ class Job:
     cells_by: Literal["confidence", "norm"]
     condition: str
     """Jobs of one condition are judged together; empty where they are only fitted."""
+    join: Rule = "nms"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +124,13 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         age_s: float = 0.0,
         representation: str = "features",
         weight: float = 1.0,
+        boxes_of: list[int] | None = None,
+        join: Rule = "nms",
     ) -> Job:
         of = old[age_s] if age_s else now
         shares = tuple(Share(of[i], representation, rho, roi, weight) for i in who)
-        return Job(now[ego], shares, unsent, cells_by, name)
+        shares += tuple(Share(of[i], "detections", 0.0, None, 1.0) for i in boxes_of or [])
+        return Job(now[ego], shares, unsent, cells_by, name, join)
 
     yield job("alone", 0.0, [])
     for rho in BUDGETS:
@@ -140,7 +147,10 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         yield job(f"nearest 2, ρ = {rho:g}", rho, near[:2])
     yield job("farthest 2, ρ = 0.5", 0.5, near[-2:])
     yield job("detections", 1.0, representation="detections")
+    yield job("detections, averaged", 1.0, representation="detections", join="average")
     yield job("tracks", 1.0, representation="tracks")
+    for rule in ("nms", "average"):
+        yield job(f"nearest 2, ρ = 0.1, boxes of the others, {rule}", 0.1, near[:2], boxes_of=near[2:], join=rule)
 
 
 def _fleet(rng: np.random.Generator, split: Split) -> tuple[list[Capture], dict[float, list[Capture]]]:

@@ -106,7 +106,7 @@ def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
     score, offset, alarms = [], [], []
     for m, (job, boxes) in enumerate(zip(asked.jobs, asked.boxes, strict=True)):
         mine = pairs.look[pairs.row == m]
-        found, off, rest = _claim(job.ego, boxes.take(boxes.score >= floor), looks, mine, eyes)
+        found, off, rest = claim(job.ego, boxes.take(boxes.score >= floor), looks, mine, eyes)
         score.append(found)
         offset.append(off)
         alarms.append(np.concatenate([np.full((len(rest), 1), m), rest], axis=1))
@@ -141,7 +141,7 @@ def _sent(asked: Asked, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict
     return sent
 
 
-def _claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
+def claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
     """Which box is of which car, best first: scores [cars] (0: none), offsets [cars, 5], and the boxes that are of none [a, 6]."""
     x, y, yaw = ego.est_pose
     c, s = np.cos(yaw), np.sin(yaw)

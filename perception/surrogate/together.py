@@ -1,7 +1,8 @@
-"""How misses hang together in a fleet: until the boxes of all drones joined gain what the detector's own gain.
+"""How misses and false alarms hang together in a fleet.
 
-What one pair of drones has in common tells too little: a car that two miss is missed by the others as well, more often
-than pairs let expect. So the parts of the luck that are a car's own (`Parameters.alike`) are raised together.
+Of misses, what one pair of drones has in common tells too little: a car that two miss is missed by the others as well, more
+often than pairs let expect. So the parts of the luck that are a car's own (`Parameters.alike`) are raised together, until the
+boxes of all drones joined gain what the detector's own gain. Of false alarms it is counted how many others have the same.
 """
 
 from __future__ import annotations
@@ -10,16 +11,26 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from perception.ap import Matched, average_precision, match
+from perception.joining import NMS_IOU, Rule, Told, in_square, joined
+from perception.overlap import iou_pairs, near_pairs
 from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector, join
+from perception.surrogate.detector import SurrogateDetector
+from perception.surrogate.features import Eyes, Fleet
+from perception.surrogate.mirages import in_common
 from perception.surrogate.model import Parameters
 from perception.surrogate.plan import draw_scene, scene_model
-from perception.types import Capture, Share
+from perception.surrogate.rows import claim
+from perception.types import Boxes
 from scenarios.schema import Perception
 
+Change = Callable[[Parameters, float], Parameters]
+
 FACTORS = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+PARTS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 MOST = 0.95
 REPEATS = 2
 
@@ -27,24 +38,52 @@ REPEATS = 2
 def hang_together(
     parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
-    """The parameters with `alike` times that factor of 1 … 3.5 with which joined boxes gain most nearly what they should."""
-    wanted, found = _gain(parameters, asked, seed, threshold, own=True), list[float]()
-    for k, factor in enumerate(FACTORS):
-        tell(k, len(FACTORS))
-        found.append(_gain(_times(parameters, factor), asked, seed, threshold))
-        if found[-1] <= wanted:
-            break
-    tell(len(FACTORS), len(FACTORS))
-    # gains fall with the factor; the noise of few scenes apart
-    falling = np.minimum.accumulate(found)
-    return _times(parameters, float(np.interp(-wanted, -falling, FACTORS[: len(found)])))
+    """The parameters with `alike` such that joined boxes gain most nearly what they should.
+
+    Suppressed ones tell how far misses hang together: the part of the cars with a luck of their own takes a factor of 1 … 3.5.
+    Averaged ones tell how far errors of place do: the car's own part of them is 0 … 0.5. Each changes the other's gain a
+    little, so the factor is looked for again.
+    """
+    wanted = {rule: _gain(parameters, asked, seed, threshold, rule, own=True) for rule in ("nms", "average")}
+    steps = 2 * len(FACTORS) + len(PARTS)
+
+    def best(base: Parameters, change: Change, values: Sequence[float], rule: Rule, done: int) -> Parameters:
+        found = list[float]()
+        for k, value in enumerate(values):
+            tell(done + k, steps)
+            found.append(_gain(change(base, value), asked, seed, threshold, rule))
+            if found[-1] <= wanted[rule]:
+                break
+        # gains fall with either; the noise of few scenes apart
+        falling = np.minimum.accumulate(found)
+        return change(base, float(np.interp(-wanted[rule], -falling, values[: len(found)])))
+
+    hung = best(parameters, _times, FACTORS, "nms", 0)
+    hung = best(hung, _with_common, PARTS, "average", len(FACTORS))
+    again = _with_common(parameters, float(hung.alike[3]))
+    hung = best(again, _times, FACTORS, "nms", len(FACTORS) + len(PARTS))
+    tell(steps, steps)
+    return hung
 
 
 def _times(parameters: Parameters, factor: float) -> Parameters:
-    return replace(parameters, alike=np.minimum(parameters.alike * factor, MOST).astype(np.float32))
+    lucks = np.minimum(parameters.alike[:3] * factor, MOST)
+    return replace(parameters, alike=np.append(lucks, parameters.alike[3]).astype(np.float32))
 
 
-def _gain(parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, *, own: bool = False) -> float:
+def _with_common(parameters: Parameters, part: float) -> Parameters:
+    return replace(parameters, alike=np.append(parameters.alike[:3], part).astype(np.float32))
+
+
+def _gain(
+    parameters: Parameters,
+    asked: Sequence[Asked],
+    seed: int,
+    threshold: float,
+    rule: Rule = "nms",
+    *,
+    own: bool = False,
+) -> float:
     """AP of every drone's boxes joined with all others', minus AP of each alone: the surrogate's, or the detector's `own`."""
     alone, together = list[Matched](), list[Matched]()
     config = Perception(score_threshold=threshold)
@@ -52,9 +91,8 @@ def _gain(parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: 
         scene = scene_model(draw_scene(seed, a.split, a.scene))
         answers = [(j.ego, b) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
         egos = [ego for ego, _ in answers]
-        shares = [_from_others(ego, egos) for ego in egos]
         for repeat in range(1 if own else REPEATS):
-            detector = SurrogateDetector.of(scene, config, parameters, scene.config.seed, repeat)
+            detector = SurrogateDetector.of(scene, config, parameters, repeat)
             truths = detector.truth_many([e.t_s for e in egos], egos)
             if own:
                 boxes = [b.take(b.score >= threshold) for _, b in answers]
@@ -62,10 +100,41 @@ def _gain(parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: 
                 boxes = list(detector.detect_many([[(ego, ())] for ego in egos]))
             by_drone = dict(zip(egos, boxes, strict=True))
             alone += [match(b, t) for b, t in zip(boxes, truths, strict=True)]
-            together += [match(join(b, s, by_drone), t) for b, s, t in zip(boxes, shares, truths, strict=True)]
+            for ego, truth in zip(egos, truths, strict=True):
+                others = [Told(by_drone[o], 1.0, o.est_pose) for o in egos if o is not ego and o.t_s == ego.t_s]
+                together.append(match(joined(ego.est_pose, by_drone[ego], False, others, rule), truth))
     return average_precision(together) - average_precision(alone)
 
 
-def _from_others(ego: Capture, egos: Sequence[Capture]) -> tuple[Share, ...]:
-    """Boxes from every drone that looks at the same moment."""
-    return tuple(Share(o, "detections", 1.0, None, 1.0) for o in egos if o is not ego and o.t_s == ego.t_s)
+def seen_by_several(asked: Sequence[Asked], floor: float, seed: int) -> NDArray[np.float32]:
+    """`Parameters.mirages` from the detector's own false alarms, where all drones of a moment have the place in view."""
+    seen, apart, turned = list[int](), list[float](), list[float]()
+    others = 0
+    for a in asked:
+        eyes = Eyes(scene_model(draw_scene(seed, a.split, a.scene)))
+        egos = [(j.ego, b.take(b.score >= floor)) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
+        looks = eyes.look(Fleet.of([ego for ego, _ in egos]))
+        # by where drones were: what they are wrong about that, they are wrong about in a sortie as well
+        poses = [(*ego.position_m[:2], ego.true_yaw_rad) for ego, _ in egos]
+        alarms = [
+            Boxes.placed(claim(ego, boxes, looks, np.flatnonzero(looks.capture == m), eyes)[2], poses[m])
+            for m, (ego, boxes) in enumerate(egos)
+        ]
+        others = len(egos) - 1
+        for m, mine in enumerate(alarms):
+            rivals = [o for k, o in enumerate(alarms) if k != m]
+            mine = mine.take(np.all(in_square(mine.xy_m, np.array(poses)), axis=1))
+            count = np.zeros(len(mine), int)
+            for theirs in rivals:
+                i, j = near_pairs(mine.table(), theirs.table())
+                same = iou_pairs(mine.table()[i], theirs.table()[j]) > NMS_IOU
+                i, j = i[same], j[same]
+                count[np.unique(i)] += 1
+                apart += np.hypot(*(mine.xy_m[i] - theirs.xy_m[j]).T).tolist()
+                turned += np.sin(mine.yaw_rad[i] - theirs.yaw_rad[j]).tolist()
+            seen += count.tolist()
+    part, chance = in_common(seen, others)
+    # of two that put one thing off by as much each; medians, for some lie on one another by chance
+    spread_m = np.median(apart) / np.sqrt(4 * np.log(2)) if apart else 0.0
+    spread_rad = np.median(np.abs(turned)) / (np.sqrt(2) * ndtri(0.75)) if turned else 0.0
+    return np.array([part, chance, spread_m, spread_rad], np.float32)

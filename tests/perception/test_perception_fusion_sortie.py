@@ -8,7 +8,7 @@ from perception_examples import capture, cross
 
 from perception.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
 from perception.fusion.age import earlier, measure
-from perception.fusion.late import SCORE_ABOVE, join_boxes, sendable
+from perception.fusion.late import SCORE_ABOVE, sendable
 from perception.scene import SceneModel
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception, Scene
@@ -53,16 +53,9 @@ def test_none_is_a_drone_alone_and_late_joins_the_same_boxes_from_maps_as_from_b
     assert same(mute, single)
 
 
-def test_late_fusion_joins_what_is_sure_and_overlaps_once() -> None:
-    def boxes(*rows: tuple[float, float, float]) -> Boxes:
-        return Boxes.placed(np.array([(x, y, 4.5, 1.85, 0.0, score) for x, y, score in rows]), (0.0, 0.0, 0.0))
-
-    own, peer = boxes((0, 0, 0.5), (30, 0, 0.15)), boxes((0.3, 0, 0.8), (60, 0, 0.3), (90, 0, 0.2))
-    assert sendable(peer).score.tolist() == pytest.approx([0.8, 0.3])
-    assert sendable(boxes((0, 0, SCORE_ABOVE))).score.tolist() == []
-    joined = join_boxes(own, [sendable(peer)])
-    assert joined.score.tolist() == pytest.approx([0.8, 0.3, 0.15])
-    assert joined.xy_m[0, 0] == pytest.approx(0.3)
+def test_late_fusion_sends_what_is_sure() -> None:
+    rows = np.array([(x, 0, 4.5, 1.85, 0.0, score) for x, score in ((0, 0.8), (60, 0.3), (90, SCORE_ABOVE))])
+    assert sendable(Boxes.placed(rows, (0.0, 0.0, 0.0))).score.tolist() == pytest.approx([0.8, 0.3])
 
 
 def test_a_late_map_lies_where_its_sender_was_or_is(scene: SceneModel, fleet: list[Capture]) -> None:

@@ -11,11 +11,13 @@ from perception_examples import EMPTY, capture, cross
 from perception.ap import match
 from perception.detector import ground_truth
 from perception.detectors import DetectsMany
+from perception.joining import in_square
 from perception.scene import SceneModel
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.exchange import Exchange, pair
 from perception.surrogate.features import Eyes, Fleet
-from perception.surrogate.luck import Luck, uniform
+from perception.surrogate.luck import Luck
+from perception.surrogate.words import uniform
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception, Scene, Target
 
@@ -91,7 +93,7 @@ def test_nothing_sent_is_alone(detector: SurrogateDetector, scene: SceneModel) -
 def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
     detector: SurrogateDetector, scene: SceneModel
 ) -> None:
-    eyes, luck = Eyes(scene), Luck(3, 0, Eyes(scene).traffic.count, detector.parameters.alike)
+    eyes, luck = Eyes(scene), Luck(3, 0, 7, Eyes(scene).traffic.count, detector.parameters.alike)
     fleet = cross(10.0, 20.0, 0.3)
     every, two = eyes.look(Fleet.of(fleet)), eyes.look(Fleet.of(fleet[1:3]))
     a, b = luck.of(fleet, every), luck.of(fleet[1:3], two)
@@ -104,7 +106,7 @@ def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, part: float) -> None:
     eyes = Eyes(scene)
-    luck = Luck(3, 0, eyes.traffic.count, np.full(3, part, np.float32))
+    luck = Luck(3, 0, 7, eyes.traffic.count, np.full(4, part, np.float32))
     fleet = [c for t in TIMES for c in cross(10.0, 20.0, 0.3, t_s=float(t))]
     looks = eyes.look(Fleet.of(fleet))
     drawn = luck.of(fleet, looks)
@@ -113,6 +115,16 @@ def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, par
         alike = np.mean([np.ptp(values[of]) == 0.0 for of in cars])
         assert alike == pytest.approx(part, abs=0.1)
         assert values.mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_which_cars_are_hard_is_the_towns_and_the_rest_the_sorties(scene: SceneModel) -> None:
+    eyes, fleet = Eyes(scene), cross(10.0, 20.0, 0.3)
+    looks, half = eyes.look(Fleet.of(fleet)), np.full(4, 0.5, np.float32)
+    a, b, other = (Luck(*key, eyes.traffic.count, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8)))
+    own = a.look == b.look
+    assert own.mean() == pytest.approx(0.5, abs=0.15)
+    np.testing.assert_array_equal(a.thrown, b.thrown)
+    assert (a.look == other.look).mean() < 0.05
 
 
 def test_uniform_draws_are_uniform_and_unlike_across_purposes() -> None:
@@ -200,9 +212,10 @@ def test_boxes_that_are_sent_are_the_peers_own(detector: SurrogateDetector) -> N
     """What is joined is the ego's or the peer's, of tracks the best 12; a box goes only where another lies on it."""
     fleet = cross(10.0, 20.0, 0.3)
     own, theirs = detector.detect([(fleet[0], ()), (fleet[1], ())])
+    inside = in_square(theirs.xy_m, np.array([fleet[0].est_pose]))[:, 0]
     for kind, most in (("detections", len(theirs)), ("tracks", 12)):
         joined = detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
-        every = Boxes.join([own, theirs.take(np.arange(min(most, len(theirs))))])
+        every = Boxes.join([own, theirs.take(np.flatnonzero(inside & (np.arange(len(theirs)) < most)))])
         kept = (every.xy_m[:, None] == joined.xy_m[None]).all(axis=-1)
         assert (kept.sum(axis=0) == 1).all()
         assert kept[len(own) :].any()

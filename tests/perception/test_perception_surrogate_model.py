@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from perception.surrogate.sight import CAR_TOP_M, HeightField
 from scenarios.schema import Scene
 
 RNG = np.random.Generator(np.random.PCG64(5))
-CARD = {"format": 2, "id": "x", "fusion": "disconet"}
+CARD = {"format": 3, "id": "x", "fusion": "disconet"}
 
 
 @pytest.fixture(scope="module")
@@ -54,16 +55,16 @@ def broken(path: Path, card: object = CARD, **changes: np.ndarray | None) -> Pat
     [
         (None, {}, "holds no calibration; `sortie calibrate` makes one"),
         ("{", {}, "its card is no JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
-        ({**CARD, "format": 7}, {}, "format is 7, must be 2; calibrate again"),
+        ({**CARD, "format": 7}, {}, "format is 7, must be 3; calibrate again"),
         ({**CARD, "fusion": 3}, {}, "card.fusion is 3, must be text"),
         (CARD, {"alike": None}, "tensor alike is missing"),
-        (CARD, {"alike": np.zeros(2, np.float32)}, "tensor alike has shape [2], must be [3]"),
+        (CARD, {"alike": np.zeros(2, np.float32)}, "tensor alike has shape [2], must be [4]"),
         (
             CARD,
             {"look.0.weight": np.zeros((2, 2), np.float32)},
             "tensor look.0.weight has shape [2, 2], must be [14, any]",
         ),
-        (CARD, {"alike": np.array([np.nan, 0, 0], np.float32)}, "tensor alike holds values that are not finite"),
+        (CARD, {"alike": np.array([np.nan, 0, 0, 0], np.float32)}, "tensor alike holds values that are not finite"),
     ],
 )
 def test_a_broken_calibration_is_named(
@@ -87,7 +88,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, parameters: Parameters) -> None
     save(tmp_path / "again.safetensors", parameters)
     again = load(tmp_path / "again.safetensors")
     assert again.card == parameters.card
-    for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "boxes"):
+    for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "mirages", "boxes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(parameters, name))
     x = RNG.normal(size=(7, 14)).astype(np.float32)
     np.testing.assert_array_equal(again.nets["look"](x), parameters.nets["look"](x))
@@ -144,7 +145,7 @@ def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
         sure = np.full(len(looks.car), own, np.float32)
         x = covariates(pairs, alone, looks, sure, none.astype(bool), none, np.zeros(n, bool))
         x = np.concatenate([x, np.full((n, 1), score, np.float32)], axis=1)
-        spread.append(float(np.abs(parameters.place(x, RNG.random(n).astype(np.float32))[0][:, :2]).mean()))
+        spread.append(float(np.abs(parameters.place(x, RNG.random(n).astype(np.float32), thrown(n))[0][:, :2]).mean()))
     assert n > 100
     assert spread[0] > 1.3 * spread[1]
 
@@ -164,12 +165,42 @@ def test_confidence_is_drawn_from_the_two_normals_that_it_is_said_to_be(paramete
 def test_best_luck_places_best_among_what_was_predicted_as_vaguely(parameters: Parameters) -> None:
     x = np.zeros((4000, len(PLACE_COVARIATES)), np.float32)
     x[:, 1:4], x[:, 11], x[:, 12], x[:, -1] = -8.0, 0.7, 1.0, 0.5
-    off, _ = parameters.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32))
+    alone = replace(parameters, alike=np.append(parameters.alike[:3], np.float32(0)))
+    off, _ = alone.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32), thrown(4000))
     fits = _iou(off.astype(np.float64))
     assert fits[:1000].mean() + 0.2 < fits[-1000:].mean()
     rows = parameters.residuals.reshape(2, -1, BAND, 6)
     assert (rows[..., 5] == rows[..., :1, 5]).all()
     assert (np.diff(rows[:, :, 0, 5], axis=1) >= 0).all()
+
+
+def test_boxes_of_part_of_the_cars_lie_off_to_the_same_side_for_all_and_as_far_as_before(
+    parameters: Parameters,
+) -> None:
+    """Two drones that look at the same cars, each with a luck of its own; what lies ahead and turned left for one lies
+    behind and turned right for the other."""
+    n = 20_000
+    x = np.zeros((n, len(PLACE_COVARIATES)), np.float32)
+    x[:, 1:4], x[:, 11], x[:, 12], x[:, -1] = -8.0, 0.7, 1.0, 0.5
+    ours = thrown(n)
+    theirs = ours * np.array([1, -1, 1, -1], np.float32)
+    far = []
+    for part in (0.0, 0.4, 1.0):
+        some = replace(parameters, alike=np.append(parameters.alike[:3], np.float32(part)))
+        a, b = (some.place(x, RNG.random(n).astype(np.float32), t)[0] - _mean(parameters, x) for t in (ours, theirs))
+        same = [(np.sign(a[:, k]) == side * np.sign(b[:, k])).mean() for k, side in enumerate((-1, 1, -1))]
+        np.testing.assert_allclose(same, 0.5 + part / 2, atol=0.06)
+        far.append(np.abs(a).mean(axis=0))
+    np.testing.assert_allclose(far[1:], [far[0]] * 2, rtol=0.03)
+
+
+def _mean(parameters: Parameters, x: np.ndarray) -> np.ndarray:
+    return parameters.nets["place"](x)[:, :5]
+
+
+def thrown(n: int) -> np.ndarray:
+    """As `Drawn.thrown`."""
+    return np.column_stack([RNG.random(n), RNG.choice([-1.0, 1.0], (n, 3))]).astype(np.float32)
 
 
 def test_what_pairs_have_in_common_is_found_again() -> None:

@@ -14,7 +14,7 @@ from perception.surrogate.plan import draw_scene, moment, scene_model
 from perception.surrogate.together import hang_together
 from scenarios.schema import Perception
 
-BASE = np.array([0.2, 0.25, 0.2], np.float32)
+BASE = np.array([0.2, 0.25, 0.2, 0.0], np.float32)
 
 
 def asked(parameters: Parameters, scenes: int) -> list[Asked]:
@@ -23,36 +23,55 @@ def asked(parameters: Parameters, scenes: int) -> list[Asked]:
     for scene in range(scenes):
         jobs = [j for j in moment(0, "fit", scene, 0).jobs if not j.shares]
         detector = SurrogateDetector.of(
-            scene_model(draw_scene(0, "fit", scene)), Perception(score_threshold=0.1), parameters, 1, 5
+            scene_model(draw_scene(0, "fit", scene)), Perception(score_threshold=0.1), parameters, 5
         )
         boxes = list(detector.detect_many([[(j.ego, ())] for j in jobs]))
         out.append(Asked("fit", scene, jobs, boxes, {}))
     return out
 
 
-@pytest.mark.parametrize(("of_theirs", "low", "high"), [(0.0, 1.0, 1.3), (3.0, 2.0, 3.5)])
-def test_the_factor_of_a_known_detector_is_found_again(of_theirs: float, low: float, high: float) -> None:
+def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> None:
     parameters = replace(load(SHIPPED), alike=BASE)
-    theirs = asked(replace(parameters, alike=of_theirs * BASE), 10)
-    told: list[tuple[int, int]] = []
-    found = hang_together(parameters, theirs, 0, 0.1, lambda done, of: told.append((done, of)))
-    factor = float(found.alike[0] / BASE[0])
-    assert low <= factor <= high
-    np.testing.assert_allclose(found.alike, np.minimum(factor * BASE, 0.95), rtol=1e-5)
-    assert told[0][0] == 0
-    assert told[-1][0] == told[-1][1]
+    factors = []
+    for times in (0.0, 3.5):
+        told: list[tuple[int, int]] = []
+        found = hang_together(
+            parameters,
+            asked(replace(parameters, alike=times * BASE), 10),
+            0,
+            0.1,
+            lambda *at, told=told: told.append(at),
+        )
+        factors.append(float(found.alike[0] / BASE[0]))
+        np.testing.assert_allclose(found.alike[:3], np.minimum(factors[-1] * BASE, 0.95)[:3], rtol=1e-5)
+        assert told[0][0] == 0
+        assert told[-1][0] == told[-1][1]
+    assert 1.0 <= factors[0] < factors[1] - 0.5
+    assert factors[1] <= 3.5
+
+
+@pytest.mark.parametrize("part", [0.0, 0.4])
+def test_the_part_of_a_cars_own_errors_is_found_again(part: float) -> None:
+    parameters = replace(load(SHIPPED), alike=BASE)
+    theirs = asked(replace(parameters, alike=np.append(BASE[:3], np.float32(part))), 20)
+    found = hang_together(parameters, theirs, 0, 0.1, lambda done, of: None)
+    assert float(found.alike[3]) == pytest.approx(part, abs=0.12)
 
 
 @pytest.mark.parametrize(("wanted", "factor"), [(0.06, 1.0), (0.035, 1.5), (0.0325, 1.625), (-1.0, 3.5)])
 def test_between_two_factors_the_gain_is_straight(
     monkeypatch: pytest.MonkeyPatch, wanted: float, factor: float
 ) -> None:
-    """Gains of 0.055 − 0.02 (factor − 0.5), planted: found on the line, at either end where they do not reach so far."""
+    """Gains of 0.055 − 0.02 (factor − 0.5), planted, and of 0.3 − 0.2 part: found on the line, at either end where they do
+    not reach so far."""
     parameters = replace(load(SHIPPED), alike=BASE)
 
-    def gain(of: Parameters, *_: object, own: bool = False) -> float:
+    def gain(of: Parameters, *about: object, own: bool = False) -> float:
+        if about[-1] == "average":
+            return 0.25 if own else 0.3 - 0.2 * float(of.alike[3])
         return wanted if own else 0.055 - 0.02 * (float(of.alike[0] / BASE[0]) - 0.5)
 
     monkeypatch.setattr("perception.surrogate.together._gain", gain)
     found = hang_together(parameters, [], 0, 0.1, lambda done, of: None)
     assert float(found.alike[0] / BASE[0]) == pytest.approx(factor, rel=1e-4)
+    assert float(found.alike[3]) == pytest.approx(0.25, rel=1e-4)

@@ -231,6 +231,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.motion_compensation": ("false", ("perception.compute_delay_s=0.12",)),
     "perception.score_threshold": ("0.5", ()),
     "perception.cells_by": ("norm", ()),
+    "perception.join": ("average", ("policy.name=boxes",)),
     "perception.unsent_cells": ("zero", ()),
     "perception.scene.seed": ("8", ()),
     "perception.scene.style": ("suburb", ()),

@@ -1,0 +1,31 @@
+"""Numbers by hashing: a draw that hangs on whose it is and on nothing else, many at once. Free of torch.
+
+splitmix64 (Steele, Lea and Flood, *Fast Splittable Pseudorandom Number Generators*, 2014).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Words = NDArray[np.uint64]
+GAMMA = 0x9E3779B97F4A7C15
+
+
+def mixed(x: Words) -> Words:
+    """Each word scrambled, one to one: splitmix64's finaliser."""
+    x = x + np.uint64(GAMMA)
+    x ^= x >> np.uint64(30)
+    x *= np.uint64(0xBF58476D1CE4E5B9)
+    x ^= x >> np.uint64(27)
+    x *= np.uint64(0x94D049BB133111EB)
+    x ^= x >> np.uint64(31)
+    return x
+
+
+def uniform(x: Words, purpose: int) -> NDArray[np.float64]:
+    """Numbers in (0, 1), others for every purpose."""
+    return np.asarray(
+        ((mixed(x + np.uint64((purpose + 1) * 0xD1B54A32D192ED03 % 2**64)) >> np.uint64(12)) + 0.5) * 2.0**-52,
+        np.float64,
+    )

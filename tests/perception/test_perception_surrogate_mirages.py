@@ -1,0 +1,89 @@
+"""False alarms that stand in the world: how many, for whom, and found again in what a fleet saw."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from perception_examples import capture, cross
+
+from perception.surrogate.collect import Asked
+from perception.surrogate.detector import SurrogateDetector
+from perception.surrogate.features import Fleet
+from perception.surrogate.mirages import Mirages, in_common
+from perception.surrogate.model import SHIPPED, load
+from perception.surrogate.plan import draw_scene, moment, scene_model
+from perception.surrogate.together import seen_by_several
+from perception.types import Capture
+from scenarios.schema import Perception
+
+
+def fleet(*at: tuple[float, float]) -> Fleet:
+    return Fleet.of([capture(x, y, yaw=0.3, drone=k) for k, (x, y) in enumerate(at)])
+
+
+def test_as_many_things_lie_in_a_square_as_are_expected_there() -> None:
+    counts = []
+    for town in range(60):
+        things = Mirages(town).about(fleet((0, 0)), 30.0)
+        assert (things.rarity < 30.0).all()
+        counts.append([int((things.there[0] & (things.rarity < most)).sum()) for most in (10.0, 30.0)])
+    mean, variance = np.mean(counts, axis=0), np.var(counts, axis=0)
+    np.testing.assert_allclose(mean, [10, 30], rtol=0.15)
+    np.testing.assert_allclose(variance, [10, 30], rtol=0.5)  # Poisson: as thrown
+
+
+def test_things_stand_where_they_stand_whoever_else_is_asked_about() -> None:
+    town = Mirages(7)
+    alone, both = town.about(fleet((300, -200)), 20.0), town.about(fleet((-500, 0), (300, -200)), 20.0)
+    seen = both.there[1]
+    here = np.lexsort(alone.xy_m[alone.there[0]].T)
+    there = np.lexsort(both.xy_m[seen].T)
+    np.testing.assert_array_equal(alone.xy_m[alone.there[0]][here], both.xy_m[seen][there])
+    np.testing.assert_array_equal(alone.word[alone.there[0]][here], both.word[seen][there])
+    assert not np.array_equal(Mirages(8).about(fleet((300, -200)), 20.0).xy_m, alone.xy_m)
+
+
+@pytest.mark.parametrize(("part", "chance"), [(0.5, 0.3), (0.9, 0.7), (1.0, 0.25)])
+def test_what_alarms_have_in_common_is_found_from_how_many_have_them(part: float, chance: float) -> None:
+    rng = np.random.default_rng(1)
+    shared = rng.random(200_000) < part
+    seen = np.where(shared, rng.binomial(4, chance, size=len(shared)), 0)
+    assert in_common(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
+
+
+def test_where_nobody_shares_an_alarm_there_are_no_mirages() -> None:
+    assert in_common([0, 0, 0], 4) == (0.0, 1.0)
+    assert in_common([], 4) == (0.0, 1.0)
+    assert in_common([4, 4], 4) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
+def test_a_fleet_of_known_mirages_is_measured_as_such(part: float, chance: float) -> None:
+    planted = replace(load(SHIPPED), mirages=np.array([part, chance, 0.4, 0.1], np.float32))
+    asked = []
+    for scene in range(40):
+        jobs = [j for j in moment(0, "fit", scene, 0).jobs if not j.shares]
+        model = scene_model(draw_scene(0, "fit", scene))
+        detector = SurrogateDetector.of(model, Perception(score_threshold=0.1), planted, 5)
+        asked.append(Asked("fit", scene, jobs, list(detector.detect_many([[(j.ego, ())] for j in jobs])), {}))
+    found = seen_by_several(asked, planted.floor, 0)
+    # how often another has it too: some stand so near a car that was missed that they are taken for it
+    assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
+    if part:
+        assert found[1] == pytest.approx(chance, abs=0.1)
+        assert found[2] == pytest.approx(0.4, abs=0.1)
+        assert found[3] == pytest.approx(0.1, abs=0.03)
+
+
+def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
+    base, towns, seen = load(SHIPPED), range(30), dict[float, float]()
+    for part in (0.0, 0.9):
+        planted = replace(base, mirages=np.array([part, 0.5, 0.5, 0.1], np.float32))
+        count = 0
+        for town in towns:
+            model = scene_model(draw_scene(0, "fit", town))
+            detector = SurrogateDetector.of(model, Perception(score_threshold=0.1), planted, 0)
+            jobs: list[tuple[Capture, tuple[()]]] = [(c, ()) for c in cross(10.0, 20.0, 0.3)]
+            count += sum(len(b) for b in detector.detect_many([jobs]))
+        seen[part] = count / len(towns)
+    assert seen[0.9] == pytest.approx(seen[0.0], rel=0.08)
