@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from fleet.staleness import LinkHealth
 from fleet.trust import Standing
@@ -135,9 +136,9 @@ def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
         digest.update(np.asarray(array.value_lengths(), np.int64).tobytes())
         array = array.flatten()
     if pa.types.is_string(array.type) or pa.types.is_binary(array.type):
-        for value in array.to_pylist():
-            digest.update(value if isinstance(value, bytes) else value.encode())
-            digest.update(b"\0")
+        if len(array):  # all values as one text, a zero behind each
+            together = pa.ListArray.from_arrays([0, len(array)], array.cast(pa.binary()))
+            digest.update(pc.binary_join(together, b"\0")[0].as_py() + b"\0")
     else:
         digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
 
