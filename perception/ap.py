@@ -22,8 +22,8 @@ from perception.overlap import Floats, Ints, Kind, corners, iou_pairs, overlappi
 from perception.types import Boxes
 
 __all__ = [  # the overlap's two main functions are had from here too
-    "CONVENTIONS", "ROTATED", "Convention", "Matched", "area", "average_precision", "best_first",
-    "corners", "hits", "iou_pairs", "match", "match_many", "suppress", "suppressed",
+    "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
+    "corners", "hits", "iou_pairs", "judge", "match", "match_many", "suppress", "suppressed",
 ]  # fmt: skip
 
 Bools = NDArray[np.bool_]
@@ -158,23 +158,55 @@ def match(
 
 def match_many(found: Sequence[Boxes], truth: Sequence[Boxes], iou: float = 0.5) -> list[Matched]:
     """As `match`, frame by frame, of many frames at once."""
-    made: list[Matched] = []
-    for a in range(0, len(found), MATCH_BATCH):
-        some, cars = found[a : a + MATCH_BATCH], truth[a : a + MATCH_BATCH]
-        many, image = np.array([len(b) for b in some], np.int64), np.arange(len(some))
-        boxes, at = Boxes.join(some), np.repeat(image, many)
-        order = best_first(boxes.score, at)
-        boxes, at = boxes.take(order), at[order]
-        ours, theirs = boxes.table(), Boxes.join(cars).table()
-        i, j, value = overlapping(ours, theirs, at, np.repeat(image, [len(c) for c in cars]))
+    image = np.arange(len(found))
+    at, cars_at = np.repeat(image, [len(b) for b in found]), np.repeat(image, [len(c) for c in truth])
+    return judge(Boxes.join(found), at, Boxes.join(truth), cars_at, len(found), iou).matched()
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Detections of many images, and which truths each overlaps enough, so that parts of them are matched for little.
+
+    `order` [n] puts the detections in the order of `best_first`; in that order `score` [n] and `image` [n]. `cars` [m]
+    is each truth's image. `i`, `j` and `value` are pairs of detection and truth, and their IoU.
+    """
+
+    images: int
+    order: Ints
+    score: Floats
+    image: Ints
+    cars: Ints
+    i: Ints
+    j: Ints
+    value: Floats
+
+    def matched(self, own: Bools | None = None, cars: Bools | None = None) -> list[Matched]:
+        """Image by image; with masks (`own` in the order of `best_first`) as if there were those boxes alone."""
+        i, j, value, score, image, of_cars = self.i, self.j, self.value, self.score, self.image, self.cars
+        if own is None or cars is None:
+            hit = hits(len(score), i, j, value)
+        else:
+            both = own[i] & cars[j]
+            hit = hits(len(score), i[both], j[both], value[both])[own]
+            score, image, of_cars = score[own], image[own], of_cars[cars]
+        first = np.searchsorted(image, np.arange(self.images + 1)).tolist()
+        truths = np.bincount(of_cars, minlength=self.images).tolist()
+        return [Matched(score[a:b], hit[a:b], n) for a, b, n in zip(first[:-1], first[1:], truths, strict=True)]
+
+
+def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou: float = 0.5) -> Judged:
+    """Detections and truths of so many images, joined; `image` and `cars` say of which each is, and ascend."""
+    order = best_first(found.score, image)
+    boxes, theirs = found.table()[order], truth.table()
+    cuts = [0, *range(MATCH_BATCH, images, MATCH_BATCH), images]
+    parts = []
+    first, first_car = np.searchsorted(image, cuts).tolist(), np.searchsorted(cars, cuts).tolist()
+    for a, b, c, d in zip(first[:-1], first[1:], first_car[:-1], first_car[1:], strict=True):
+        i, j, value = overlapping(boxes[a:b], theirs[c:d], image[a:b], cars[c:d])
         good = value >= iou
-        hit, first = hits(len(boxes), i[good], j[good], value[good]), np.cumsum(many) - many
-        score = boxes.score.astype(np.float64)
-        made += [
-            Matched(score[k : k + n], hit[k : k + n], len(c))
-            for k, n, c in zip(first.tolist(), many.tolist(), cars, strict=True)
-        ]
-    return made
+        parts.append((i[good] + a, j[good] + c, value[good]))
+    i, j, value = (np.concatenate(v) for v in zip(*parts, strict=True))
+    return Judged(images, order, found.score[order].astype(np.float64), image, cars, i, j, value)
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:

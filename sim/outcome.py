@@ -5,14 +5,15 @@ Everything here is computed from the record's tables; the README of this room li
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from perception.ap import Matched, average_precision, match_many
+from perception.ap import Matched, average_precision, judge
 from perception.types import Boxes
 from sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
@@ -104,23 +105,8 @@ def matched(
     Args:
         mission: count the mission disc alone, and only fusions made while there is one.
     """
-    fusions, missions = record.tables["fusions"], record.tables["mission"]
-    detections = _boxes_by_fusion(record.tables["detections"])
-    truths = _boxes_by_fusion(record.tables["truths"])
-    mission_t = missions["t_s"].to_numpy()
-    discs = np.column_stack([missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
-    asked: dict[tuple[float, int], tuple[Boxes, Boxes]] = {}
-    for t_s, drone in zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True):
-        if not begin_s <= t_s < end_s:
-            continue
-        disc = discs[np.searchsorted(mission_t, t_s, side="right") - 1].tolist()
-        if mission and np.isnan(disc[2]):
-            continue
-        key = (t_s, drone)
-        boxes, truth = detections.get(key, Boxes.empty()), truths.get(key, Boxes.empty())
-        asked[key] = (boxes.inside(tuple(disc)), truth.inside(tuple(disc))) if mission else (boxes, truth)
-    both = match_many([b for b, _ in asked.values()], [t for _, t in asked.values()])
-    return dict(zip(asked, both, strict=True))
+    judged = _Fusions(record, begin_s, end_s)
+    return judged.in_mission() if mission else judged.in_full()
 
 
 def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
@@ -134,7 +120,43 @@ Both = dict[str, dict[tuple[float, int], Matched]]
 
 def both_matched(record: SortieRecord) -> Both:
     """Every scored fusion matched in the full scene and in the mission disc."""
-    return {"full_scene": matched(record, mission=False), "mission": matched(record, mission=True)}
+    judged = _Fusions(record, 0.0, float("inf"))
+    return {"full_scene": judged.in_full(), "mission": judged.in_mission()}
+
+
+class _Fusions:
+    """The scored fusions of a record from `begin_s` to `end_s`; overlaps are worked out once, whatever is asked then."""
+
+    def __init__(self, record: SortieRecord, begin_s: float, end_s: float) -> None:
+        tables = record.tables
+        t_s, drone = tables["fusions"]["t_s"].to_numpy(), tables["fusions"]["drone"].to_numpy()
+        asked = (begin_s <= t_s) & (t_s < end_s)
+        self._t_s = t_s[asked]
+        self._keys = list(zip(self._t_s.tolist(), drone[asked].tolist(), strict=True))
+        found, at = _boxes_of(self._keys, tables["detections"])
+        self._truth, cars = _boxes_of(self._keys, tables["truths"])
+        self._judged = judge(found, at, self._truth, cars, len(self._keys))
+        self._found = found.take(self._judged.order)
+        self._missions = tables["mission"]
+
+    def in_full(self) -> dict[tuple[float, int], Matched]:
+        """By (time, ego), the full scene."""
+        return dict(zip(self._keys, self._judged.matched(), strict=True))
+
+    def in_mission(self) -> dict[tuple[float, int], Matched]:
+        """By (time, ego), the mission disc, where there is one."""
+        discs = np.column_stack([self._missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
+        disc = discs[np.searchsorted(self._missions["t_s"].to_numpy(), self._t_s, side="right") - 1]
+        found, cars = self._judged.image, self._judged.cars
+        inside = self._judged.matched(_within(self._found, disc[found]), _within(self._truth, disc[cars]))
+        there = ~np.isnan(disc[:, 2])
+        return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
+
+
+def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each box's centre is in its disc [n, 3], as `Boxes.inside` says; in none that is NaN."""
+    dx, dy = boxes.xy_m[:, 0] - disc[:, 0], boxes.xy_m[:, 1] - disc[:, 1]
+    return np.asarray(dx * dx + dy * dy <= disc[:, 2] ** 2)
 
 
 def _accuracy(both: Both, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
@@ -146,18 +168,19 @@ def _accuracy(both: Both, begin_s: float = 0.0, end_s: float = float("inf")) -> 
     return found
 
 
-def _boxes_by_fusion(table: pa.Table) -> dict[tuple[float, int], Boxes]:
-    """Split a box table into the boxes of each (time, ego); rows of one fusion stand together."""
-    if table.num_rows == 0:
-        return {}
+def _boxes_of(keys: Sequence[tuple[float, int]], table: pa.Table) -> tuple[Boxes, NDArray[np.int64]]:
+    """A box table's boxes of some fusions (time, ego), and which of them each is of; both in order of time."""
     column = {c: table[c].to_numpy() for c in table.column_names}
     t_s, drone = column["t_s"], column["drone"]
-    cuts = np.flatnonzero((np.diff(t_s) != 0) | (np.diff(drone) != 0)) + 1
+    # rows of one fusion stand together
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(t_s) != 0) | (np.diff(drone) != 0)])[: len(t_s)])
+    number = {key: k for k, key in enumerate(keys)}
+    of = [number.get(key, -1) for key in zip(t_s[first].tolist(), drone[first].tolist(), strict=True)]
+    at = np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
     score = column.get("score", np.ones(len(t_s)))
     xy = np.column_stack([column["x_m"], column["y_m"]])
-    size = np.column_stack([column["length_m"], column["width_m"]])
-    parts = zip(*(np.split(c, cuts) for c in (t_s, drone, xy, size, column["yaw_rad"], score)), strict=True)
-    return {(float(t[0]), int(d[0])): Boxes(p, s, y, w) for t, d, p, s, y, w in parts}
+    boxes = Boxes(xy, np.column_stack([column["length_m"], column["width_m"]]), column["yaw_rad"], score)
+    return (boxes, at) if len(at) == 0 or at.min() >= 0 else (boxes.take(at >= 0), at[at >= 0])
 
 
 # --- traffic, decisions, energy ------------------------------------------------------------------
