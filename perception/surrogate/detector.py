@@ -117,9 +117,8 @@ class SurrogateDetector:
 
     def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Found:
         looks = self._eyes.look(replace(Fleet.of(egos), t_s=np.asarray(t_s, float)), bare=True)
-        first = np.searchsorted(looks.capture, np.arange(len(egos) + 1))
         columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
-        return Found(first, Boxes(*(c.astype(np.float32) for c in columns)))
+        return Found(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
@@ -180,7 +179,7 @@ class SurrogateDetector:
         p, config = self.parameters, self._config
         pairs = pair(exchange, looks, fleet)
         zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
-        cars = np.bincount(looks.capture, minlength=len(fleet.t_s))[looks.capture]
+        cars = np.diff(looks.first)[looks.capture]
         rank = p.rank(rank_covariates(looks.covariates, confidence, cars), luck.rank, config.cells_by)[pairs.peer]
         everything = exchange.cells >= exchange.allowed
         sent = pairs.aimed & (
@@ -201,7 +200,7 @@ class SurrogateDetector:
         at = (
             at
             + off_axes(off[:, :2].astype(np.float64), angle, hand)
-            + mean_shift(pairs, exchange, sent)[here] * follow[:, None]
+            + mean_shift(pairs, exchange, sent, here) * follow[:, None]
         )
         size = self._eyes.traffic.size_m[looks.car[look]] * np.exp(off[:, 3:5])
         yaw = heading + hand * off[:, 2]

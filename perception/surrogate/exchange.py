@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from perception import budget
 from perception.geometry import CELLS, FULL
-from perception.surrogate.features import Fleet, Ints, Looks
+from perception.surrogate.features import Fleet, Ints, Looks, beside
 from perception.town import Floats
 from perception.types import Capture, Share
 from scenarios.schema import Scene
 
 MAPS = ("features", "raw")
+_ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
 FUSED_COVARIATES = (
@@ -133,8 +134,10 @@ class Pairs:
 
 def pair(exchange: Exchange, looks: Looks, fleet: Fleet) -> Pairs:
     """Every car that an ego's square holds, with what its peers' maps hold of it."""
-    row, car = np.nonzero(looks.index[exchange.ego] >= 0)
-    look = looks.index[exchange.ego[row], car].astype(np.intp)
+    first, count = looks.first[exchange.ego], np.diff(looks.first)[exchange.ego]
+    row = np.repeat(np.arange(len(count)), count)
+    look = np.arange(len(row)) + np.repeat(first - (np.cumsum(count) - count), count)  # a capture's looks are a run
+    car = looks.car[look]
     sender, k = exchange.sender, exchange.sender.shape[1]
     peer = np.full((len(row), k), -1, np.int32)
     shift = np.zeros((len(row), k, 2), np.float32)
@@ -218,35 +221,37 @@ def covariates(
         confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
         spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in (0, 3, 2, 1, 7, 8, 4, 12, 13)),
     )  # fmt: skip
-    return np.stack(columns, axis=1).astype(np.float32)
+    return beside(n, columns)
 
 
-def mean_shift(pairs: Pairs, exchange: Exchange, sent: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How far off what was sent of each car lies, [n, 2] m of the ego's frame, by the shares' weights."""
-    weight = (exchange.weight[pairs.row] * sent).astype(np.float32)
+def mean_shift(
+    pairs: Pairs, exchange: Exchange, sent: NDArray[np.bool_], here: Ints | slice = _ALL
+) -> NDArray[np.float32]:
+    """How far off what was sent of each car lies, [n, 2] m of the ego's frame, by the shares' weights; or of some cars alone."""
+    weight = (exchange.weight[pairs.row[here]] * sent[here]).astype(np.float32)
     total = np.maximum(weight.sum(axis=1), 1e-6)
-    return np.asarray((pairs.shift_m * weight[..., None]).sum(axis=1) / total[:, None], np.float32)
+    off = np.zeros((len(weight), 2), np.float32)
+    for j in range(weight.shape[1]):  # few slots: summing over so short an axis takes several times as long
+        off += pairs.shift_m[here, j] * weight[:, j, None]
+    return np.asarray(off / total[:, None], np.float32)
 
 
 def alarm_covariates(exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_], scene: Scene) -> NDArray[np.float32]:
     """What the number of false alarms depends on, [m, 13] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
     light, and how much of how many maps was sent."""
     m = len(exchange.ego)
-    cars = (looks.index[exchange.ego] >= 0).sum(axis=1)
+    cars = np.diff(looks.first)[exchange.ego]
     shares = (exchange.sender >= 0).sum(axis=1)
     received = exchange.arrived.sum(axis=1) / CELLS**2
     silent = np.where(zeros, shares - received, 0.0)
     seams = np.where(zeros, 0.0, np.sqrt(np.clip(received, 0, 1) * np.clip(shares - received, 0, 4)))
     plenty = np.where(shares > 0, np.log10(np.maximum(received, 1e-3)), 0.0)
     shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
-    given = (scene.brightness - 1.0, shade, scene.building_density - 0.6, scene.tree_density - 0.5)
-    styles = (scene.style == name for name in ALARM_COVARIATES[-3:])
-    b, d, h, t = (np.full(m, v) for v in given)
     columns = (
-        np.log1p(cars) - 3.6, b, d, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty, h, t,
-        *(np.full(m, float(is_)) for is_ in styles),
+        np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
+        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in ALARM_COVARIATES[-3:]),
     )  # fmt: skip
-    return np.stack(columns, axis=1).astype(np.float32)
+    return beside(m, columns)
 
 
 def cell_of(xy_m: Floats) -> tuple[Ints, Ints]:

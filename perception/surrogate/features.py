@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from perception.geometry import FULL
 from perception.scene import SceneModel
@@ -66,7 +66,7 @@ class Fleet:
 class Looks:
     """n looks, capture by capture, cars ascending: `capture` [n], `car` [n] (column of `Traffic`), `xy_m` [n, 2] where the
     drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 14] float32 as
-    `LOOK_COVARIATES`, `index` [c, cars] (−1: no look)."""
+    `LOOK_COVARIATES`, `index` [c, cars] (−1: no look); those of capture c are `first[c]` to `first[c + 1]`."""
 
     capture: Ints
     car: Ints
@@ -75,6 +75,7 @@ class Looks:
     yaw_rad: Floats
     covariates: NDArray[np.float32]
     index: NDArray[np.int32]
+    first: Ints
 
 
 class Traffic:
@@ -152,7 +153,8 @@ class Eyes:
         at = which[capture]
         world, turn = xy[at, among], yaw[at, among]
         covariates = np.zeros((0, 0), np.float32) if bare else self._covariates(fleet, capture, car, local, world, turn)
-        return Looks(capture, car, local * fleet.stretch[capture, None], world, turn, covariates, index)
+        first = np.searchsorted(capture, np.arange(len(where) + 1))
+        return Looks(capture, car, local * fleet.stretch[capture, None], world, turn, covariates, index, first)
 
     def _covariates(
         self, fleet: Fleet, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats
@@ -160,7 +162,7 @@ class Eyes:
         traffic = self.traffic
         eye = fleet.position_m[capture]
         reach = np.hypot(local[:, 0], local[:, 1])
-        nadir, margin = _in_view(fleet.tilt[capture], local, eye[:, 2])
+        nadir, margin = _in_view(np.moveaxis(fleet.tilt, 0, 2)[..., capture], local, eye[:, 2])
         along = 0.35 * traffic.size_m[car, 0, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
         visible = sum(self._field.seen(p[:, 0], p[:, 1], eye).astype(np.float32) for p in (xy - along, xy, xy + along))
         moving = car >= traffic.parked
@@ -176,21 +178,28 @@ class Eyes:
         columns = (
             reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
             (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
-            traffic.size_m[car, 0] - 4.6, lit, shade * np.ones(len(car)), (brightness - 1.0) * np.ones(len(car)),
-            crowd, eye[:, 2] / 60.0 - 1.0,
+            traffic.size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / 60.0 - 1.0,
         )  # fmt: skip
-        return np.stack(columns, axis=1).astype(np.float32)
+        return beside(len(car), columns)
+
+
+def beside(rows: int, columns: Sequence[ArrayLike]) -> NDArray[np.float32]:
+    """Columns (or one value for all rows) beside one another, [rows, columns]; each is rounded as it is put in."""
+    out = np.empty((rows, len(columns)), np.float32)
+    for k, column in enumerate(columns):
+        out[:, k] = column
+    return out
 
 
 def _in_view(tilt: Floats, local: Floats, height_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Whether the camera that looks down sees the point, and how far inside the camera that the lift asks it lies (1 in its middle)."""
-    x, y, z = (
-        tilt[:, 0, k] * local[:, 0] + tilt[:, 1, k] * local[:, 1] - tilt[:, 2, k] * (height_m - 0.8) for k in range(3)
-    )
-    depth = np.maximum(-z, 0.1)
-    down = 1.0 - np.maximum(np.abs(y) / HALF_H, np.abs(x) / HALF_V) / depth
-    lengthwise = np.abs(x) >= np.abs(y)
-    ahead, right = np.where(lengthwise, np.abs(x), np.abs(y)), np.where(lengthwise, np.abs(y), np.abs(x))
+    """Whether the camera that looks down sees the point, and how far inside the camera that the lift asks it lies (1 in its middle).
+
+    `tilt` is [3, 3, n], so that each of its numbers is a run in memory."""
+    ahead_m, left_m, drop_m = local[:, 0], local[:, 1], height_m - 0.8
+    x, y, z = (tilt[0, k] * ahead_m + tilt[1, k] * left_m - tilt[2, k] * drop_m for k in range(3))
+    depth, across, along = np.maximum(-z, 0.1), np.abs(y), np.abs(x)
+    down = 1.0 - np.maximum(across / HALF_H, along / HALF_V) / depth
+    ahead, right = np.maximum(along, across), np.minimum(along, across)
     forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
     u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
     side = 1.0 - np.maximum(u, v)

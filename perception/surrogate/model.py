@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
-from perception.surrogate.features import LOOK_COVARIATES
+from perception.surrogate.features import LOOK_COVARIATES, beside
 
 Singles = NDArray[np.float32]
 FORMAT = 3
@@ -169,7 +169,7 @@ def rank_covariates(look: Singles, confidence: Singles, cars: NDArray[Any]) -> S
         name: look[:, LOOK_COVARIATES.index(name)] for name in ("range", "visible", "nadir", "brightness", "shade")
     }
     named |= {"confidence": confidence, "cars": np.log1p(cars) - 3.6}
-    return np.stack([named[name] for name in RANK_COVARIATES], axis=1).astype(np.float32)
+    return beside(len(look), [named[name] for name in RANK_COVARIATES])
 
 
 def save(path: Path, parameters: Parameters) -> None:
