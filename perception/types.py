@@ -37,8 +37,7 @@ class Capture(NamedTuple):
         return float(np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)))
 
 
-@dataclass(frozen=True, slots=True)
-class Share:
+class Share(NamedTuple):
     """One peer's payload as it was delivered."""
 
     capture: Capture

@@ -13,7 +13,7 @@ from fleet.agent import Agent, Received
 from perception.detectors import DetectsMany
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Scenario
-from sim.record import Recorder
+from sim.record import REPRESENTATIONS, Recorder
 
 
 class Detector(Protocol):
@@ -33,7 +33,7 @@ def as_share(received: Received, trust: float = 1.0) -> Share:
     """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
     payload, roi = received.payload, received.payload.roi
     disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-    name, weight = payload.representation.name.lower(), payload.fusion_weight * trust
+    name, weight = REPRESENTATIONS[payload.representation], payload.fusion_weight * trust
     return Share(received.capture, name, payload.rho, disc, weight, received.missing)
 
 

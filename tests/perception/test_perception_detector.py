@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -112,7 +111,7 @@ def test_a_budget_an_roi_and_the_two_masks_matter(
         [
             (fleet[0], [share(c) for c in fleet[1:]]),
             (fleet[0], shares),
-            (fleet[0], [replace(s, roi=(10.0, 20.0, 32.0)) for s in shares]),
+            (fleet[0], [s._replace(roi=(10.0, 20.0, 32.0)) for s in shares]),
         ]
     )
     zero = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1).detect([(fleet[0], shares)])[0]
