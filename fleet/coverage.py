@@ -67,8 +67,8 @@ def survey(x_m: npt.ArrayLike, y_m: npt.ArrayLike, radius_m: npt.ArrayLike) -> l
     states = (distance_m <= RANGE_M).astype(np.uint8)  # UNSEEN or POOR
     states[well] = Coverage.WELL
     look, row, column = np.nonzero(well)  # in the order of looks, so that a cell's first entry is its first sight
-    cell = np.stack([rows[look, row], columns[look, column]], axis=1)
-    _, first = np.unique(cell, axis=0, return_index=True)
+    north, east = rows[look, row] - rows.min(initial=0), columns[look, column] - columns.min(initial=0)
+    _, first = np.unique(north * (columns.max(initial=0) - columns.min(initial=0) + 1) + east, return_index=True)
     states[look[first], row[first], column[first]] = Coverage.NOVEL
     novel = np.zeros(len(states), bool)
     novel[look[first]] = True
