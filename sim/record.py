@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -196,7 +197,7 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     """A decision's ages stand in one row."""
     t_s, drones, ages_s = zip(*rows, strict=True)
     counts = [len(ages) for ages in ages_s]
-    return [np.repeat(t_s, counts), np.repeat(drones, counts), np.concatenate(ages_s)]
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), np.fromiter(chain.from_iterable(ages_s), float)]
 
 
 class AgentNotes:
