@@ -127,7 +127,7 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
     assert len(joined) >= len(single)
     assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
-    tracks = detector._sent_boxes(share(fleet[2], "tracks", roi=roi), {})
+    tracks = detector._told(share(fleet[2], "tracks", roi=roi), {}).boxes
     assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
 

@@ -50,12 +50,12 @@ def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> No
     assert factors[1] <= 3.5
 
 
-@pytest.mark.parametrize("part", [0.0, 0.4])
-def test_the_part_of_a_cars_own_errors_is_found_again(part: float) -> None:
+@pytest.mark.parametrize(("part", "low", "high"), [(0.0, 0.0, 0.1), (0.5, 0.25, 0.5)])
+def test_the_part_of_the_cars_that_lie_off_for_all_is_found_again(part: float, low: float, high: float) -> None:
     parameters = replace(load(SHIPPED), alike=BASE)
     theirs = asked(replace(parameters, alike=np.append(BASE[:3], np.float32(part))), 20)
     found = hang_together(parameters, theirs, 0, 0.1, lambda done, of: None)
-    assert float(found.alike[3]) == pytest.approx(part, abs=0.12)
+    assert low <= float(found.alike[3]) <= high
 
 
 @pytest.mark.parametrize(("wanted", "factor"), [(0.06, 1.0), (0.035, 1.5), (0.0325, 1.625), (-1.0, 3.5)])
