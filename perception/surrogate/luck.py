@@ -26,7 +26,8 @@ BANDS, ALARMS = 8, 24
 class Drawn:
     """Of looks l and captures c: `look` [l] uniform, `rank` [l] normal, `find` [l, 2] uniform and normal, `residual` [l] uniform,
     `alarm_at` [c, 8, 24] arrivals of processes of rate 1, `alarm_which` [c, 8, 24] uniform, `moment` [c] numbers to draw more by; `thrown`
-    [l, 4], of the car whoever looks: uniform, and on which side (−1, 1) along it, across it and in heading boxes of it lie."""
+    [l, 4], of the car whoever looks: uniform, and to which side (−1, 1) along it, across it and in heading boxes of it lie off,
+    where it is one of those whose boxes all do."""
 
     look: NDArray[np.float32]
     rank: NDArray[np.float32]

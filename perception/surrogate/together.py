@@ -41,7 +41,7 @@ def hang_together(
     """The parameters with `alike` such that joined boxes gain most nearly what they should.
 
     Suppressed ones tell how far misses hang together: the part of the cars with a luck of their own takes a factor of 1 … 3.5.
-    Averaged ones tell how far errors of place do: the car's own part of them is 0 … 0.5. Each changes the other's gain a
+    Averaged ones tell how far errors of place do: of a part of 0 … 0.5 of the cars they have one sign for all. Each changes the other's gain a
     little, so the factor is looked for again.
     """
     wanted = {rule: _gain(parameters, asked, seed, threshold, rule, own=True) for rule in ("nms", "average")}
