@@ -73,25 +73,25 @@ def spread(view: FleetView, by: float) -> FleetView:
 @pytest.mark.parametrize(
     ("phase", "apart", "rho", "expected"),
     [
-        (TaskPhase.SEARCH, 3.0, 0.009, BOXES),
-        (TaskPhase.SEARCH, 3.0, 0.010, FEATURES),
-        (TaskPhase.SEARCH, 0.5, 0.020, BOXES),
-        (TaskPhase.SEARCH, 0.5, 0.021, FEATURES),
-        (TaskPhase.TRACK, 3.0, 0.018, BOXES),
-        (TaskPhase.TRACK, 3.0, 0.019, FEATURES),
+        (TaskPhase.SEARCH, 3.0, 0.01, BOXES),
+        (TaskPhase.SEARCH, 3.0, 1.0, BOXES),
+        (TaskPhase.SEARCH, 0.5, 0.043, BOXES),
+        (TaskPhase.SEARCH, 0.5, 0.044, FEATURES),
+        (TaskPhase.TRACK, 3.0, 0.422, BOXES),
+        (TaskPhase.TRACK, 3.0, 0.423, FEATURES),
     ],
 )
 def test_budget_mission_and_coverage_decide_together(
     phase: TaskPhase, apart: float, rho: float, expected: Representation
 ) -> None:
-    view = spread(fleet_of(5, phase=phase), apart)
+    view = spread(fleet_of(5, phase=phase, goodput=1000.0), apart)
     assert set(rungs(a.adaptive(view, rho=rho))) == {expected}
 
 
 def test_links_that_carry_no_cells_carry_boxes() -> None:
-    view = spread(fleet_of(5, goodput=3.0), 3.0)  # carries 0.007 of a map a link
+    view = spread(fleet_of(5, goodput=3.0), 0.5)  # carries 0.007 of a map a link
     assert set(rungs(a.adaptive(view, rho=0.2))) == {BOXES}
-    assert set(rungs(a.adaptive(spread(fleet_of(5, goodput=20.0), 3.0), rho=0.2))) == {FEATURES}
+    assert set(rungs(a.adaptive(spread(fleet_of(5, goodput=40.0), 0.5), rho=0.2))) == {FEATURES}
 
 
 def test_the_learned_policy_takes_the_arm_of_the_highest_prediction() -> None:
