@@ -14,7 +14,7 @@ from perception.geometry import FULL
 from perception.joining import joined, told
 from perception.scene import SceneModel
 from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
-from perception.surrogate.features import Eyes, Fleet, Looks, axes, off_axes, turned
+from perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, turned
 from perception.surrogate.luck import Drawn, Luck
 from perception.surrogate.mirages import Mirages
 from perception.surrogate.model import SHIPPED, Parameters, load, rank_covariates
@@ -161,16 +161,10 @@ class SurrogateDetector:
         boxes = list(found)
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
         fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
-        out = [
-            joined(
-                ego.est_pose,
-                own,
-                f,
-                [told(s, alone[s.capture]) for s in shares if s.capture in alone and s.representation in LATE],
-                self._config.join,
-            )
-            for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False)
-        ]
+        out = []
+        for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False):
+            others = [told(s, alone[s.capture]) for s in shares if s.representation in LATE and s.weight > 0.0]
+            out.append(joined(ego.est_pose, own, f, others, self._config.join))
         return Found(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(
@@ -219,26 +213,31 @@ class SurrogateDetector:
         """False alarms: a drone's own, and those of things that others may see as well. One that comes at a rate also comes at
         a higher one."""
         p, ego = self.parameters, exchange.ego
-        part, chance, spread_m, spread_rad = p.mirages.astype(np.float64)
         rate = p.alarm_rates(alarm_covariates(exchange, looks, zeros, self._scene.config))
-        job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - part) * rate)[:, :, None])
-        drawn = self._pooled(band, luck.alarm_which[ego[job], band, k])
-        # a thing is there for everybody; whether a drone takes it for a car, how surely and where exactly, is its own affair
-        expected = rate.sum(axis=1, dtype=np.float64) * part / chance
-        things = self._mirages.about(fleet, float(expected.max(initial=0.0)))
-        one = mixed(luck.moment[:, None] ^ things.word)
-        seen = things.there & (uniform(one, 0) < chance)
-        also, thing = np.nonzero(seen[ego] & (things.rarity < expected[:, None]))
-        capture, own = ego[also], one[ego[also], thing]
-        sure = np.cumsum(rate[also], axis=1) > (uniform(own, 1) * rate[also].sum(axis=1))[:, None]
-        mirage = self._pooled(np.where(sure.any(axis=1), sure.argmax(axis=1), rate.shape[1] - 1), uniform(own, 2))
-        off = np.stack([ndtri(uniform(own, k)) for k in (3, 4, 5)], axis=1)
-        away = things.xy_m[thing] - fleet.position_m[capture, :2]
-        mirage[:, :2] = turned(away, -fleet.yaw_rad[capture]) * fleet.stretch[capture, None] + spread_m * off[:, :2]
-        mirage[:, 4] = things.yaw_rad[thing] - fleet.yaw_rad[capture] + spread_rad * off[:, 2]
-        job, drawn = np.concatenate([job, also]), np.concatenate([drawn, mirage])
+        job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - p.mirages[0]) * rate)[:, :, None])
+        own = _Alarms(job, self._pooled(band, luck.alarm_which[ego[job], band, k]))
+        seen = self._seen(rate, ego, fleet, luck)
+        job, drawn = np.concatenate([own.job, seen.job]), np.concatenate([own.drawn, seen.drawn])
         loud = drawn[:, 5] >= self._config.score_threshold
         return _Alarms(job[loud], drawn[loud])
+
+    def _seen(self, rate: NDArray[np.float32], ego: Ints, fleet: Fleet, luck: Drawn) -> _Alarms:
+        """Alarms of things in the town, at `rate` [m, bands] of all alarms. They are there for everybody; whether a drone takes
+        one for a car, how surely and where exactly, is its own affair."""
+        part, chance, spread_m, spread_rad = self.parameters.mirages.astype(np.float64)
+        expected = rate.sum(axis=1, dtype=np.float64) * part / chance
+        things = self._mirages.about(fleet, float(expected.max(initial=0.0)))
+        luck_of = mixed(luck.moment[:, None] ^ things.word)
+        seen = things.there & (uniform(luck_of, 0) < chance)
+        job, thing = np.nonzero(seen[ego] & (things.rarity < expected[:, None]))
+        capture, own = ego[job], luck_of[ego[job], thing]
+        over = np.cumsum(rate[job], axis=1) > (uniform(own, 1) * rate[job].sum(axis=1))[:, None]
+        drawn = self._pooled(np.where(over.any(axis=1), over.argmax(axis=1), rate.shape[1] - 1), uniform(own, 2))
+        off = np.stack([ndtri(uniform(own, k)) for k in (3, 4, 5)], axis=1)
+        away = turned(things.xy_m[thing] - fleet.position_m[capture, :2], -fleet.yaw_rad[capture])
+        drawn[:, :2] = away * fleet.stretch[capture, None] + spread_m * off[:, :2]
+        drawn[:, 4] = things.yaw_rad[thing] - fleet.yaw_rad[capture] + spread_rad * off[:, 2]
+        return _Alarms(job, drawn)
 
     def _pooled(self, band: NDArray[np.intp], luck: NDArray[np.floating]) -> Floats:
         """Alarms [a, 6] that the detector had, of the given bands; `luck` [a] uniform."""
