@@ -26,10 +26,9 @@ from perception.checkpoint import load_weights
 from perception.decode import decode
 from perception.errors import InputError
 from perception.fusion.base import takes_part
-from perception.fusion.late import sendable
 from perception.fusion.registry import FUSIONS
-from perception.geometry import CELLS, FULL
-from perception.joining import NMS_IOU, Told, joined, told
+from perception.geometry import CELLS, FULL, in_square
+from perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
 from perception.model import folded
 from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
@@ -42,7 +41,6 @@ WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 KEPT_CAPTURES = 64
 MAPS, LATE = ("features", "raw"), ("detections", "tracks")
-Pose = tuple[float, float, float]
 Disc = tuple[float, float, float]
 R = TypeVar("R")
 
@@ -66,11 +64,11 @@ def ground_truth(
     Every such car counts, also one that no drone could see. Scores are 1.
     """
     cars = scene.cars_at(t_s)
-    dx, dy = cars.x_m - centre_xy[0], cars.y_m - centre_xy[1]
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    cars = cars.where((np.abs(c * dx + s * dy) < half_extent) & (np.abs(c * dy - s * dx) < half_extent))
+    xy = np.stack([cars.x_m, cars.y_m], axis=1)
+    inside = in_square(xy, [(*centre_xy, yaw_rad)], half_extent)[:, 0]
+    cars = cars.where(inside)
     columns = (
-        np.stack([cars.x_m, cars.y_m], 1),
+        xy[inside],
         np.stack([cars.length_m, cars.width_m], 1),
         cars.yaw_rad,
         np.ones(len(cars)),

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 IMAGE_PX = 256
 CELLS = 64
 CHANNELS = 80
@@ -41,3 +44,13 @@ FULL = Geometry(102.4)
 """UAV3D's, and the default."""
 SMALL = Geometry(51.2)
 """Half as far, twice as fine."""
+
+
+def in_square(
+    xy_m: NDArray[np.floating], poses: ArrayLike, half_extent_m: float = FULL.half_extent_m
+) -> NDArray[np.bool_]:
+    """Which places [n, 2] (ENU) lie in the squares of which poses [m, 3] (x, y, yaw): [n, m]."""
+    x, y, yaw = np.asarray(poses, np.float64).T
+    dx, dy, c, s = xy_m[:, :1] - x, xy_m[:, 1:] - y, np.cos(yaw), np.sin(yaw)
+    inside: NDArray[np.bool_] = (np.abs(c * dx + s * dy) < half_extent_m) & (np.abs(c * dy - s * dx) < half_extent_m)
+    return inside

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from perception.ap import suppress
 from perception.decode import decode
-from perception.fusion.late import sendable
 from perception.fusion.registry import FUSIONS
 from perception.fusion.traffic import boxes_of
 from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
@@ -22,7 +21,7 @@ from perception.harness.evaluate import evaluate
 from perception.harness.instrument import CarNetInstrument
 from perception.harness.selection import link_bytes
 from perception.harness.statistics import Difference, compare
-from perception.joining import NMS_IOU, Pose, Rule, Told, joined
+from perception.joining import NMS_IOU, Pose, Rule, Told, joined, sendable
 from perception.model import CarNet, folded
 from perception.types import Boxes
 

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from perception import budget
 from perception.ap import suppress
-from perception.geometry import CELLS, CHANNELS, FULL
-from perception.joining import NMS_IOU, Told, joined, told
+from perception.geometry import CELLS, CHANNELS, FULL, in_square
+from perception.joining import NMS_IOU, Told, joined, sendable, told
 from perception.outside.exchange import Sent, fused, load_fusion, reaching
 from perception.outside.recorded import RecordingError, open_recording
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception
 
-LATE_SCORE = 0.2
-"""In late fusion peers send boxes with a score above this, as `fusion/late.py` has it."""
 MAPS = ("features", "raw")
 NEAR_M = 5.0
 """The drone of the sortie has to be this near to where the recorded one was."""
@@ -61,11 +59,9 @@ class RecordedDetector:
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The recorded cars of the frame nearest to `t_s`, in the square about where the ego was recorded."""
-        x, y, yaw = self._recording.pose[self._frame(ego), ego.drone]
+        pose = self._recording.pose[self._frame(ego), ego.drone]
         cars = self._recording.truth(self._nearest(t_s, "truth"))
-        dx, dy, c, s = cars[:, 0] - x, cars[:, 1] - y, np.cos(yaw), np.sin(yaw)
-        reach = FULL.half_extent_m
-        cars = cars[(np.abs(c * dx + s * dy) < reach) & (np.abs(c * dy - s * dx) < reach)]
+        cars = cars[in_square(cars[:, :2], [pose])[:, 0]]
         columns = (cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
         return Boxes(*(column.astype(np.float32) for column in columns))
 
@@ -112,9 +108,7 @@ class RecordedDetector:
 
     def _told(self, share: Share) -> Told:
         said = told(share, self._alone(share.capture, self._pose(share.capture)))
-        if self._config.fusion != "late":
-            return said
-        return replace(said, boxes=said.boxes.take(said.boxes.score > LATE_SCORE))
+        return replace(said, boxes=sendable(said.boxes)) if self._config.fusion == "late" else said
 
     def _alone(self, capture: Capture, pose: tuple[float, float, float]) -> Boxes:
         local = self._recording.boxes(self._frame(capture), capture.drone)

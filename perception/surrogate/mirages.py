@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.geometry import FULL
+from perception.geometry import FULL, in_square
 from perception.surrogate.features import Fleet
 from perception.surrogate.words import GAMMA, Words, mixed, uniform
 from perception.town import Floats
@@ -57,16 +57,8 @@ class Mirages:
         tile, thing = np.nonzero(rarity < most)
         word, rarity = word[tile, thing], rarity[tile, thing]
         xy = (tiles[tile] + np.stack([uniform(word, 1), uniform(word, 2)], axis=1)) * TILE_M
-        return Things(xy, 2 * np.pi * uniform(word, 3), word, rarity, _in_squares(xy, fleet))
-
-
-def _in_squares(xy_m: Floats, fleet: Fleet) -> NDArray[np.bool_]:
-    """[c, n]: which places lie in which captures' squares."""
-    dx, dy = (xy_m[:, k] - fleet.position_m[:, k, None] for k in (0, 1))
-    c, s = np.cos(fleet.yaw_rad)[:, None], np.sin(fleet.yaw_rad)[:, None]
-    half = FULL.half_extent_m
-    inside: NDArray[np.bool_] = (np.abs(c * dx + s * dy) < half) & (np.abs(c * dy - s * dx) < half)
-    return inside
+        poses = np.column_stack([fleet.position_m[:, :2], fleet.yaw_rad])
+        return Things(xy, 2 * np.pi * uniform(word, 3), word, rarity, in_square(xy, poses).T)
 
 
 def in_common(seen: Sequence[int], others: int) -> tuple[float, float]:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from perception.ap import Matched, average_precision, match
-from perception.joining import NMS_IOU, Rule, Told, in_square, joined
+from perception.geometry import in_square
+from perception.joining import NMS_IOU, Rule, Told, joined
 from perception.overlap import iou_pairs, near_pairs
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
@@ -123,7 +124,7 @@ def seen_by_several(asked: Sequence[Asked], floor: float, seed: int) -> NDArray[
         others = len(egos) - 1
         for m, mine in enumerate(alarms):
             rivals = [o for k, o in enumerate(alarms) if k != m]
-            mine = mine.take(np.all(in_square(mine.xy_m, np.array(poses)), axis=1))
+            mine = mine.take(np.flatnonzero(in_square(mine.xy_m, poses).all(axis=1)))
             count = np.zeros(len(mine), int)
             for theirs in rivals:
                 i, j = near_pairs(mine.table(), theirs.table())

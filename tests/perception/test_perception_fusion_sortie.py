@@ -8,7 +8,7 @@ from perception_examples import capture, cross
 
 from perception.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
 from perception.fusion.age import earlier, measure
-from perception.fusion.late import SCORE_ABOVE, sendable
+from perception.joining import SURE, sendable
 from perception.scene import SceneModel
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception, Scene
@@ -54,7 +54,7 @@ def test_none_is_a_drone_alone_and_late_joins_the_same_boxes_from_maps_as_from_b
 
 
 def test_late_fusion_sends_what_is_sure() -> None:
-    rows = np.array([(x, 0, 4.5, 1.85, 0.0, score) for x, score in ((0, 0.8), (60, 0.3), (90, SCORE_ABOVE))])
+    rows = np.array([(x, 0, 4.5, 1.85, 0.0, score) for x, score in ((0, 0.8), (60, 0.3), (90, SURE))])
     assert sendable(Boxes.placed(rows, (0.0, 0.0, 0.0))).score.tolist() == pytest.approx([0.8, 0.3])
 
 

@@ -12,7 +12,7 @@ from perception_examples import EMPTY, capture, cross
 from perception.ap import match
 from perception.detector import ground_truth
 from perception.detectors import DetectsMany
-from perception.joining import in_square
+from perception.geometry import in_square
 from perception.scene import SceneModel
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.exchange import Exchange, pair
@@ -214,7 +214,7 @@ def test_boxes_that_are_sent_are_the_peers_own(detector: SurrogateDetector) -> N
     """What is joined is the ego's or the peer's, of tracks the best 12; a box goes only where another lies on it."""
     fleet = cross(10.0, 20.0, 0.3)
     own, theirs = detector.detect([(fleet[0], ()), (fleet[1], ())])
-    inside = in_square(theirs.xy_m, np.array([fleet[0].est_pose]))[:, 0]
+    inside = in_square(theirs.xy_m, [fleet[0].est_pose])[:, 0]
     for kind, most in (("detections", len(theirs)), ("tracks", 12)):
         joined = detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
         every = Boxes.join([own, theirs.take(np.flatnonzero(inside & (np.arange(len(theirs)) < most)))])

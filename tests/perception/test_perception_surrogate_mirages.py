@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perception_examples import capture, cross
+from surrogate_examples import asked
 
-from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.features import Fleet
 from perception.surrogate.mirages import Mirages, in_common
 from perception.surrogate.model import SHIPPED, load
-from perception.surrogate.plan import draw_scene, moment, scene_model
+from perception.surrogate.plan import draw_scene, scene_model
 from perception.surrogate.together import seen_by_several
 from perception.types import Capture
 from scenarios.schema import Perception
@@ -60,13 +60,7 @@ def test_where_nobody_shares_an_alarm_there_are_no_mirages() -> None:
 @pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
 def test_a_fleet_of_known_mirages_is_measured_as_such(part: float, chance: float) -> None:
     planted = replace(load(SHIPPED), mirages=np.array([part, chance, 0.4, 0.1], np.float32))
-    asked = []
-    for scene in range(40):
-        jobs = [j for j in moment(0, "fit", scene, 0).jobs if not j.shares]
-        model = scene_model(draw_scene(0, "fit", scene))
-        detector = SurrogateDetector.of(model, Perception(score_threshold=0.1), planted, 5)
-        asked.append(Asked("fit", scene, jobs, list(detector.detect_many([[(j.ego, ())] for j in jobs])), {}))
-    found = seen_by_several(asked, planted.floor, 0)
+    found = seen_by_several(asked(planted, 40), planted.floor, 0)
     # how often another has it too: some stand so near a car that was missed that they are taken for it
     assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
     if part:

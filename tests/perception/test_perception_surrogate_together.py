@@ -6,28 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surrogate_examples import asked
 
-from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import SHIPPED, Parameters, load
-from perception.surrogate.plan import draw_scene, moment, scene_model
 from perception.surrogate.together import hang_together
-from scenarios.schema import Perception
 
 BASE = np.array([0.2, 0.25, 0.2, 0.0], np.float32)
-
-
-def asked(parameters: Parameters, scenes: int) -> list[Asked]:
-    """What a surrogate would have answered where the detector is asked."""
-    out = []
-    for scene in range(scenes):
-        jobs = [j for j in moment(0, "fit", scene, 0).jobs if not j.shares]
-        detector = SurrogateDetector.of(
-            scene_model(draw_scene(0, "fit", scene)), Perception(score_threshold=0.1), parameters, 5
-        )
-        boxes = list(detector.detect_many([[(j.ego, ())] for j in jobs]))
-        out.append(Asked("fit", scene, jobs, boxes, {}))
-    return out
 
 
 def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> None:
