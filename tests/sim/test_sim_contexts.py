@@ -30,7 +30,7 @@ contexts:
 """
 
 
-SETS = ("contexts", "contexts_second", "contexts_third")
+SETS = ("contexts", "contexts_second", "contexts_third", "contexts_fourth")
 
 
 def held_out(name: str) -> Contexts:
