@@ -1,8 +1,8 @@
 """Adaptive policies: one byte budget, spent by what mission, link, battery and geometry ask for.
 
 Each decision picks an arm, a way to spend the budget: to how many peers, features or boxes, all that is seen or the
-mission's region alone. `adaptive` picks by rules that read budget, mission and coverage jointly; `learned` asks a
-small network that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
+mission's region alone. `adaptive` picks by rules that read mission, budget and links jointly; `learned` asks a
+linear model that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
 
 `rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies: at equal
 `rho` no arm sends more bytes than they do.
@@ -45,16 +45,14 @@ class Arm(NamedTuple):
         """As it stands in a reason."""
         who = "all" if self.peers >= EVERYONE else f"{self.peers}"
         rest = ", boxes to the rest" if self.boxes and self.peers < EVERYONE else ""
-        return f"features{' of the region' if self.region else ''} to {who}{rest}" if self.peers else "boxes to all"
+        return f"features to {who}{rest}" if self.peers else "boxes to all"
 
 
-ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, False), Arm(2, True, False), Arm(0, True, False))
-"""What the adaptive policies choose from."""
+ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, True), Arm(2, True, True), Arm(0, True, False))
+"""What the adaptive policies choose from; searching there is no region, and maps are of everything."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
-ENOUGH_OVERLAPPING, ENOUGH_TRACKING = 0.044, 0.423
-"""Budgets from which on feature cells find more than boxes, as `sortie learn` prints them for its training contexts:
-searching above `MUCH_OVERLAP`, and tracking. Searching below it boxes find more under every budget."""
-MUCH_OVERLAP = 0.65
+FEW = 8 / 4096
+"""Of a map: with fewer cells than that to a link boxes are sent."""
 
 
 def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
@@ -123,25 +121,20 @@ def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
 
 def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Rules over budget, mission, links and coverage: cells where enough of them get through, boxes where not.
+    """Rules over mission, budget and links: of a region that is tracked its feature cells, otherwise boxes.
 
-    A starved budget sends so few cells that boxes, at a fraction of the bytes, find more; so do links that carry as
-    little. Where peers see much else than the drone does, boxes always find more: they bring what it has no eyes for.
+    A region is small, so that even a starved budget sends the cells that count, and maps of them find more than boxes; of
+    the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`).
     """
     me = view.me
     if me is None:
         return []
-    _, tracking, overlap, _, _ = features(view, rho)
+    if me.task_phase != TaskPhase.TRACK or me.region is None:
+        return spend(view, BOXES, rho, "no region")
     through = min(rho, carried(me, view.peers))
-    if tracking:
-        enough, why = ENOUGH_TRACKING, "track"
-    elif overlap >= MUCH_OVERLAP:
-        enough, why = ENOUGH_OVERLAPPING, "search, much overlap"
-    else:
-        return spend(view, BOXES, rho, "search, little overlap")
-    if through < enough:
-        return spend(view, BOXES, rho, f"{why}, budget and links {through:.3g} < {enough:g}")
-    return spend(view, MAPS, rho, f"{why}, budget and links {through:.3g} ≥ {enough:g}")
+    if through < FEW:
+        return spend(view, BOXES, rho, f"a region, budget and links {through:.2g} < {FEW:.2g}")
+    return spend(view, MAPS, rho, "a region")
 
 
 def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:

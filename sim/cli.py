@@ -158,12 +158,15 @@ def compare(
     readme: Annotated[
         Path | None, typer.Option(help="A Markdown file whose section between the comparison's markers is replaced.")
     ] = None,
+    by_torch: Annotated[
+        bool, typer.Option("--by-torch", help="Contexts flown by the surrogate are scored by the torch detector.")
+    ] = False,
 ) -> None:
     """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
     contexts = load_contexts(scenario)
     if contexts is not None:
         chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
-        return cli_contexts.compare_contexts(contexts, chosen, set_ or [], out_file)
+        return cli_contexts.compare_contexts(contexts, chosen, set_ or [], out_file, by_torch=by_torch)
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
     if own_fusion:
         flown = [(p, _with_own_fusion(s)) for p, s in flown]

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
-from scenarios.load import load
+from policies.registry import resolve
+from scenarios.load import load, load_contexts
 from sim.console import out, stages, user_errors
+from sim.in_flight import REGIONS, Level, flights, means
+
+if TYPE_CHECKING:
+    from perception.surrogate.judge import Verdict
 
 
 def calibrate(
@@ -24,21 +30,39 @@ def calibrate(
         "runs/calibrate"
     ),
     fly: Annotated[
-        str | None, typer.Option(help="Then fly this scenario with both detectors under worked, all-4 and silence.")
+        str | None, typer.Option(help="Then fly this scenario or set of contexts by both detectors, side by side.")
     ] = None,
+    made: Annotated[Path | None, typer.Option(help="Take this calibration and make none; with --fly.")] = None,
+    policies: Annotated[str, typer.Option(help="Comma-separated: under which.")] = "silence,all-4,boxes",
     rate_hz: Annotated[float, typer.Option(help="How often those sorties are scored.", min=0.05, max=10)] = 0.5,
 ) -> None:
     """Fit the surrogate to the torch detector's own runs and judge it on held-out scenes; goes on where it was cut off."""
     from perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
-    from perception.surrogate.judge import WITHIN
 
+    chosen = [p.strip() for p in policies.split(",")]
     with user_errors():
-        if fly is not None:
+        for p in chosen if fly is not None else ():
+            resolve(p)
+        if fly is not None and load_contexts(fly) is None:
             load(fly)
-        with stages() as progress:
+        if made is not None and fly is None:
+            raise ValueError("--made goes with --fly: there is nothing else to do with it")
+    if made is None:
+        with user_errors(), stages() as progress:
             _, verdict = make(
                 out_file, work=work, weights=weights, scenes=scenes, held_out=held_out, seed=seed, progress=progress
             )
+        _tell(verdict, out_file)
+    if fly is not None:
+        with user_errors(), stages() as progress:
+            flown = list(flights(fly, made or out_file, weights, rate_hz, chosen, progress))
+        out.print(_in_flight(flown, f"AP in points, {fly}, scored at {rate_hz:g} Hz"))
+
+
+def _tell(verdict: Verdict, out_file: Path) -> None:
+    """Levels, orders, and where they are kept."""
+    from perception.surrogate.judge import WITHIN
+
     table = Table("condition", "torch", "surrogate", "error", title="AP@0.5 on held-out scenes")
     for v in verdict.levels:
         colour = "green" if abs(v.error) <= WITHIN else "red"
@@ -50,24 +74,12 @@ def calibrate(
             f"{o.b} − {o.a}: torch {o.torch:+.3f} \\[{o.low:+.3f}, {o.high:+.3f}], surrogate {o.surrogate:+.3f}, {said}"
         )
     out.print(f"kept in [bold]{out_file}[/bold], its card in [bold]{out_file.with_suffix('.md')}[/bold]")
-    if fly is not None:
-        with user_errors():
-            out.print(side_by_side(fly, out_file, weights, rate_hz))
 
 
-def side_by_side(scenario: str, calibration: Path, weights: Path | None, rate_hz: float) -> Table:
-    """AP of whole sorties by both detectors, policy by policy, on the same seed."""
-    from sim.outcome import accuracy
-    from sim.sortie import run_sortie
-
-    table = Table("policy", "region", "torch", "surrogate", "error", title=f"{scenario}, scored at {rate_hz:g} Hz")
-    shared = [f"perception.sample_rate_hz={rate_hz}"]
-    torch = [*shared, "perception.detector=torch", *([f"perception.weights={weights}"] if weights else [])]
-    ours = [*shared, "perception.detector=surrogate", f"perception.weights={calibration}"]
-    for policy in ("silence", "worked", "all-4"):
-        a, b = (accuracy(run_sortie(load(scenario, how), policy)) for how in (torch, ours))
-        for region in ("full_scene", "mission"):
-            x, y = a[region], b[region]
-            if x is not None and y is not None:
-                table.add_row(policy, region, f"{x:.3f}", f"{y:.3f}", f"{y - x:+.3f}")
+def _in_flight(levels: Sequence[Level], title: str) -> Table:
+    """AP by both detectors, and what policies gain over one another; in points, with 95 % intervals over contexts."""
+    table = Table("policy", "region", "torch", "surrogate", "error", title=title)
+    for m in means(levels):
+        torch, error = (f"{100 * v[0]:.1f} \\[{100 * v[1]:.1f}, {100 * v[2]:.1f}]" for v in (m.torch, m.error))
+        table.add_row(m.what, REGIONS[m.region], torch, f"{100 * m.surrogate:.1f}", error)
     return table

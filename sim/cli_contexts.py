@@ -12,23 +12,28 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
+from perception.detectors import make_detector
 from policies.adaptive import ARMS, LEARNED
 from policies.registry import resolve
 from scenarios.contexts import Contexts
 from sim.console import bars, out
 from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
 from sim.folders import write_text
+from sim.in_flight import torch_answers
 from sim.tables import size
 
 
-def compare_contexts(contexts: Contexts, policies: Sequence[str], sets: Sequence[str], out_file: Path | None) -> None:
+def compare_contexts(
+    contexts: Contexts, policies: Sequence[str], sets: Sequence[str], out_file: Path | None, *, by_torch: bool = False
+) -> None:
     """Fly every policy in every context, print AP by context and the sums, keep both as JSON."""
     for policy in policies:
         resolve(policy)
     contexts = contexts.model_copy(update={"set": (*contexts.set, *sets)})
     with bars() as bar:
         each = {p: bar(p, len(contexts.contexts)) for p in policies}
-        cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k))
+        detector_of = torch_answers() if by_torch else make_detector
+        cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k), detector_of=detector_of)
     rows = summarise(cells)
     for table in _by_context(contexts, policies, cells, out.width):
         out.print(table)
@@ -85,16 +90,20 @@ def learn(
     contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 100,
     seed: Annotated[int, typer.Option(help="Of the training contexts.", min=0)] = 0,
     workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
+    by_torch: Annotated[
+        bool,
+        typer.Option("--by-torch", help="The torch detector scores what the surrogate flies; half an hour a core."),
+    ] = False,
     out_file: Annotated[
         Path, typer.Option("--out", help="Where the fit is kept; left out, the policy's own.")
     ] = LEARNED,
 ) -> None:
-    """Fit the policy `learned`: fly every arm in drawn contexts with the surrogate detector, and regress AP on what a policy sees."""
+    """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""
     from sim.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     with bars() as bar:
-        lessons = fly_lessons(seed, contexts, workers=workers, progress=bar("contexts", contexts))
-    save(out_file, lessons, seed)
+        lessons = fly_lessons(seed, contexts, by_torch=by_torch, workers=workers, progress=bar("contexts", contexts))
+    save(out_file, lessons, seed, by_torch=by_torch)
     table = Table("arm", "mean AP", "best in")
     for k, arm in enumerate(ARMS):
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)

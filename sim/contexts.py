@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from perception.ap import average_precision
+from perception.detectors import make_detector
 from policies.registry import POLICIES, parameters, resolve
 from scenarios.contexts import Context, Contexts
 from scenarios.load import load
 from scenarios.schema import Scenario
 from sim.outcome import matched, outcome
-from sim.sortie import run_sortie
+from sim.sortie import DetectorOf, run_sortie
 
 FIXED = ("all-4", "best-2", "worst-2", "random-2", "fixed-compression", "silence")
 """Policies that do the same whatever the context; the best of them, and the best of them in each context, are the
@@ -52,12 +53,17 @@ class Summary:
 
 
 def fly_all(
-    contexts: Contexts, policies: Sequence[str], *, progress: Callable[[str, int], None] | None = None
+    contexts: Contexts,
+    policies: Sequence[str],
+    *,
+    progress: Callable[[str, int], None] | None = None,
+    detector_of: DetectorOf = make_detector,
 ) -> list[Cell]:
     """Every policy in every context; the budget goes to every policy that takes one.
 
     Args:
         progress: called with the policy and how many of its contexts are flown.
+        detector_of: as `run_sortie` takes it.
 
     Raises:
         ScenarioError, PolicyError: a context or policy that cannot be flown, before anything is.
@@ -65,7 +71,7 @@ def fly_all(
     planned = [(p, c, [scenario_of(contexts, c, p)] * len(contexts.seeds)) for p in policies for c in contexts.contexts]
     cells: list[Cell] = []
     for k, (policy, context, scenarios) in enumerate(planned):
-        cells.append(_fly(policy, context, scenarios, contexts.seeds))
+        cells.append(_fly(policy, context, scenarios, contexts.seeds, detector_of))
         if progress is not None:
             progress(policy, k % len(contexts.contexts) + 1)
     return cells
@@ -80,10 +86,12 @@ def scenario_of(contexts: Contexts, context: Context, policy: str) -> Scenario:
     return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"params": budget})})
 
 
-def _fly(policy: str, context: Context, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> Cell:
+def _fly(
+    policy: str, context: Context, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorOf
+) -> Cell:
     frames, results = [], []
     for scenario, seed in zip(scenarios, seeds, strict=True):
-        record = run_sortie(scenario, None, seed)
+        record = run_sortie(scenario, None, seed, detector_of=detector_of)
         frames += list(matched(record, mission=context.metric == "mission").values())
         results.append(outcome(record))
     ap = average_precision(frames) if frames else float("nan")

@@ -18,14 +18,16 @@ from pathlib import Path
 import numpy as np
 
 from perception.ap import average_precision
-from policies.adaptive import ARMS, FEATURES, MUCH_OVERLAP, features, spend
+from perception.detectors import make_detector
+from policies.adaptive import ARMS, features, spend
 from policies.contract import Directive, FleetView
 from scenarios.load import load
 from scenarios.schema import Scenario
 from scenarios.streams import stream
 from sim.folders import write_text
+from sim.in_flight import torch_answers
 from sim.outcome import matched
-from sim.sortie import run_sortie
+from sim.sortie import DetectorOf, run_sortie
 
 BUDGETS = (0.01, 0.04, 0.2, 0.6)
 SPACINGS_M = (15, 20, 30)
@@ -35,6 +37,7 @@ RADII_M = (28, 36)
 LINKS = ((), (), ("radio.tx_power_dbm=5", "radio.path_loss_exponent=2.4"))
 """Clear air twice as often as weak links."""
 SECONDS = 12
+TORCH_RATE_HZ = 0.5
 RIDGE = 30.0
 """Shrinkage of the slopes towards none; the mean gain of an arm is not shrunk. Of 1, 3, 10 and 30 the best in ten-fold
 cross-validation over the training contexts."""
@@ -73,9 +76,13 @@ def draw_context(seed: int, number: int) -> tuple[Scenario, float]:
     return load("track_target", sets), rho
 
 
-def fly_lesson(seed: int, number: int) -> Lesson:
-    """Fly every arm in a training context."""
+def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
+    """Fly every arm in a training context; `by_torch`: scored by the torch detector, at fewer moments."""
     scenario, rho = draw_context(seed, number)
+    detector_of: DetectorOf = make_detector
+    if by_torch:
+        perception = scenario.perception.model_copy(update={"sample_rate_hz": TORCH_RATE_HZ})
+        scenario, detector_of = scenario.model_copy(update={"perception": perception}), torch_answers()
     mission = scenario.mission.phases[0].phase == "track"
     seen: list[tuple[float, ...]] = []
     aps = []
@@ -86,7 +93,7 @@ def fly_lesson(seed: int, number: int) -> Lesson:
                 seen.append(features(view, rho))
             return spend(view, ARMS[index], rho, "lesson")
 
-        record = run_sortie(scenario, decide)
+        record = run_sortie(scenario, decide, detector_of=detector_of)
         frames = list(matched(record, mission=mission).values())
         aps.append(average_precision(frames))
     settled = np.mean(seen[len(seen) // 2 :], axis=0)
@@ -95,17 +102,28 @@ def fly_lesson(seed: int, number: int) -> Lesson:
 
 
 def fly_lessons(
-    seed: int, count: int, *, workers: int = 1, progress: Callable[[int], None] | None = None
+    seed: int,
+    count: int,
+    *,
+    by_torch: bool = False,
+    workers: int = 1,
+    progress: Callable[[int], None] | None = None,
 ) -> list[Lesson]:
     """Lessons of so many contexts; those in which AP is undefined are left out."""
-    with ProcessPoolExecutor(max_workers=workers) as pool:
+    with ProcessPoolExecutor(max_workers=workers, initializer=_one_thread if by_torch else None) as pool:
         lessons = []
-        for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count))):
+        for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count)):
             if progress is not None:
                 progress(k + 1)
             if np.isfinite(lesson.ap).all():
                 lessons.append(lesson)
     return lessons
+
+
+def _one_thread() -> None:
+    import torch  # only where it is asked
+
+    torch.set_num_threads(1)  # processes side by side would fight for cores
 
 
 def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
@@ -141,20 +159,15 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
 
 
 def thresholds(lessons: list[Lesson]) -> dict[str, float]:
-    """Budgets from which on the first arm (maps to all) finds more than the last (boxes to all), for the cases that
-    `policies.adaptive` tells apart; cases without lessons are left out.
+    """Budgets from which on the first arm (maps to all) finds more than the last (boxes to all), by phase; phases without
+    lessons are left out.
 
     Where the mean gain of boxes falls through zero, by its slope over log budget between the two budgets flown; the least
     budget where boxes never gain, infinity where they gain at every one.
     """
-    overlap = FEATURES.index("mean overlap of peers")
-    search, track = ([s for s in lessons if (s.features[1] > 0.5) == tracking] for tracking in (False, True))
-    cases = {
-        "search": [s for s in search if s.features[overlap] < MUCH_OVERLAP],
-        "search, much overlap": [s for s in search if s.features[overlap] >= MUCH_OVERLAP],
-        "track": track,
-    }
-    return {name: _falls_through_zero(some) for name, some in cases.items() if some}
+    cases = {"search": False, "track": True}
+    some = {name: [s for s in lessons if (s.features[1] > 0.5) == tracking] for name, tracking in cases.items()}
+    return {name: _falls_through_zero(few) for name, few in some.items() if few}
 
 
 def _falls_through_zero(lessons: list[Lesson]) -> float:
@@ -167,8 +180,8 @@ def _falls_through_zero(lessons: list[Lesson]) -> float:
     return flown[0][0] if flown[0][1] <= 0 else float("inf")
 
 
-def save(path: Path, lessons: list[Lesson], seed: int) -> None:
+def save(path: Path, lessons: list[Lesson], seed: int, *, by_torch: bool = False) -> None:
     """Write the fit, with how it was made."""
     fitted = fit(lessons)
-    about = f"sortie learn, {len(lessons)} contexts of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
+    about = f"sortie learn{' --by-torch' * by_torch}, {len(lessons)} contexts of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
     write_text(path, json.dumps({"about": about, **fitted}, indent=1) + "\n")

@@ -20,13 +20,13 @@ from fleet.compact import Form
 from fleet.frames import up_vector
 from fleet.motion import fly
 from fleet.traces import follow, read_traces
-from perception.detectors import DetectsMany, make_detector
+from perception.detectors import Detector, DetectsMany, make_detector
 from perception.scene import SceneModel
 from perception.types import Capture
 from policies.contract import Disc, Policy
 from radio import Air
 from radio.rates import STANDARDS
-from scenarios.schema import Scenario
+from scenarios.schema import Perception, Scenario
 from scenarios.streams import stream
 from sim.adversity import group_key, schedule
 from sim.ether import Ether
@@ -62,6 +62,10 @@ def _not_collecting() -> Iterator[None]:
             gc.enable()
 
 
+DetectorOf = Callable[[SceneModel, Perception, int, int], Detector | None]
+"""As `perception.detectors.Constructor`; None flies without."""
+
+
 @_not_collecting()
 def run_sortie(
     scenario: Scenario,
@@ -71,6 +75,7 @@ def run_sortie(
     replication: int = 0,
     progress: Callable[[float], None] | None = None,
     observer: Observer | None = None,
+    detector_of: DetectorOf = make_detector,
 ) -> SortieRecord:
     """Fly one sortie from 0 to `scenario.duration_s` (exclusive) and return its record.
 
@@ -81,6 +86,7 @@ def run_sortie(
         replication: another draw of everything random, for campaigns.
         progress: called with the simulated time once a simulated second.
         observer: gets the new rows once a simulated second.
+        detector_of: makes the detector; left out, the one that the scenario names.
 
     Returns:
         The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
@@ -113,7 +119,7 @@ def run_sortie(
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
     keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
     ether = Ether(air, recorder, keys=keys, rates_mbps=STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz])
-    detector = make_detector(scene, config, seed, replication)
+    detector = detector_of(scene, config, seed, replication)
 
     def count_boxes(capture: Capture, roi: Disc | None) -> int:
         assert detector is not None  # noqa: S101

@@ -19,7 +19,7 @@ from perception.surrogate.collect import FLOOR, Asked, collect, read
 from perception.surrogate.fit import fit
 from perception.surrogate.judge import WITHIN, Verdict, judge
 from perception.surrogate.model import Parameters, save
-from perception.surrogate.plan import THRESHOLD, Split, draw_scene, scene_model
+from perception.surrogate.plan import MANNERS, THRESHOLD, Split, draw_scene, scene_model
 from perception.surrogate.rows import Rows, rows_of
 from perception.surrogate.together import hang_together, seen_by_several
 
@@ -93,7 +93,7 @@ def _asked(
     out = []
     for k in range(count):
         tell(f"the detector, {split} scenes", k, count)
-        out.append(read(collect(work, seed, split, k, 1, weights, key), split))
+        out += [read(collect(work, seed, split, k, m, weights, key), split) for m in range(len(MANNERS))]
     tell(f"the detector, {split} scenes", count, count)
     return out
 

@@ -1,4 +1,4 @@
-"""The torch detector's own runs: what it found for every job of a scene, one npz file a scene, kept where it exists."""
+"""The torch detector's own runs: what it found for every job of a moment, one npz file each, kept where it exists."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Probe(TorchDetector):
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One scene's runs.
+    """One moment's runs.
 
     `jobs` and the `boxes` of each; `ranks` of every capture in them, [2, 64, 64].
     """
@@ -59,6 +59,7 @@ class Asked:
     jobs: list[Job]
     boxes: list[Boxes]
     ranks: dict[Capture, NDArray[np.float32]]
+    moment: int = 0
 
 
 def captures_of(jobs: Sequence[Job]) -> list[Capture]:
@@ -66,32 +67,27 @@ def captures_of(jobs: Sequence[Job]) -> list[Capture]:
     return list(dict.fromkeys(c for job in jobs for c in (job.ego, *(s.capture for s in job.shares))))
 
 
-def collect(folder: Path, seed: int, split: Split, scene: int, moments: int, weights: Path | None, key: str) -> Path:
-    """Ask about `moments` moments of a scene and keep the answers, unless they are there already.
+def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weights: Path | None, key: str) -> Path:
+    """Ask about moment `index` of a scene and keep the answers, unless they are there already.
 
     Args:
         key: names the weights; answers of other weights have other files.
     """
-    path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{moments}.npz"
+    path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{index}.npz"
     if path.exists():
         return path
-    model = scene_model(draw_scene(seed, split, scene))
-    probe = Probe(model, scene_seed(seed, split, scene), weights)
-    boxes: list[Boxes] = []
-    ranks: list[NDArray[np.float32]] = []
-    for m in range(moments):
-        jobs = moment(seed, split, scene, m).jobs
-        boxes += [probe.ask(job) for job in jobs]
-        ranks += [probe.ranks(c) for c in captures_of(jobs)]
+    jobs = moment(seed, split, scene, index)
+    probe = Probe(scene_model(draw_scene(seed, split, scene)), scene_seed(seed, split, scene), weights)
+    boxes = [probe.ask(job) for job in jobs]
     folder.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
     joined = Boxes.join(boxes)
     np.savez(
         part,
-        of=np.array([seed, scene, moments]),
+        of=np.array([seed, scene, index]),
         count=np.array([len(b) for b in boxes]),
         boxes=np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
-        ranks=np.stack(ranks),
+        ranks=np.stack([probe.ranks(c) for c in captures_of(jobs)]),
     )
     part.replace(path)
     return path
@@ -100,13 +96,12 @@ def collect(folder: Path, seed: int, split: Split, scene: int, moments: int, wei
 def read(path: Path, split: Split) -> Asked:
     """The answers in a file, with the jobs drawn again."""
     with np.load(path, allow_pickle=False) as file:
-        seed, scene, moments = (int(v) for v in file["of"])
+        seed, scene, index = (int(v) for v in file["of"])
         count, table, ranks = file["count"], file["boxes"], file["ranks"]
-    asked = [moment(seed, split, scene, m).jobs for m in range(moments)]
-    jobs = [job for each in asked for job in each]
-    captures = [c for each in asked for c in captures_of(each)]
+    jobs = moment(seed, split, scene, index)
+    captures = captures_of(jobs)
     if len(jobs) != len(count) or len(captures) != len(ranks):
         raise ValueError(f"{path}: holds {len(count)} answers, the plan has {len(jobs)} jobs; remove it")
     parts = np.split(table, np.cumsum(count)[:-1])
     boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
-    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))
+    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)), index)

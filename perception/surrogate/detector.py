@@ -62,13 +62,14 @@ class SurrogateDetector:
         self._set(scene, config, load(path), seed, replication, scene.config.seed, str(path))
 
     @classmethod
-    def of(cls, scene: SceneModel, config: Perception, parameters: Parameters, draw: int) -> SurrogateDetector:
+    def of(
+        cls, scene: SceneModel, config: Perception, parameters: Parameters, draw: int, eyes: Eyes | None = None
+    ) -> SurrogateDetector:
         """The same from parameters in memory, for one of many draws of everything: of what is the town's as well, which is
-        the same for all sorties over it."""
+        the same for all sorties over it. `eyes` are the scene's, where they are at hand."""
         made = cls.__new__(cls)
-        made._set(
-            scene, config, parameters, scene.config.seed, draw, scene.config.seed + (draw << 40), "the calibration"
-        )
+        seed, town = scene.config.seed, scene.config.seed + (draw << 40)
+        made._set(scene, config, parameters, seed, draw, town, "the calibration", eyes)
         return made
 
     def _set(
@@ -80,6 +81,7 @@ class SurrogateDetector:
         replication: int,
         town: int,
         name: str,
+        eyes: Eyes | None = None,
     ) -> None:
         fitted = str(parameters.card["fusion"])
         if config.fusion not in (fitted, "none"):
@@ -88,7 +90,7 @@ class SurrogateDetector:
             )
         self.parameters, self.calibration = parameters, parameters.id
         self._scene, self._config = scene, config
-        self._eyes = Eyes(scene)
+        self._eyes = eyes or Eyes(scene)
         self._luck = Luck(seed, replication, town, self._eyes.traffic.count, parameters.alike)
         self._mirages = Mirages(town)
 
@@ -213,7 +215,7 @@ class SurrogateDetector:
         """False alarms: a drone's own, and those of things that others may see as well. One that comes at a rate also comes at
         a higher one."""
         p, ego = self.parameters, exchange.ego
-        rate = p.alarm_rates(alarm_covariates(exchange, looks, zeros, self._scene.config))
+        rate = p.alarm_rates(alarm_covariates(exchange, looks, fleet, zeros, self._scene.config))
         job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - p.mirages[0]) * rate)[:, :, None])
         own = _Alarms(job, self._pooled(band, luck.alarm_which[ego[job], band, k]))
         seen = self._seen(rate, ego, fleet, luck)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception import budget
 from perception.geometry import CELLS, FULL
-from perception.surrogate.features import Fleet, Ints, Looks, beside
+from perception.surrogate.features import Fleet, Ints, Looks, beside, square
 from perception.town import Floats
 from perception.types import Capture, Share
 from scenarios.schema import Scene
@@ -21,12 +21,12 @@ NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
 FUSED_COVARIATES = (
     "own", "first", "second", "mean", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
-    "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude",
+    "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude", "square",
 )  # fmt: skip
 
 ALARM_COVARIATES = (
     "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
-    "old_town", "suburb", "yard",
+    "old_town", "suburb", "yard", "square",
 )  # fmt: skip
 
 
@@ -181,7 +181,7 @@ def covariates(
     rank: NDArray[np.float32],
     zeros: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """What fusion makes of each pair depends on: [n, 22] float32, as `FUSED_COVARIATES`.
+    """What fusion makes of each pair depends on: [n, 23] float32, as `FUSED_COVARIATES`.
 
     Args:
         confidence: [looks] the logit that each drone gives each car on its own.
@@ -219,7 +219,7 @@ def covariates(
     own = looks.covariates[pairs.look]
     columns = (
         confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
-        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in (0, 3, 2, 1, 7, 8, 4, 12, 13)),
+        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in (0, 3, 2, 1, 7, 8, 4, 12, 13, 14)),
     )  # fmt: skip
     return beside(n, columns)
 
@@ -236,9 +236,11 @@ def mean_shift(
     return np.asarray(off / total[:, None], np.float32)
 
 
-def alarm_covariates(exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_], scene: Scene) -> NDArray[np.float32]:
-    """What the number of false alarms depends on, [m, 13] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
-    light, and how much of how many maps was sent."""
+def alarm_covariates(
+    exchange: Exchange, looks: Looks, fleet: Fleet, zeros: NDArray[np.bool_], scene: Scene
+) -> NDArray[np.float32]:
+    """What the number of false alarms depends on, [m, 14] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
+    light, how much of how many maps was sent, and whether the drone flies square to the streets."""
     m = len(exchange.ego)
     cars = np.diff(looks.first)[exchange.ego]
     shares = (exchange.sender >= 0).sum(axis=1)
@@ -249,7 +251,7 @@ def alarm_covariates(exchange: Exchange, looks: Looks, zeros: NDArray[np.bool_],
     shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
     columns = (
         np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
-        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in ALARM_COVARIATES[-3:]),
+        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in ("old_town", "suburb", "yard")), square(fleet.yaw_rad[exchange.ego]),
     )  # fmt: skip
     return beside(m, columns)
 

@@ -11,12 +11,13 @@ from perception.harness.statistics import compare
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import THRESHOLD, draw_scene, scene_model
+from perception.surrogate.plan import THRESHOLD, Disc, Job, draw_scene, scene_model
 from scenarios.schema import Perception
 
 WITHIN = 0.02
 """The error of AP that a calibration is to keep."""
 REPEATS = 8
+IN_DISC = ", in the disc"
 CONTRASTS = (
     ("alone", "all-4, ρ = 0.01"), ("alone", "all-4, ρ = 0.25"), ("alone", "all-4, ρ = 0.25, 32 m"), ("alone", "detections"),
     ("all-4, ρ = 0.05", "all-4, ρ = 0.25"), ("all-4, ρ = 0.25", "all-4, ρ = 1"), ("detections", "all-4, ρ = 0.25"),
@@ -24,6 +25,11 @@ CONTRASTS = (
     ("detections", "detections, averaged"), ("all-4, ρ = 1", "detections, averaged"),
     ("nearest 2, ρ = 0.5", "farthest 2, ρ = 0.5"), ("all-4, ρ = 0.25, 0.4 s older", "all-4, ρ = 0.25"),
     ("all-4, ρ = 0.25, zeros", "all-4, ρ = 0.25"),
+    *((f"street: {a}{where}", f"street: {b}{where}") for where in ("", IN_DISC) for a, b in (
+        ("alone", "all-4, ρ = 0.025"), ("alone", "detections"), ("all-4, ρ = 0.025", "all-4, ρ = 0.35"),
+        ("detections", "all-4, ρ = 0.35"), ("detections", "detections, averaged"), ("all-4, ρ = 0.35", "detections, averaged"),
+        ("all-4, ρ = 0.1, 32 m", "all-4, ρ = 0.1"),
+    )),
 )  # fmt: skip
 """Policies whose order is judged, in pairs."""
 
@@ -91,16 +97,22 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
                     truths = list(detector.truth_many([j.ego.t_s for j in asked.jobs], [j.ego for j in asked.jobs]))
                 jobs = [[(asked.jobs[i].ego, asked.jobs[i].shares)] for i in mine]
                 for i, boxes in zip(mine, detector.detect_many(jobs), strict=True):
-                    name = asked.jobs[i].condition
-                    ours.setdefault(name, []).append(match(boxes, truths[i]))
-                    if repeat == 0:
-                        found = asked.boxes[i].take(asked.boxes[i].score >= THRESHOLD)
-                        theirs.setdefault(name, []).append(match(found, truths[i]))
-                        scenes.setdefault(name, []).append(asked.scene)
+                    for name, disc in _regions(asked.jobs[i]):
+                        ours.setdefault(name, []).append(match(boxes, truths[i], disc))
+                        if repeat == 0:
+                            found = asked.boxes[i].take(asked.boxes[i].score >= THRESHOLD)
+                            theirs.setdefault(name, []).append(match(found, truths[i], disc))
+                            scenes.setdefault(name, []).append(asked.scene)
     ap = {name: (average_precision(theirs[name]), average_precision(ours[name])) for name in theirs}
     levels = [Level(name, a, b, b - a, len(theirs[name])) for name, (a, b) in ap.items()]
     orders = []
-    for a, b in CONTRASTS:
+    for a, b in (pair for pair in CONTRASTS if ap.keys() >= set(pair)):
         d = compare(theirs[a], theirs[b], scenes[a])
         orders.append(Order(a, b, d.delta, d.low, d.high, ap[b][1] - ap[a][1]))
     return Verdict(levels, orders)
+
+
+def _regions(job: Job) -> list[tuple[str, Disc | None]]:
+    """Where the job's condition is judged, and under which name."""
+    everywhere: list[tuple[str, Disc | None]] = [(job.condition, None)]
+    return everywhere if job.disc is None else [*everywhere, (job.condition + IN_DISC, job.disc)]

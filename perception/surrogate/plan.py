@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from perception.joining import Rule
@@ -17,6 +18,10 @@ from scenarios.streams import stream
 
 Split = Literal["fit", "held-out"]
 SPLITS: dict[Split, int] = {"fit": 1, "held-out": 2}
+Manner = Literal["anywhere", "street"]
+MANNERS: tuple[Manner, ...] = ("anywhere", "street")
+"""How a scene's first moment is flown, and its second: anywhere and turned anyhow, or along the street through the origin as
+sorties are, with cars that stand square on every drone's map."""
 AREA_M = 60.0
 """The fleet's middle lies within ± this of the scene's origin."""
 DRONES = 5
@@ -30,7 +35,11 @@ _SHAPES = {
     "cross": np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64),
     "line": np.array([(0, 0), (0, 1), (0, 2), (0, -1), (0, -2)], dtype=np.float64),
     "wedge": np.array([(0, 0), (-1, 1), (-1, -1), (-2, 2), (-2, -2)], dtype=np.float64) / np.sqrt(2),
+    "circle": np.array([(np.cos(a), np.sin(a)) for a in np.arange(5) * 2 * np.pi / 5]) / (2 * np.sin(np.pi / 5)),
 }
+Disc = tuple[float, float, float]
+Fleets = tuple[list[Capture], dict[float, list[Capture]]]
+"""A fleet's captures now, and a little earlier by how much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +53,8 @@ class Job:
     condition: str
     """Jobs of one condition are judged together; empty where they are only fitted."""
     join: Rule = "nms"
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """One fleet in one scene at one time, and what is asked of it."""
-
-    index: int
-    jobs: tuple[Job, ...]
+    disc: Disc | None = None
+    """A mission's disc in which the condition is judged as well."""
 
 
 def scene_seed(seed: int, split: Split, index: int) -> int:
@@ -89,20 +92,21 @@ def scene_model(config: Scene) -> SceneModel:
     return SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
 
 
-def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> Moment:
+def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Job]:
     """What is asked at moment `index` of a scene.
 
     For the fit, every drone is asked alone and under two drawn exchanges. Held out, the first `condition_egos` drones are
-    asked under every one of `conditions`.
+    asked under every condition of the moment's manner.
     """
     rng = stream(scene_seed(seed, split, scene), 0, index, "calibrate.fleet")
-    now, old = _fleet(rng, split)
+    manner = MANNERS[index]
+    now, old = _on_street(rng) if manner == "street" else _anywhere(rng, split)
     if split == "held-out":
+        asked = street_conditions if manner == "street" else conditions
         egos = rng.permutation(DRONES)[:condition_egos]
-        return Moment(index, tuple(job for ego in egos for job in conditions(int(ego), now, old)))
+        return [job for ego in egos for job in asked(int(ego), now, old)]
     jobs = [Job(ego, (), "masked", "confidence", "") for ego in now]
-    jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(2)]
-    return Moment(index, tuple(jobs))
+    return jobs + [_exchange(rng, ego, now, old) for ego in now for _ in range(2)]
 
 
 def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Job]:
@@ -120,7 +124,7 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         unsent: Literal["masked", "zero"] = "masked",
         *,
         cells_by: Literal["confidence", "norm"] = "confidence",
-        roi: tuple[float, float, float] | None = None,
+        roi: Disc | None = None,
         age_s: float = 0.0,
         representation: str = "features",
         weight: float = 1.0,
@@ -153,7 +157,34 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         yield job(f"nearest 2, ρ = 0.1, boxes of the others, {rule}", 0.1, near[:2], boxes_of=near[2:], join=rule)
 
 
-def _fleet(rng: np.random.Generator, split: Split) -> tuple[list[Capture], dict[float, list[Capture]]]:
+def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Job]:
+    """One drone of a fleet that flies along a street, under exchanges as sorties have them; the mission's disc is about the
+    fleet's middle."""
+    peers = [i for i in range(len(now)) if i != ego]
+    x, y, _ = np.mean([c.position_m for c in now], axis=0)
+    disc = (float(x), float(y), 32.0)
+
+    def job(
+        name: str,
+        rho: float,
+        of: list[Capture] = now,
+        representation: str = "features",
+        roi: Disc | None = None,
+        join: Rule = "nms",
+    ) -> Job:
+        shares = tuple(Share(of[i], representation, rho, roi, 1.0) for i in peers if name != "alone")
+        return Job(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
+
+    yield job("alone", 0.0)
+    for rho in (0.006, 0.025, 0.1, 0.35):
+        yield job(f"all-4, ρ = {rho:g}", rho)
+    yield job("all-4, ρ = 0.1, 32 m", 0.1, roi=disc)
+    yield job("all-4, ρ = 0.1, 0.1 s older", 0.1, old[0.1])
+    yield job("detections", 0.0, representation="detections")
+    yield job("detections, averaged", 0.0, representation="detections", join="average")
+
+
+def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
     """A jittered formation of five, 60 m up or so, now and a little earlier, with attitude and pose errors."""
     u = rng.random(9)
     t_s = float(np.round(5 + 295 * u[0], 3))
@@ -166,23 +197,56 @@ def _fleet(rng: np.random.Generator, split: Split) -> tuple[list[Capture], dict[
     heading, speed = 2 * np.pi * u[7], 8 * u[8]
     c, s = np.cos(heading), np.sin(heading)
     slots = rng.uniform(-AREA_M, AREA_M, 2) + spacing * _SHAPES[shape] @ np.array([[c, s], [-s, c]])
-    now: list[Capture] = []
-    old: dict[float, list[Capture]] = {age: [] for age in AGES_S}
-    for drone, slot in enumerate(slots):
-        x, y, z = np.array([*slot, altitude]) + 0.5 * rng.normal(size=3)
+    poses = []
+    for slot in slots:
+        place = np.array([*slot, altitude]) + 0.5 * rng.normal(size=3)
         yaw = heading + np.radians(1.0) * rng.normal()
         roll, pitch = np.radians(3.0) * rng.normal(size=2)
-        error, turn = position_error * rng.normal(size=3), heading_error * rng.normal()
+        poses.append((place, (yaw, pitch, roll), position_error * rng.normal(size=3), heading_error * rng.normal()))
+    return _captures(t_s, heading, speed, poses)
+
+
+def _on_street(rng: np.random.Generator) -> Fleets:
+    """A formation of five along the street through the origin, one way or the other: nose down by half a degree for each metre
+    a second, heights known, everything else as a sortie's defaults are."""
+    u = rng.random(6)
+    t_s = float(np.round(5 + 295 * u[0], 3))
+    shape, spacing = list(_SHAPES)[int(4 * u[1])], 14 + 12 * u[2]
+    heading, speed = np.pi / 2 * int(4 * u[3]), 10 * u[4]
+    c, s = np.cos(heading), np.sin(heading)
+    along, across = AREA_M * (2 * u[5] - 1), 2.0 * rng.normal()
+    slots = (np.array([along, across]) + spacing * _SHAPES[shape]) @ np.array([[c, s], [-s, c]])
+    poses = []
+    for slot in slots:
+        place = np.array([*slot, 60.0]) + 0.5 * rng.normal(size=3)
+        yaw = heading + np.radians(0.15) * rng.normal()
+        pitch, roll = np.radians(0.5 * speed + 1.7 * rng.normal()), np.radians(2.0) * rng.normal()
+        error = np.array([*(0.2 * rng.normal(size=2)), 0.0])
+        poses.append((place, (yaw, pitch, roll), error, np.radians(0.2) * rng.normal()))
+    return _captures(t_s, heading, speed, poses)
+
+
+def _captures(
+    t_s: float,
+    heading: float,
+    speed_mps: float,
+    poses: list[tuple[NDArray[np.float64], tuple[float, float, float], NDArray[np.float64], float]],
+) -> Fleets:
+    """Each drone's captures from its place, attitude (yaw, pitch, roll) and errors of position and heading."""
+    now: list[Capture] = []
+    old: dict[float, list[Capture]] = {age: [] for age in AGES_S}
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    for drone, (at, attitude, error, turn) in enumerate(poses):
+        q = Rotation.from_euler("ZYX", attitude).as_quat()
         for age in (0.0, *AGES_S):
-            q = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
-            place = np.array([x - c * speed * age, y - s * speed * age, z])
+            place = at - ahead * speed_mps * age
             capture = Capture(
                 drone,
                 float(np.round(t_s - age, 3)),
                 (float(place[0]), float(place[1]), float(place[2])),
                 (float(q[0]), float(q[1]), float(q[2]), float(q[3])),
                 tuple(float(v) for v in place + error),  # type: ignore[arg-type]
-                float(yaw + turn),
+                float(attitude[0] + turn),
             )
             (old[age] if age else now).append(capture)
     return now, old

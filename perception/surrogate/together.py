@@ -7,7 +7,7 @@ boxes of all drones joined gain what the detector's own gain. Of false alarms it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from perception.ap import Matched, average_precision, match
 from perception.geometry import in_square
 from perception.joining import NMS_IOU, Rule, Told, joined
 from perception.overlap import iou_pairs, near_pairs
+from perception.scene import SceneModel
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.features import Eyes, Fleet
@@ -45,14 +46,16 @@ def hang_together(
     Averaged ones tell how far errors of place do: of a part of 0 … 0.5 of the cars they have one sign for all. Each changes the other's gain a
     little, so the factor is looked for again.
     """
-    wanted = {rule: _gain(parameters, asked, seed, threshold, rule, own=True) for rule in ("nms", "average")}
+    scenes = {k: scene_model(draw_scene(seed, "fit", k)) for k in dict.fromkeys(a.scene for a in asked)}
+    towns = {k: (scene, Eyes(scene)) for k, scene in scenes.items()}  # a part of a second each, and asked for often
+    wanted = {rule: _gain(parameters, asked, towns, threshold, rule, own=True) for rule in ("nms", "average")}
     steps = 2 * len(FACTORS) + len(PARTS)
 
     def best(base: Parameters, change: Change, values: Sequence[float], rule: Rule, done: int) -> Parameters:
         found = list[float]()
         for k, value in enumerate(values):
             tell(done + k, steps)
-            found.append(_gain(change(base, value), asked, seed, threshold, rule))
+            found.append(_gain(change(base, value), asked, towns, threshold, rule))
             if found[-1] <= wanted[rule]:
                 break
         # gains fall with either; the noise of few scenes apart
@@ -79,9 +82,9 @@ def _with_common(parameters: Parameters, part: float) -> Parameters:
 def _gain(
     parameters: Parameters,
     asked: Sequence[Asked],
-    seed: int,
+    towns: Mapping[int, tuple[SceneModel, Eyes]],
     threshold: float,
-    rule: Rule = "nms",
+    rule: Rule,
     *,
     own: bool = False,
 ) -> float:
@@ -89,11 +92,11 @@ def _gain(
     alone, together = list[Matched](), list[Matched]()
     config = Perception(score_threshold=threshold)
     for a in asked:
-        scene = scene_model(draw_scene(seed, a.split, a.scene))
+        scene, eyes = towns[a.scene]
         answers = [(j.ego, b) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
         egos = [ego for ego, _ in answers]
         for repeat in range(1 if own else REPEATS):
-            detector = SurrogateDetector.of(scene, config, parameters, repeat)
+            detector = SurrogateDetector.of(scene, config, parameters, repeat, eyes)
             truths = detector.truth_many([e.t_s for e in egos], egos)
             if own:
                 boxes = [b.take(b.score >= threshold) for _, b in answers]

@@ -13,7 +13,7 @@ def asked(parameters: Parameters, scenes: int) -> list[Asked]:
     """What a surrogate would have answered where the detector is asked."""
     out = []
     for scene in range(scenes):
-        jobs = [j for j in moment(0, "fit", scene, 0).jobs if not j.shares]
+        jobs = [j for j in moment(0, "fit", scene, 0) if not j.shares]
         detector = SurrogateDetector.of(
             scene_model(draw_scene(0, "fit", scene)), Perception(score_threshold=0.1), parameters, 5
         )

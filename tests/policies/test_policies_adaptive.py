@@ -8,7 +8,7 @@ from policies_examples import fleet_of
 
 from policies import adaptive as a
 from policies.baselines import everyone
-from policies.contract import Descriptor, FleetView, Representation, TaskPhase
+from policies.contract import Representation, TaskPhase
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE
 
@@ -60,38 +60,23 @@ def test_maps_to_all_are_what_the_fixed_policy_sends(goodput: float) -> None:
     assert a.spend(view, a.MAPS, 0.1, "") == everyone(view, rho=0.1)
 
 
-def spread(view: FleetView, by: float) -> FleetView:
-    """The same fleet, `by` times as far apart: less overlap."""
-
-    def moved(d: Descriptor) -> Descriptor:
-        x_m, y_m, z_m = d.position_m
-        return d._replace(position_m=(by * x_m, by * y_m, z_m))
-
-    return view._replace(descriptors={i: moved(d) for i, d in view.descriptors.items()})
-
-
-@pytest.mark.parametrize(
-    ("phase", "apart", "rho", "expected"),
-    [
-        (TaskPhase.SEARCH, 3.0, 0.01, BOXES),
-        (TaskPhase.SEARCH, 3.0, 1.0, BOXES),
-        (TaskPhase.SEARCH, 0.5, 0.043, BOXES),
-        (TaskPhase.SEARCH, 0.5, 0.044, FEATURES),
-        (TaskPhase.TRACK, 3.0, 0.422, BOXES),
-        (TaskPhase.TRACK, 3.0, 0.423, FEATURES),
-    ],
-)
-def test_budget_mission_and_coverage_decide_together(
-    phase: TaskPhase, apart: float, rho: float, expected: Representation
-) -> None:
-    view = spread(fleet_of(5, phase=phase, goodput=1000.0), apart)
-    assert set(rungs(a.adaptive(view, rho=rho))) == {expected}
+@pytest.mark.parametrize("rho", [0.004, 0.05, 1.0])
+def test_a_region_is_worth_its_cells_and_the_rest_boxes(rho: float) -> None:
+    searching = a.adaptive(fleet_of(5, phase=TaskPhase.SEARCH, goodput=1000.0), rho=rho)
+    assert rungs(searching) == [BOXES] * 4
+    view = fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0)
+    tracking = a.adaptive(view, rho=rho)
+    assert rungs(tracking) == [FEATURES] * 4
+    assert {d.roi for d in tracking} == {view.descriptors[0].region}
+    assert sum(d.rho for d in tracking) == pytest.approx(4 * rho, rel=0.01) or rho == 1.0, "as far as the air carries"
 
 
-def test_links_that_carry_no_cells_carry_boxes() -> None:
-    view = spread(fleet_of(5, goodput=3.0), 0.5)  # carries 0.007 of a map a link
-    assert set(rungs(a.adaptive(view, rho=0.2))) == {BOXES}
-    assert set(rungs(a.adaptive(spread(fleet_of(5, goodput=40.0), 0.5), rho=0.2))) == {FEATURES}
+def test_hardly_any_cells_are_worth_less_than_boxes() -> None:
+    view = fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0)
+    assert rungs(a.adaptive(view, rho=0.0019)) == [BOXES] * 4
+    assert rungs(a.adaptive(view, rho=0.002)) == [FEATURES] * 4
+    weak = fleet_of(5, phase=TaskPhase.TRACK, goodput=0.5)  # carries 0.001 of a map a link
+    assert rungs(a.adaptive(weak, rho=0.2)) == [BOXES] * 4
 
 
 def test_the_learned_policy_takes_the_arm_of_the_highest_prediction() -> None:

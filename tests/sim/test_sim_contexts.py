@@ -12,13 +12,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from perception.scene import SceneModel
+from perception.surrogate.detector import SurrogateDetector
+from perception.types import Boxes, Capture
 from policies.adaptive import ARMS, FEATURES, read_model
 from policies.registry import POLICIES
 from scenarios.contexts import Contexts
 from scenarios.load import ScenarioError, context_sets, library, load_contexts
+from scenarios.schema import Perception
 from sim import cli_contexts, learn
 from sim.cli import main
-from sim.contexts import Cell, best_fixed, paired_interval, scenario_of, summarise
+from sim.contexts import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
+from sim.in_flight import torch_answers
 from sim.learn import Lesson, draw_context, fit, save
 
 SMALL = """
@@ -113,6 +118,51 @@ def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: p
     assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
 
 
+class Seer:
+    """In the torch detector's place: finds every car, and notes what it is asked."""
+
+    asked = 0
+
+    def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: object) -> None:
+        self._truth = SurrogateDetector(scene, config.model_copy(update={"weights": None}), seed)
+
+    def detect(self, jobs: list[tuple[Capture, object]]) -> list[Boxes]:
+        Seer.asked += len(jobs)
+        return [self._truth.truth(ego.t_s + 0.06, ego) for ego, _ in jobs]
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        return self._truth.truth(t_s, ego)
+
+    def camera_views(self, capture: Capture) -> None: ...
+
+
+def test_contexts_are_scored_by_torch_over_the_surrogates_traffic(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL)
+    contexts = load_contexts(path)
+    assert contexts is not None
+    ours = fly_all(contexts, ["all-4", "boxes"])
+    monkeypatch.setattr("perception.detector.TorchDetector", Seer)
+    theirs = fly_all(contexts, ["all-4", "boxes"], detector_of=torch_answers())
+    assert [c.data_bytes for c in theirs] == [c.data_bytes for c in ours]
+    assert all(c.ap > 0.9 for c in theirs)
+    assert Seer.asked == 2 * 2 * 5 * 6  # policies, contexts, drones, moments
+
+
+def test_a_lesson_by_torch_asks_it_at_fewer_moments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("perception.detector.TorchDetector", Seer)
+    monkeypatch.setattr(learn, "SECONDS", 4)
+    before = Seer.asked
+    lesson = learn.fly_lesson(0, 6, by_torch=True)
+    assert min(lesson.ap) > 0.8
+    assert Seer.asked - before == len(ARMS) * 5 * 2
+    ours = learn.fly_lesson(0, 6)
+    assert lesson.features == ours.features
+    assert max(ours.ap) < 0.9
+
+
 def test_the_tables_fit_a_narrow_terminal() -> None:
     """As many policies side by side as there is room for; no figure is cut off."""
     contexts = held_out("contexts")
@@ -175,15 +225,14 @@ def test_gains_by_phase_and_budget_by_hand() -> None:
 
 
 def test_boxes_are_worth_it_up_to_where_their_gain_falls_through_zero() -> None:
-    def lesson(rho: float, tracking: float, overlap: float, gain: float) -> Lesson:
-        return Lesson((np.log10(rho), tracking, overlap, 2.0, 0.9), (0.3, 0.2, 0.3 + gain), "")
+    def lesson(rho: float, tracking: float, gain: float) -> Lesson:
+        return Lesson((np.log10(rho), tracking, 0.6, 2.0, 0.9), (0.3, 0.2, 0.3 + gain), "")
 
-    falls = [lesson(0.01, 1.0, 0.5, 0.03), lesson(0.01, 1.0, 0.9, 0.01), lesson(0.04, 1.0, 0.5, -0.02)]
-    never = [lesson(0.01, 0.0, 0.5, -0.01), lesson(0.2, 0.0, 0.5, -0.03)]
-    always = [lesson(0.01, 0.0, 0.9, 0.01), lesson(0.6, 0.0, 0.9, 0.02)]
-    found = learn.thresholds([*falls, *never, *always])
-    assert found == pytest.approx({"search": 0.01, "search, much overlap": np.inf, "track": 0.02})
-    assert learn.thresholds(falls) == pytest.approx({"track": 0.02})
+    falls = [lesson(0.01, 1.0, 0.03), lesson(0.01, 1.0, 0.01), lesson(0.04, 1.0, -0.02)]
+    never = [lesson(0.01, 0.0, -0.01), lesson(0.2, 0.0, -0.03)]
+    always = [lesson(0.01, 0.0, 0.01), lesson(0.6, 0.0, 0.02)]
+    assert learn.thresholds([*falls, *never]) == pytest.approx({"search": 0.01, "track": 0.02})
+    assert learn.thresholds(always) == {"search": np.inf}
 
 
 def test_one_lesson_leaves_no_slope() -> None:

@@ -1,0 +1,140 @@
+"""What a calibration asks the detector, keeps, and is judged by; the detector itself is played by others here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perception.surrogate import collect as collecting
+from perception.surrogate.collect import Asked, captures_of, collect, read
+from perception.surrogate.features import square
+from perception.surrogate.judge import IN_DISC, judge
+from perception.surrogate.model import SHIPPED, load
+from perception.surrogate.plan import AREA_M, MANNERS, Job, draw_scene, moment, scene_model
+from perception.types import Boxes, Capture
+
+STREET = MANNERS.index("street")
+
+
+def test_square_is_along_or_across_the_cells() -> None:
+    turn = np.radians([0, 90, -180, 3, 87, -3, 45])
+    np.testing.assert_allclose(square(turn), [1, 1, 1, np.exp(-1), np.exp(-1), np.exp(-1), np.exp(-15)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("split", ["fit", "held-out"])
+def test_along_a_street_drones_fly_as_sorties_do(split: Any) -> None:
+    ways, speeds = set(), []
+    for scene in range(40):
+        jobs = moment(0, split, scene, STREET)
+        egos = {j.ego.drone: j.ego for j in jobs}
+        for ego in egos.values():
+            assert float(square(np.array(ego.true_yaw_rad))) > 0.7  # within a degree
+            assert ego.est_position_m[2] == ego.position_m[2]
+            assert 56 < ego.position_m[2] < 64
+        ways.add(round(np.degrees(ego.true_yaw_rad) / 90) % 4)
+        x, y, _ = np.median([e.position_m for e in egos.values()], axis=0)
+        assert max(abs(x), abs(y)) < AREA_M + 60
+        older = [s.capture for j in jobs for s in j.shares if s.capture.t_s < j.ego.t_s]
+        now = {c.drone: c for j in jobs for c in (j.ego, *(s.capture for s in j.shares)) if c.t_s == j.ego.t_s}
+        speeds += [
+            np.hypot(*np.subtract(now[c.drone].position_m, c.position_m)[:2]) / (now[c.drone].t_s - c.t_s)
+            for c in older
+            if c.drone in now
+        ]
+    assert ways == {0, 1, 2, 3}
+    assert 4 < np.mean(speeds) < 6
+    assert max(speeds) < 10.1
+
+
+def test_an_older_capture_is_of_the_same_flight() -> None:
+    """At either manner the drone was behind where it is now, with the same attitude and the same error."""
+    for index in range(len(MANNERS)):
+        captures = captures_of([j for scene in range(20) for j in moment(3, "fit", scene, index)])
+        now = {c.drone: c for c in captures if c.t_s == max(d.t_s for d in captures)}
+        for old in [c for c in captures if c.t_s != max(d.t_s for d in captures) and c.drone in now]:
+            error = np.subtract(old.est_position_m, old.position_m)
+            if now[old.drone].orientation_xyzw == old.orientation_xyzw:
+                np.testing.assert_allclose(
+                    error, np.subtract(now[old.drone].est_position_m, now[old.drone].position_m), atol=1e-9
+                )
+
+
+class Told:
+    """A detector that says what it is asked: a box at every drone that takes part."""
+
+    asked = 0
+
+    def __init__(self, *_: object) -> None: ...
+
+    def ask(self, job: Job) -> Boxes:
+        Told.asked += 1
+        drones = [job.ego, *(s.capture for s in job.shares)]
+        rows = np.array([(*d.position_m[:2], 4.5, 1.9, 0.0, 1 / (1 + k)) for k, d in enumerate(drones)])
+        return Boxes.placed(rows, (0.0, 0.0, 0.0))
+
+    def ranks(self, capture: Capture) -> np.ndarray:
+        return np.full((2, 64, 64), capture.drone, np.float32)
+
+
+def test_answers_are_kept_and_not_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "Probe", Told)
+    for split in ("fit", "held-out"):
+        for index in range(len(MANNERS)):
+            path = collect(tmp_path, 0, split, 3, index, None, "key")
+            jobs, before = moment(0, split, 3, index), Told.asked
+            assert collect(tmp_path, 0, split, 3, index, None, "key") == path
+            assert Told.asked == before
+            kept = read(path, split)
+            assert kept.jobs == jobs
+            assert [len(b) for b in kept.boxes] == [1 + len(j.shares) for j in jobs]
+            np.testing.assert_allclose(kept.boxes[-1].xy_m[0], jobs[-1].ego.position_m[:2], rtol=1e-6)
+            assert all((ranks == c.drone).all() for c, ranks in kept.ranks.items())
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_answers_to_another_plan_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "Probe", Told)
+    path = collect(tmp_path, 0, "held-out", 0, STREET, None, "key")
+    monkeypatch.setattr(collecting, "moment", lambda *at: moment(*at)[:-1])
+    with pytest.raises(ValueError) as error:
+        read(path, "held-out")
+    count = len(moment(0, "held-out", 0, STREET))
+    assert str(error.value) == f"{path}: holds {count} answers, the plan has {count - 1} jobs; remove it"
+
+
+def test_the_disc_is_judged_beside_the_scene() -> None:
+    """A detector that finds all cars in the disc and none elsewhere has an AP of 1 there, and of their share in the scene."""
+    cars: list[int] = []
+    inside: list[int] = []
+
+    def answered(scene: int) -> Asked:
+        jobs = moment(0, "held-out", scene, STREET)
+        truths = truth_of(scene, jobs)
+        for t, j in zip(truths, jobs, strict=True):
+            if j.condition == "street: alone":
+                cars.append(len(t))
+                inside.append(len(t.inside(j.disc)))
+        boxes = [t.inside(j.disc) for t, j in zip(truths, jobs, strict=True)]
+        return Asked("held-out", scene, jobs, boxes, {}, STREET)
+
+    parameters = load(SHIPPED)
+    verdict = judge(replace(parameters), [answered(s) for s in range(3)])
+    level = {v.condition: v for v in verdict.levels}
+    assert level["street: alone" + IN_DISC].torch == 1.0
+    assert level["street: alone"].torch == pytest.approx(sum(inside) / sum(cars))
+    assert 0.2 < level["street: alone" + IN_DISC].surrogate < 0.9
+    assert all(o.torch == 0.0 and not o.significant for o in verdict.orders)
+
+
+def truth_of(scene: int, jobs: Sequence[Job]) -> list[Boxes]:
+    from perception.detector import ground_truth
+    from perception.geometry import FULL
+
+    model = scene_model(draw_scene(0, "held-out", scene))
+    half = FULL.half_extent_m
+    return [ground_truth(model, j.ego.t_s, j.ego.position_m[:2], half, j.ego.true_yaw_rad) for j in jobs]

@@ -1,0 +1,74 @@
+"""Both detectors on what one flight asks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sim_examples import BASE
+
+from perception.surrogate.model import SHIPPED
+from scenarios.load import load, load_contexts
+from scenarios.schema import Scenario
+from sim.in_flight import Level, flights, means
+from sim.outcome import accuracy
+from sim.record import SortieRecord
+from sim.sortie import run_sortie
+
+
+def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[Level]:
+    return [Level(policy, f"c{k}", region, a, b) for k, (a, b) in enumerate(zip(torch, surrogate, strict=True))]
+
+
+def test_means_and_gains_by_hand() -> None:
+    both = levels("all-4", [0.3, 0.4, 0.5], [0.31, 0.42, 0.53]) + levels("boxes", [0.5, 0.5, 0.5], [0.5, 0.5, 0.53])
+    found = {m.what: m for m in means(both)}
+    assert list(found) == ["all-4", "boxes", "boxes − all-4"]
+    assert found["all-4"].torch[0] == pytest.approx(0.4)
+    assert found["all-4"].surrogate == pytest.approx(0.42)
+    assert found["all-4"].error[0] == pytest.approx(0.02)
+    assert found["boxes − all-4"].torch[0] == pytest.approx(0.1)
+    assert found["boxes − all-4"].error[0] == pytest.approx(-0.01)
+    for m in found.values():
+        assert m.torch[1] <= m.torch[0] <= m.torch[2]
+        assert m.error[1] <= m.error[0] <= m.error[2]
+
+
+def test_regions_are_told_apart_and_those_without_a_disc_left_out() -> None:
+    both = levels("all-4", [0.3, 0.4], [0.3, 0.4]) + levels("all-4", [0.7], [0.6], "mission")
+    assert [(m.what, m.region) for m in means(both)] == [("all-4", "full_scene"), ("all-4", "mission")]
+    assert next(m for m in means(both) if m.region == "mission").error == pytest.approx((-0.1, -0.1, -0.1))
+    assert not [m for m in means(levels("all-4", [0.3], [0.3])) if np.isnan(m.surrogate)]
+
+
+@pytest.mark.slow
+def test_the_torch_detector_is_asked_what_its_own_sortie_asks(tmp_path: Path) -> None:
+    """All-4 sends maps alone, so traffic is the same whichever detector counts boxes."""
+    (path := tmp_path / "example.yaml").write_text(BASE)
+    found = {v.region: v for v in flights(str(path), SHIPPED, None, 0.5, ["all-4"])}
+    sets = ["perception.detector=torch", "perception.sample_rate_hz=0.5", "policy.name=all-4", "policy.params={}"]
+    scenario = load(path, sets)
+    own = accuracy(run_sortie(scenario))
+    assert {r: v.torch for r, v in found.items()} == pytest.approx(own)
+    ours = scenario.model_copy(update={"perception": scenario.perception.model_copy(update={"detector": "surrogate"})})
+    assert {r: v.surrogate for r, v in found.items()} == pytest.approx(accuracy(run_sortie(ours)))
+
+
+def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the surrogate in the torch detector's place, so that both say the same."""
+    flown = []
+
+    def fly(scenario: Scenario, policy: None, seed: int, *, detector_of: object) -> SortieRecord:
+        flown.append((scenario.policy.name, scenario.policy.params.get("rho"), seed))
+        return run_sortie(scenario.model_copy(update={"duration_s": 1.0}), policy, seed)
+
+    monkeypatch.setattr("sim.in_flight.run_sortie", fly)
+    told: list[tuple[str, int, int]] = []
+    found = list(flights("contexts", SHIPPED, None, 2.0, ["silence", "all-4"], lambda *at: told.append(at)))
+    contexts = load_contexts("contexts")
+    assert contexts is not None
+    assert told[-1] == ("contexts by both detectors", 2 * len(contexts.contexts), 2 * len(contexts.contexts))
+    assert flown[2:4] == [("all-4", contexts.contexts[0].rho, contexts.seeds[0])] * 2
+    assert {v.context for v in found} == {c.name for c in contexts.contexts}
+    assert all(v.torch == v.surrogate for v in found)
