@@ -1,7 +1,7 @@
 """Adaptive policies: one byte budget, spent by what mission, link, battery and geometry ask for.
 
 Each decision picks an arm, a way to spend the budget: to how many peers, features or boxes, all that is seen or the
-mission's region alone. `adaptive` picks by rules that read mission, budget and links jointly; `learned` asks a
+mission's region alone. `adaptive` picks by rules that read mission, coverage, budget and links jointly; `learned` asks a
 linear model that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
 
 `rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies: at equal
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from policies.coverage import sees
 from policies.geometry import footprint_overlap, peers_by_overlap
 
 RATE_HZ = 10.0
@@ -121,16 +122,19 @@ def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
 
 def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Rules over mission, budget and links: of a region that is tracked its feature cells, otherwise boxes.
+    """Rules over mission, coverage, budget and links: of a region that is tracked and seen its feature cells, otherwise boxes.
 
     A region is small, so that even a starved budget sends the cells that count, and maps of them find more than boxes; of
-    the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`).
+    the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`). Who sees
+    nothing of the region well has no cells of it to send.
     """
     me = view.me
     if me is None:
         return []
     if me.task_phase != TaskPhase.TRACK or me.region is None:
         return spend(view, BOXES, rho, "no region")
+    if not sees(me, me.region):
+        return spend(view, BOXES, rho, "a region out of sight")
     through = min(rho, carried(me, view.peers))
     if through < FEW:
         return spend(view, BOXES, rho, f"a region, budget and links {through:.2g} < {FEW:.2g}")

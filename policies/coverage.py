@@ -51,6 +51,15 @@ def disc_around(cells: Cells) -> Disc:
     return Disc(x * COVERAGE_CELL_M, y * COVERAGE_CELL_M, reach * COVERAGE_CELL_M + _HALF_DIAGONAL_M)
 
 
+def sees(d: Descriptor, disc: Disc) -> bool:
+    """Whether a drone says that it sees any cell well whose middle lies in the disc, or within half a diagonal of it."""
+    reach_m = disc.radius_m + _HALF_DIAGONAL_M
+    return any(
+        hypot((c + 0.5) * COVERAGE_CELL_M - disc.x_m, (r + 0.5) * COVERAGE_CELL_M - disc.y_m) <= reach_m
+        for r, c in seen_well(d)
+    )
+
+
 @lru_cache(maxsize=65536)
 def answered(key: Cells, known: Cells) -> float:
     """Share of what one sees well that another does not, 0 … 1: how far a key answers a query."""

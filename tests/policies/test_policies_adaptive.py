@@ -8,7 +8,7 @@ from policies_examples import fleet_of
 
 from policies import adaptive as a
 from policies.baselines import everyone
-from policies.contract import Representation, TaskPhase
+from policies.contract import Coverage, Disc, FleetView, Representation, TaskPhase
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE
 
@@ -60,11 +60,17 @@ def test_maps_to_all_are_what_the_fixed_policy_sends(goodput: float) -> None:
     assert a.spend(view, a.MAPS, 0.1, "") == everyone(view, rho=0.1)
 
 
+def seeing(view: FleetView, state: Coverage = Coverage.WELL) -> FleetView:
+    """The same fleet, all of whose grids say this of every cell."""
+    grid = bytes([state * 0b01010101] * 64)
+    return view._replace(descriptors={i: d._replace(coverage_grid=grid) for i, d in view.descriptors.items()})
+
+
 @pytest.mark.parametrize("rho", [0.004, 0.05, 1.0])
 def test_a_region_is_worth_its_cells_and_the_rest_boxes(rho: float) -> None:
     searching = a.adaptive(fleet_of(5, phase=TaskPhase.SEARCH, goodput=1000.0), rho=rho)
     assert rungs(searching) == [BOXES] * 4
-    view = fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0)
+    view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
     tracking = a.adaptive(view, rho=rho)
     assert rungs(tracking) == [FEATURES] * 4
     assert {d.roi for d in tracking} == {view.descriptors[0].region}
@@ -72,11 +78,22 @@ def test_a_region_is_worth_its_cells_and_the_rest_boxes(rho: float) -> None:
 
 
 def test_hardly_any_cells_are_worth_less_than_boxes() -> None:
-    view = fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0)
+    view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
     assert rungs(a.adaptive(view, rho=0.0019)) == [BOXES] * 4
     assert rungs(a.adaptive(view, rho=0.002)) == [FEATURES] * 4
-    weak = fleet_of(5, phase=TaskPhase.TRACK, goodput=0.5)  # carries 0.001 of a map a link
+    weak = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=0.5))  # carries 0.001 of a map a link
     assert rungs(a.adaptive(weak, rho=0.2)) == [BOXES] * 4
+
+
+def test_who_sees_nothing_of_the_region_sends_boxes() -> None:
+    view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0), Coverage.POOR)
+    assert rungs(a.adaptive(view, rho=0.2)) == [BOXES] * 4
+    view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
+    me = view.descriptors[0]
+    for away_m, expected in ((60.0, FEATURES), (500.0, BOXES)):
+        x_m, y_m, _ = me.position_m
+        there = me._replace(region=Disc(x_m + away_m, y_m, 20.0))
+        assert rungs(a.adaptive(view._replace(descriptors={**view.descriptors, 0: there}), rho=0.2)) == [expected] * 4
 
 
 def test_the_learned_policy_takes_the_arm_of_the_highest_prediction() -> None:
