@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.box import SIMPLE
 from rich.table import Table
 
 from policies.registry import resolve
@@ -56,7 +57,8 @@ def calibrate(
     if fly is not None:
         with user_errors(), stages() as progress:
             flown = list(flights(fly, made or out_file, weights, rate_hz, chosen, progress))
-        out.print(_in_flight(flown, f"AP in points, {fly}, scored at {rate_hz:g} Hz"))
+        for table in _in_flight(flown, f"AP in points, {fly} at {rate_hz:g} Hz"):
+            out.print(table)
 
 
 def _tell(verdict: Verdict, out_file: Path) -> None:
@@ -76,10 +78,15 @@ def _tell(verdict: Verdict, out_file: Path) -> None:
     out.print(f"kept in [bold]{out_file}[/bold], its card in [bold]{out_file.with_suffix('.md')}[/bold]")
 
 
-def _in_flight(levels: Sequence[Level], title: str) -> Table:
+def _in_flight(levels: Sequence[Level], title: str) -> Iterator[Table]:
     """AP by both detectors, and what policies gain over one another; in points, with 95 % intervals over contexts."""
-    table = Table("policy", "region", "torch", "surrogate", "error", title=title)
-    for m in means(levels):
-        torch, error = (f"{100 * v[0]:.1f} \\[{100 * v[1]:.1f}, {100 * v[2]:.1f}]" for v in (m.torch, m.error))
-        table.add_row(m.what, REGIONS[m.region], torch, f"{100 * m.surrogate:.1f}", error)
-    return table
+    found = list(means(levels))
+    for region, words in REGIONS.items():
+        table = Table(title=f"{title}, {words}", box=SIMPLE, padding=(0, 1, 0, 0))
+        for column in ("policy", "torch", "surrogate", "error"):
+            table.add_column(column, no_wrap=True)
+        for m in (m for m in found if m.region == region):
+            torch, error = (f"{100 * v[0]:.1f} \\[{100 * v[1]:.1f}, {100 * v[2]:.1f}]" for v in (m.torch, m.error))
+            table.add_row(m.what, torch, f"{100 * m.surrogate:.1f}", error)
+        if table.row_count:
+            yield table

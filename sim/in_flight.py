@@ -71,9 +71,9 @@ def flights(
         scenario = scenario.model_copy(update={"perception": perception})
         found = [both_matched(run_sortie(scenario, None, contexts.seeds[0], detector_of=make)) for make in both]
         for region in REGIONS:
-            theirs, ours = (list(f[region].values()) for f in found)
-            if theirs:
-                yield Level(policy, context.name, region, average_precision(theirs), average_precision(ours))
+            theirs, ours = (average_precision(list(f[region].values())) for f in found)
+            if not np.isnan(theirs):  # there is such a region, and there are cars in it
+                yield Level(policy, context.name, region, theirs, ours)
     if progress is not None:
         progress(f"{name} by both detectors", len(planned), len(planned))
 
