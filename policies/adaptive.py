@@ -126,7 +126,7 @@ def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
     A region is small, so that even a starved budget sends the cells that count, and maps of them find more than boxes; of
     the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`). Who sees
-    nothing of the region well has no cells of it to send.
+    nothing of the region has no cells of it to send.
     """
     me = view.me
     if me is None:

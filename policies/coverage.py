@@ -18,6 +18,11 @@ def seen_well(d: Descriptor) -> Cells:
     return _cells(d.coverage_grid, *d.coverage_corner)
 
 
+def seen_at_all(d: Descriptor) -> Cells:
+    """Cells that a drone says it sees, well or poorly: what its map holds."""
+    return _cells(d.coverage_grid, *d.coverage_corner, Coverage.POOR)
+
+
 def centre_cell(d: Descriptor) -> Cells:
     """The one cell below the middle of the grid."""
     row, column = d.coverage_corner
@@ -25,14 +30,14 @@ def centre_cell(d: Descriptor) -> Cells:
 
 
 @lru_cache(maxsize=4096)  # a grid stands for a second and is read by every drone
-def _cells(grid: bytes, row: int, column: int) -> Cells:
-    well = []
+def _cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) -> Cells:
+    seen = []
     for i, byte in enumerate(grid):
         for k in range(4):
-            if (byte >> (2 * k)) & 3 >= Coverage.WELL:
+            if (byte >> (2 * k)) & 3 >= least:
                 cell = 4 * i + k
-                well.append((row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS))
-    return frozenset(well)
+                seen.append((row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS))
+    return frozenset(seen)
 
 
 @lru_cache(maxsize=4096)
@@ -52,11 +57,11 @@ def disc_around(cells: Cells) -> Disc:
 
 
 def sees(d: Descriptor, disc: Disc) -> bool:
-    """Whether a drone says that it sees any cell well whose middle lies in the disc, or within half a diagonal of it."""
+    """Whether a drone says that it sees any cell whose middle lies in the disc, or within half a diagonal of it."""
     reach_m = disc.radius_m + _HALF_DIAGONAL_M
     return any(
         hypot((c + 0.5) * COVERAGE_CELL_M - disc.x_m, (r + 0.5) * COVERAGE_CELL_M - disc.y_m) <= reach_m
-        for r, c in seen_well(d)
+        for r, c in seen_at_all(d)
     )
 
 

@@ -86,8 +86,9 @@ def test_hardly_any_cells_are_worth_less_than_boxes() -> None:
 
 
 def test_who_sees_nothing_of_the_region_sends_boxes() -> None:
-    view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0), Coverage.POOR)
-    assert rungs(a.adaptive(view, rho=0.2)) == [BOXES] * 4
+    for state, expected in ((Coverage.UNSEEN, BOXES), (Coverage.POOR, FEATURES)):
+        view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0), state)
+        assert rungs(a.adaptive(view, rho=0.2)) == [expected] * 4
     view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
     me = view.descriptors[0]
     for away_m, expected in ((60.0, FEATURES), (500.0, BOXES)):
