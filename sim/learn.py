@@ -110,7 +110,7 @@ def fly_lessons(
     progress: Callable[[int], None] | None = None,
 ) -> list[Lesson]:
     """Lessons of so many contexts; those in which AP is undefined are left out."""
-    with ProcessPoolExecutor(max_workers=workers, initializer=_one_thread if by_torch else None) as pool:
+    with ProcessPoolExecutor(max_workers=workers) as pool:
         lessons = []
         for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count)):
             if progress is not None:
@@ -118,12 +118,6 @@ def fly_lessons(
             if np.isfinite(lesson.ap).all():
                 lessons.append(lesson)
     return lessons
-
-
-def _one_thread() -> None:
-    import torch  # only where it is asked
-
-    torch.set_num_threads(1)  # processes side by side would fight for cores
 
 
 def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
