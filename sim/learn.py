@@ -38,6 +38,7 @@ LINKS = ((), (), ("radio.tx_power_dbm=5", "radio.path_loss_exponent=2.4"))
 """Clear air twice as often as weak links."""
 SECONDS = 12
 TORCH_RATE_HZ = 0.5
+"""How often the torch detector scores: a moment of five drones costs it most of a second."""
 RIDGE = 30.0
 """Shrinkage of the slopes towards none; the mean gain of an arm is not shrunk. Of 1, 3, 10 and 30 the best in ten-fold
 cross-validation over the training contexts."""

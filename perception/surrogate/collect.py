@@ -59,7 +59,6 @@ class Asked:
     jobs: list[Job]
     boxes: list[Boxes]
     ranks: dict[Capture, NDArray[np.float32]]
-    moment: int = 0
 
 
 def captures_of(jobs: Sequence[Job]) -> list[Capture]:
@@ -104,4 +103,4 @@ def read(path: Path, split: Split) -> Asked:
         raise ValueError(f"{path}: holds {len(count)} answers, the plan has {len(jobs)} jobs; remove it")
     parts = np.split(table, np.cumsum(count)[:-1])
     boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
-    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)), index)
+    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))

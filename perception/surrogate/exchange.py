@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception import budget
 from perception.geometry import CELLS, FULL
-from perception.surrogate.features import Fleet, Ints, Looks, beside, square
+from perception.surrogate.features import LOOK_COVARIATES, Fleet, Ints, Looks, beside, square
 from perception.town import Floats
 from perception.types import Capture, Share
 from scenarios.schema import Scene
@@ -24,9 +24,15 @@ FUSED_COVARIATES = (
     "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude", "square",
 )  # fmt: skip
 
+_OWN = tuple(
+    LOOK_COVARIATES.index(name)
+    for name in ("range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "square")
+)
+"""What `FUSED_COVARIATES` take over from the ego's look."""
+_STYLES = ("old_town", "suburb", "yard")
 ALARM_COVARIATES = (
     "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
-    "old_town", "suburb", "yard", "square",
+    *_STYLES, "square",
 )  # fmt: skip
 
 
@@ -219,7 +225,7 @@ def covariates(
     own = looks.covariates[pairs.look]
     columns = (
         confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
-        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in (0, 3, 2, 1, 7, 8, 4, 12, 13, 14)),
+        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in _OWN),
     )  # fmt: skip
     return beside(n, columns)
 
@@ -251,7 +257,8 @@ def alarm_covariates(
     shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
     columns = (
         np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
-        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in ("old_town", "suburb", "yard")), square(fleet.yaw_rad[exchange.ego]),
+        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in _STYLES),
+        square(fleet.yaw_rad[exchange.ego]),
     )  # fmt: skip
     return beside(m, columns)
 

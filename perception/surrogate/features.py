@@ -186,7 +186,7 @@ class Eyes:
 
 
 def square(turn_rad: Floats) -> Floats:
-    """How nearly what is turned by this stands along or across a map's cells: 1 if it does, less than a half from 2° on. A network
+    """How nearly what is turned by this stands along or across a map's cells: 1 if it does, a half at 2° off. A network
     of cells finds such cars less well, the more so if it was trained on headings of every kind."""
     off = np.abs((turn_rad + np.pi / 4) % (np.pi / 2) - np.pi / 4)
     return np.asarray(np.exp(-off / SQUARE_RAD))

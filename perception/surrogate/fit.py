@@ -31,6 +31,7 @@ CAR_M = (4.5, 1.9)
 """A car, about the towns' mean: to tell which boxes would count."""
 RESIDUALS, POOL, REACH = 2048, 512, 10.0
 GROUPS, FACTORS = 4, (0.7, 1.4)
+"""Of bands of residuals, each made longer or shorter by a factor within these bounds."""
 NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
 BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.94, 0.975, 0.99])
 """Quantiles of the alarms' scores between which they are counted."""
