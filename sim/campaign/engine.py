@@ -77,13 +77,17 @@ class Dask:
 
         fill()
         for future in done:
-            batch = flying.pop(future)
-            if future.status == "finished":
+            batch, status = flying.pop(future), future.status
+            if status in ("lost", "pending"):
+                # its worker died between the end of the run and this look: the scheduler has it flown again
+                flying[future] = batch
+                done.add(future)
+            elif status == "finished":
                 results, seconds = future.result()
                 self._learn(seconds / len(batch))
                 fill()
                 yield results
-            elif future.status == "cancelled":
+            elif status == "cancelled":
                 raise RunError("the cluster is gone; the same command goes on when there is one")
             elif not isinstance(error := future.exception(), KilledWorker):
                 raise (

@@ -81,11 +81,17 @@ def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
 
 
 class _Future:
-    """What dask gives for a task, here at once or as the death of its worker."""
+    """What dask gives for a task, here at once or as the death of its worker; or at first lost with its worker."""
 
-    def __init__(self, call: Any, error: BaseException | None) -> None:
-        self.call, self.error = call, error
-        self.status = "finished" if error is None else "error"
+    def __init__(self, call: Any, error: BaseException | None, *, lost: bool = False) -> None:
+        self.call, self.error, self.lost = call, error, lost
+
+    @property
+    def status(self) -> str:
+        if self.lost:
+            self.lost = False
+            return "lost"
+        return "finished" if self.error is None else "error"
 
     def result(self) -> Any:
         return self.call()
@@ -95,12 +101,12 @@ class _Future:
 
 
 class _Client:
-    """A cluster whose workers die of one run; it counts what is in flight."""
+    """A cluster whose workers die of one run, and lose the results of some; it counts what is in flight."""
 
     loop = None
 
-    def __init__(self, deadly: int) -> None:
-        self.deadly, self.batches, self.waiting, self.most = deadly, list[int](), list[_Future](), 0
+    def __init__(self, deadly: int = -1, lost: frozenset[int] = frozenset()) -> None:
+        self.deadly, self.lost, self.batches, self.most = deadly, lost, list[int](), 0
 
     def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
         return {"workers": {"a": {"nthreads": 1}, "b": {"nthreads": 1}}}
@@ -110,7 +116,8 @@ class _Client:
 
         self.batches.append(len(batch))
         dies = any(run == self.deadly for run, _ in batch)
-        return _Future(lambda: function(code, batch), KilledWorker("x", "y", 4) if dies else None)
+        lost = any(run in self.lost for run, _ in batch)
+        return _Future(lambda: function(code, batch), KilledWorker("x", "y", 4) if dies else None, lost=lost)
 
 
 class _AsCompleted:
@@ -144,8 +151,21 @@ def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
     assert client.most <= engines.AHEAD * 2 + max(client.batches)  # no more than what is in flight
 
 
+def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The worker dies after its run has ended and before the result was fetched."""
+    import distributed
+
+    p, client = plan(tmp_path), _Client(lost=frozenset({0, 7, 48}))
+    monkeypatch.setattr(distributed, "as_completed", lambda loop: _AsCompleted(client))
+    done = run_campaign(p, tmp_path / "a", Dask(client))
+    assert (done.finished, done.failed) == (p.runs, 0)
+    assert sum(client.batches) == p.runs  # none was given out twice
+    run_campaign(p, tmp_path / "alone", InProcess())
+    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "alone")
+
+
 def test_batches_are_about_a_second_long() -> None:
-    engine = Dask(_Client(deadly=-1))
+    engine = Dask(_Client())
     assert engine._batch() == 1  # until it is known how long a run takes
     engine._learn(0.3)
     assert engine._batch() == 3
