@@ -173,19 +173,17 @@ class Flown(NamedTuple):
 def flown() -> Flown:
     """Three drones for five seconds; number 2 is killed at 2.5 s, and a peer of its own making says 10 contexts."""
     environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK}
-    peer = subprocess.Popen(
-        [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "10"],
-        stdout=subprocess.PIPE, text=True, env=environment,
-    )  # fmt: skip
+    command = [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "10"]
     pids: dict[int, int] = {}
-    try:
-        assert peer.stdout is not None
-        assert peer.stdout.readline() == "listening\n"
-        scenario = example("fleet.drones=3", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0.3}")
-        result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
-        told, _ = peer.communicate(timeout=60)
-    finally:
-        peer.kill()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as peer:
+        try:
+            assert peer.stdout is not None
+            assert peer.stdout.readline() == "listening\n"
+            scenario = example("fleet.drones=3", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0.3}")
+            result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
+            told, _ = peer.communicate(timeout=60)
+        finally:
+            peer.kill()
     return Flown(result, json.loads(told), pids)
 
 
