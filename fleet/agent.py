@@ -25,7 +25,7 @@ from fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted,
 from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from perception.types import Capture
 from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
-from policies.damping import LinkState, damp
+from policies.damping import LinkState, believed, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -55,6 +55,7 @@ class PlaneRules:
     degraded_after_periods: float
     detached_after_periods: float
     dwell_s: float
+    hysteresis: float
     compute_delay_s: float
     tile_limit_bytes: int | None = None
     """Features go as tiles of at most so many bytes; None: as one sample."""
@@ -161,7 +162,8 @@ class Agent:
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = self._period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
-        self._known: dict[int, Descriptor] = {}  # by ascending id
+        self._claims: dict[int, Descriptor] = {}
+        self._known: dict[int, Descriptor] = {}  # what policies read of them; by ascending id
         self._heard_at_s: dict[int, float] = {}
         self._links: dict[int, _Link] = {}
         self._standings: dict[int, Standing] = {}
@@ -194,8 +196,9 @@ class Agent:
 
     def _hold(self, descriptor: Descriptor) -> None:
         known, sender = self._known, descriptor.agent_id
+        self._claims[sender] = descriptor
         if sender in known:
-            known[sender] = descriptor
+            known[sender] = believed(known[sender], descriptor, self._rules.hysteresis)
         else:  # by ascending id, so that the order of hearing decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = self.env.now
@@ -285,7 +288,7 @@ class Agent:
     def _judge(self) -> None:
         """Hold what peers claimed in the last second against what is known otherwise."""
         now_s, before = self.env.now, self._standings
-        heard = {i: d for i, d in self._known.items() if now_s - self._heard_at_s[i] <= self._fresh_s}
+        heard = {i: self._claims[i] for i in self._known if now_s - self._heard_at_s[i] <= self._fresh_s}
         self._standings = after = judge(before, self.drone, heard, self._arrivals, self._rules.form)
         self._arrivals = {}
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])

@@ -1,8 +1,9 @@
-"""Damping between a policy and the gate: reductions at once, upgrades after a dwell time, repeats for free.
+"""Damping about a policy: small changes of context are not read, passing ones do not switch the link.
 
-A pure function over one link's state. An upgrade is made once it has been asked for without a break for the
-dwell time, so that a small or passing change of context does not switch the link; the number of upgrades in
-t seconds is at most 1 + t / dwell (average dwell time, FACTS §5).
+Before the policy a hysteresis band (`believed`): of what can flicker, what a policy reads falls at once and rises only
+by more than the band, so that a threshold switches up that much higher than it switches down. After it a dwell time
+(`damp`): reductions at once, upgrades once they were asked for without a break for so long, repeats for free. The
+number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both.
 """
 
 from __future__ import annotations
@@ -10,13 +11,45 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from policies.contract import Directive, Disc, Representation
+from policies.contract import Descriptor, Directive, Disc, Representation
 
 _NONE = Representation.NONE
 SAME_DISC_M = 1.6
 """A disc that moved less, half a feature cell, is the same disc: it would select almost the same cells."""
 EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
+
+
+def believed(before: Descriptor | None, heard: Descriptor, hysteresis: float) -> Descriptor:
+    """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
+
+    The play operator (backlash) of width h in the logarithm: for a quantity u the value read is
+    min(u, max(value read before, u / (1 + h))).
+
+    Args:
+        before: what it read of that drone the last time; None the first time.
+        heard: the drone's new descriptor.
+        hysteresis: h, the share by which a quantity must rise before its rise is read, ≥ 0.
+
+    Returns:
+        A descriptor that is nowhere better than `heard`; `heard` itself where they are equal.
+    """
+    if before is None or not hysteresis:
+        return heard
+    part = 1.0 / (1.0 + hysteresis)
+    links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
+    soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom
+    if len(links) == len(last):  # else the roster is another
+        links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
+    if soc > before.battery_soc:
+        soc = max(before.battery_soc, soc * part)
+    if cpu > before.cpu_headroom:
+        cpu = max(before.cpu_headroom, cpu * part)
+    if gpu > before.gpu_headroom:
+        gpu = max(before.gpu_headroom, gpu * part)
+    if (links, soc, cpu, gpu) == (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
+        return heard
+    return heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
 
 
 class LinkState(NamedTuple):

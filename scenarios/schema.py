@@ -474,6 +474,9 @@ class Policy(Section):
     name: str = Field("worked", min_length=1, description="A registered policy, or path/to/file.py:function.")
     params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
     dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
+    hysteresis: float = Field(
+        0.2, ge=0, le=10, description="By which share goodput, charge or headroom must rise before policies read it."
+    )
     changes: tuple[PolicyChange, ...] = Field(
         (),
         max_length=100,

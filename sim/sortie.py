@@ -131,6 +131,7 @@ def run_sortie(
         degraded_after_periods=scenario.context.degraded_after_periods,
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,
+        hysteresis=scenario.policy.hysteresis,
         compute_delay_s=config.compute_delay_s,
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=scenario.context.trust,

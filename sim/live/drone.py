@@ -47,6 +47,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         degraded_after_periods=scenario.context.degraded_after_periods,
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,
+        hysteresis=scenario.policy.hysteresis,
         compute_delay_s=scenario.perception.compute_delay_s,
         publish_every=scenario.context.publish_every,
     )

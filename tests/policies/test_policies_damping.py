@@ -1,14 +1,15 @@
-"""Damping: reductions at once, upgrades after the dwell, repeats for free."""
+"""Damping: a band on what is read; reductions at once, upgrades after the dwell, repeats for free."""
 
 from __future__ import annotations
 
 import itertools
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policies.contract import Directive, Disc, Representation
-from policies.damping import LinkState, damp
+from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from policies.damping import LinkState, believed, damp
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
@@ -120,3 +121,57 @@ def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
     assert damp(state, FULL._replace(roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)
+
+
+# --- the band on what is read ---------------------------------------------------------------------
+
+BAND = 0.25
+HEARD = Descriptor(
+    0, 1, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 42.0, 0.5, 0.5, 0.5,
+    (10.0, 0.0), bytes(64), 0, TaskPhase.SEARCH, None,
+)  # fmt: skip
+FLICKERING = ("battery_soc", "cpu_headroom", "gpu_headroom")
+
+
+def read(values: list[float], field: str = "goodput", band: float = BAND) -> list[float]:
+    """What a policy reads of one quantity, value by value."""
+    known, seen = None, []
+    for value in values:
+        new = {"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}
+        known = believed(known, HEARD._replace(**new), band)  # type: ignore[arg-type]
+        seen.append(known.peer_goodput_mbps[0] if field == "goodput" else getattr(known, field))
+    return seen
+
+
+@pytest.mark.parametrize("field", ["goodput", *FLICKERING])
+def test_what_falls_is_read_at_once_and_what_rises_by_more_than_the_band(field: str) -> None:
+    assert read([0.8, 0.4, 0.5, 0.45], field) == pytest.approx([0.8, 0.4, 0.4, 0.4])
+    assert read([0.4, 0.75, 0.6, 0.5], field) == pytest.approx([0.4, 0.6, 0.6, 0.5])
+    assert read([0.4, 0.75], field, band=0.0) == [0.4, 0.75]
+
+
+def test_a_link_that_hovers_about_a_threshold_crosses_it_once() -> None:
+    """Down below 5, up again from 5 · (1 + band) on: a Schmitt trigger in front of any policy's comparison."""
+    hovering = [4.9, 5.1, 4.8, 5.9, 4.7, 6.2] * 20
+    assert not any(u >= 5.0 for u in read(hovering)[1:])
+    assert read([4.9, 6.25])[-1] == 5.0
+
+
+def test_all_else_is_read_as_heard_and_a_roster_that_grew_anew() -> None:
+    moved = HEARD._replace(stamp_ns=7, position_m=(1.0, 2.0, 3.0), task_phase=TaskPhase.TRACK)
+    assert believed(HEARD, moved, BAND) is moved
+    more = moved._replace(peer_goodput_mbps=(11.0, 0.0, 3.0), battery_soc=0.9)
+    assert believed(HEARD, more, BAND) == more._replace(battery_soc=pytest.approx(0.72))
+
+
+@given(st.lists(st.floats(0, 300), min_size=1, max_size=60), st.floats(0, 3))
+def test_the_band_is_the_play_operator(values: list[float], band: float) -> None:
+    """Never above what was heard, never below it by more than the band, still where it moved by less; saying the same
+    again changes nothing."""
+    seen = read(values, band=band)
+    for u, v in zip(values, seen, strict=True):
+        assert u / (1 + band) - 1e-9 <= v <= u
+    for (before, v), u in zip(itertools.pairwise(seen), values[1:], strict=True):
+        if before <= u <= before * (1 + band) * (1 - 1e-12):
+            assert v == before
+    assert read([u for u in values for _ in range(3)], band=band)[::3] == seen

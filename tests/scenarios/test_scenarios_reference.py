@@ -87,6 +87,7 @@ def test_units_stand_in_names() -> None:
         "parked_density",
         "lost_fraction",
         "at_least",
+        "hysteresis",
         "at_most",
         "tolerance",
         "publish_every",

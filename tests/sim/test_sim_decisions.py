@@ -5,7 +5,9 @@ Policies of one line fly the same six seconds; nothing else differs between the 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import pyarrow as pa
 import pytest
@@ -135,3 +137,25 @@ def test_every_decision_stands_in_the_directives_table() -> None:
     for row in rows:
         got = (row["rho"], row["roi_radius_m"], row["rate_hz"], row["deadline_s"], row["fusion_weight"])
         assert (*got, row["duty_percent"]) == (0.125, 30.0, 5.0, 0.25, 0.75, 80)
+
+
+def test_a_link_that_hovers_about_a_threshold_steps_down_once_and_stays(tmp_path: Path) -> None:
+    """A policy slows down below 7 Mb/s, with hardly any dwell: without the band it climbs each time the link is back."""
+    links = tmp_path / "links.csv"
+    traced = [f"{0.5 * k:g},0,{peer},{30 if k < 2 else 8 + k % 2 * 2}" for k in range(13) for peer in (1, 2)]
+    links.write_text("t_s,sender,receiver,goodput_mbps\n" + "\n".join(traced) + "\n")
+
+    def slows(view: FleetView, /) -> Sequence[Directive]:
+        asked = [PLAIN._replace(source=view.ego, destination=p, rho=0.02) for p in view.peers]
+        me = view.me
+        return [d if me and me.goodput_to(d.destination) >= 7.0 else d._replace(rate_hz=5.0) for d in asked]
+
+    def climbs(hysteresis: float) -> int:
+        sets = (NO_PHASES, "fleet.drones=3", "policy.dwell_s=0.1", f"radio.trace={links}")
+        record = run_sortie(example(*sets, f"policy.hysteresis={hysteresis}"), slows)
+        rows = record.tables["directives"].to_pylist()
+        rates_hz = [r["rate_hz"] for r in rows if (r["drone"], r["peer"]) == (0, 1)]
+        return sum(b > a for a, b in itertools.pairwise(rates_hz))
+
+    assert climbs(0.25) == 1  # after take-off
+    assert climbs(0.0) > 3

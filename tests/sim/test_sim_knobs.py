@@ -190,6 +190,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "policy.name": ("worst-2", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),
+    "policy.hysteresis": ("3", ("policy.name=adaptive", FAR)),
     "policy.changes.at_s": ("3", (AT_2,)),
     "policy.changes.phase": ("search", (IN_TRACK,)),
     "policy.changes.command": ("b", (TOLD, TELL)),
