@@ -19,7 +19,7 @@ from perception.surrogate.collect import FLOOR, Asked, collect, read
 from perception.surrogate.fit import fit
 from perception.surrogate.judge import WITHIN, Verdict, judge
 from perception.surrogate.model import Parameters, save
-from perception.surrogate.plan import MANNERS, THRESHOLD, Split, draw_scene, scene_model
+from perception.surrogate.plan import MANNERS, THRESHOLD, Split, scene_model
 from perception.surrogate.rows import Rows, rows_of
 from perception.surrogate.together import hang_together, seen_by_several
 
@@ -110,7 +110,7 @@ def _ap(asked: Sequence[Asked], seed: int, shared: bool, floor: float) -> tuple[
     """AP of the detector's boxes, and of those above `floor`."""
     matched = []
     for a in asked:
-        scene = scene_model(draw_scene(seed, a.split, a.scene))
+        scene = scene_model(seed, a.split, a.scene)
         for job, boxes in zip(a.jobs, a.boxes, strict=True):
             if bool(job.shares) == shared:
                 truth = ground_truth(

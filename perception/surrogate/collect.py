@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from perception.detector import TorchDetector
 from perception.scene import SceneModel
-from perception.surrogate.plan import THRESHOLD, Job, Split, draw_scene, moment, scene_model, scene_seed
+from perception.surrogate.plan import THRESHOLD, Job, Split, draw_scene, draw_target, moment, scene_model, scene_seed
 from perception.types import Boxes, Capture
 from scenarios.schema import Perception
 
@@ -70,13 +71,15 @@ def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weigh
     """Ask about moment `index` of a scene and keep the answers, unless they are there already.
 
     Args:
-        key: names the weights; answers of other weights have other files.
+        key: names the weights; answers of other weights, and to other questions, have other files.
     """
-    path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{index}.npz"
+    jobs = moment(seed, split, scene, index)
+    asked = repr((jobs, draw_scene(seed, split, scene), draw_target(seed, split, scene)))
+    digest = hashlib.blake2b(asked.encode(), digest_size=4).hexdigest()
+    path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{index}-{digest}.npz"
     if path.exists():
         return path
-    jobs = moment(seed, split, scene, index)
-    probe = Probe(scene_model(draw_scene(seed, split, scene)), scene_seed(seed, split, scene), weights)
+    probe = Probe(scene_model(seed, split, scene), scene_seed(seed, split, scene), weights)
     boxes = [probe.ask(job) for job in jobs]
     folder.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")

@@ -22,11 +22,26 @@ NO_PEER = -8.0
 FUSED_COVARIATES = (
     "own", "first", "second", "mean", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
     "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude", "square",
+    "next", "next_along", "next_across",
 )  # fmt: skip
 
 _OWN = tuple(
     LOOK_COVARIATES.index(name)
-    for name in ("range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "square")
+    for name in (
+        "range",
+        "visible",
+        "margin",
+        "nadir",
+        "moving",
+        "length",
+        "across",
+        "crowd",
+        "altitude",
+        "square",
+        "next",
+        "next_along",
+        "next_across",
+    )
 )
 """What `FUSED_COVARIATES` take over from the ego's look."""
 _STYLES = ("old_town", "suburb", "yard")
@@ -187,7 +202,7 @@ def covariates(
     rank: NDArray[np.float32],
     zeros: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """What fusion makes of each pair depends on: [n, 23] float32, as `FUSED_COVARIATES`.
+    """What fusion makes of each pair depends on: [n, 26] float32, as `FUSED_COVARIATES`.
 
     Args:
         confidence: [looks] the logit that each drone gives each car on its own.

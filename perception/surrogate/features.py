@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from perception.geometry import FULL
 from perception.scene import SceneModel
@@ -25,8 +26,10 @@ HALF_V = HALF_H * 90 / 160
 """The cameras' half angles, as in `render.py`, which needs torch."""
 LOOK_COVARIATES = (
     "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
-    "crowd", "altitude", "square",
+    "crowd", "altitude", "square", "next", "next_along", "next_across",
 )  # fmt: skip
+NEXT_M = 8.0
+"""A car that stands farther away from the next one has none."""
 SQUARE_RAD = np.radians(3.0)
 _ROAD_TONE, _TONE = 0.34, np.array([0.299, 0.587, 0.114]) / 255.0
 
@@ -66,7 +69,7 @@ class Fleet:
 @dataclass(frozen=True, slots=True)
 class Looks:
     """n looks, capture by capture, cars ascending: `capture` [n], `car` [n] (column of `Traffic`), `xy_m` [n, 2] where the
-    drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 15] float32 as
+    drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 18] float32 as
     `LOOK_COVARIATES`, `index` [c, cars] (−1: no look); those of capture c are `first[c]` to `first[c + 1]`."""
 
     capture: Ints
@@ -97,6 +100,7 @@ class Traffic:
         self.tone: Floats = colour @ _TONE
         self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
         self.parked_xy: Floats = np.stack([parked.x_m, parked.y_m], 1)
+        self._next_parked = _next_of(self.parked_xy)
         self._yaw = np.concatenate([parked.yaw_rad, lanes.yaw_rad, np.zeros(extra)])
 
     def at(self, t_s: Floats, parked: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -118,6 +122,34 @@ class Traffic:
             yaw = yaw.copy()
             yaw[:, -1] = pose[:, 2]
         return xy, yaw, there
+
+    def next_to(self, parked: Ints, xy: Floats, there: NDArray[np.bool_]) -> Floats:
+        """From every car to the one next to it [t, k, 2], of cars as `at` gives them; inf where none is within 8 m."""
+        first = len(parked)
+        out = np.full(xy.shape, np.inf)
+        out[:, :first] = self._next_parked[parked]
+        for at, here, to in zip(xy, there, out, strict=True):
+            moving = np.flatnonzero(here[first:]) + first
+            if not len(moving):
+                continue
+            around = np.concatenate([np.arange(first), moving])
+            x, y = (at[None, around, k] - at[moving, None, k] for k in (0, 1))
+            far = x * x + y * y
+            far[np.arange(len(moving)), first + np.arange(len(moving))] = np.inf
+            to[moving] = at[around[far.argmin(axis=1)]] - at[moving]
+            to[moving[far.min(axis=1) == np.inf]] = np.inf
+            passing, far = far[:, :first].argmin(axis=0), far[:, :first].min(axis=0)
+            closer = np.flatnonzero(far < to[:first, 0] ** 2 + to[:first, 1] ** 2)
+            to[closer] = at[moving[passing[closer]]] - at[closer]
+        out[out[..., 0] ** 2 + out[..., 1] ** 2 > NEXT_M**2] = np.inf
+        return out
+
+
+def _next_of(xy: Floats) -> Floats:
+    """From every point to the one next to it [n, 2]; inf where there is none."""
+    if len(xy) < 2:
+        return np.full(xy.shape, np.inf)
+    return np.asarray(xy[cKDTree(xy).query(xy, k=2)[1][:, 1]] - xy)
 
 
 class Eyes:
@@ -153,12 +185,16 @@ class Eyes:
         index[capture, car] = np.arange(len(capture))
         at = which[capture]
         world, turn = xy[at, among], yaw[at, among]
-        covariates = np.zeros((0, 0), np.float32) if bare else self._covariates(fleet, capture, car, local, world, turn)
+        covariates = np.zeros((0, 0), np.float32)
+        if not bare:
+            there &= ((xy > low) & (xy < high)).all(axis=-1)
+            beside_it = traffic.next_to(parked, xy, there)[at, among]
+            covariates = self._covariates(fleet, capture, car, local, world, turn, beside_it)
         first = np.searchsorted(capture, np.arange(len(where) + 1))
         return Looks(capture, car, local * fleet.stretch[capture, None], world, turn, covariates, index, first)
 
     def _covariates(
-        self, fleet: Fleet, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats
+        self, fleet: Fleet, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats, beside_it: Floats
     ) -> NDArray[np.float32]:
         traffic = self.traffic
         eye = fleet.position_m[capture]
@@ -173,6 +209,10 @@ class Eyes:
         lit = np.empty(len(car), bool)
         lit[~moving] = self._lit[car[~moving]]
         lit[moving] = self._field.lit(xy[moving, 0], xy[moving, 1])
+        beside_m = np.hypot(*beside_it.T)
+        close = np.maximum(0.0, 1.0 - beside_m / NEXT_M)
+        way = np.where(close[:, None] > 0.0, beside_it, 0.0) / np.clip(beside_m, 0.1, NEXT_M)[:, None]
+        way = on_axes(way, *axes(yaw, xy - eye[:, :2])) * close[:, None]
         overcast, brightness, length = self._light
         shade = (1.0 - overcast) * min(length, 2.5)
         light = np.where(lit, 1.0, 0.6 + 0.4 * overcast)
@@ -180,7 +220,7 @@ class Eyes:
             reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
             (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
             traffic.size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / 60.0 - 1.0,
-            square(yaw - fleet.yaw_rad[capture]),
+            square(yaw - fleet.yaw_rad[capture]), close, way[:, 0], way[:, 1],
         )  # fmt: skip
         return beside(len(car), columns)
 

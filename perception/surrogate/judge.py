@@ -11,7 +11,7 @@ from perception.harness.statistics import compare
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import THRESHOLD, Disc, Job, draw_scene, scene_model
+from perception.surrogate.plan import THRESHOLD, Disc, Job, scene_model
 from scenarios.schema import Perception
 
 WITHIN = 0.02
@@ -86,7 +86,7 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
     ours: dict[str, list[Matched]] = {}
     scenes: dict[str, list[int]] = {}
     for asked in held_out:
-        scene = scene_model(draw_scene(seed, asked.split, asked.scene))
+        scene = scene_model(seed, asked.split, asked.scene)
         truths = None
         for rules in dict.fromkeys((j.unsent, j.cells_by, j.join) for j in asked.jobs):
             config = Perception(unsent_cells=rules[0], cells_by=rules[1], join=rules[2], score_threshold=THRESHOLD)

@@ -27,7 +27,7 @@ from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES, beside
 
 Singles = NDArray[np.float32]
-FORMAT = 4
+FORMAT = 5
 RANK_COVARIATES = ("confidence", "range", "visible", "nadir", "cars", "brightness", "shade")
 PLACE_COVARIATES = (*FUSED_COVARIATES, "score")
 ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from perception.joining import Rule
 from perception.scene import SceneModel
+from perception.traffic import TargetPath
 from perception.types import Capture, Share
-from scenarios.schema import Scene
+from scenarios.schema import Scene, Target
 from scenarios.streams import stream
 
 Split = Literal["fit", "held-out"]
@@ -21,9 +22,13 @@ SPLITS: dict[Split, int] = {"fit": 1, "held-out": 2}
 Manner = Literal["anywhere", "street"]
 MANNERS: tuple[Manner, ...] = ("anywhere", "street")
 """How a scene's first moment is flown, and its second: anywhere and turned anyhow, or along the street through the origin as
-sorties are, with cars that stand square on every drone's map."""
+sorties are, with a mission's target below, and cars that stand square on every drone's map."""
 AREA_M = 60.0
 """The fleet's middle lies within ± this of the scene's origin."""
+LANE_M = 1.75
+"""From a street's middle to that of its lanes."""
+FIRST_S, LAST_S = 5.0, 300.0
+"""Scenes are asked about between these times."""
 DRONES = 5
 THRESHOLD = 0.1
 """Boxes count from this score on."""
@@ -87,9 +92,24 @@ def draw_scene(seed: int, split: Split, index: int) -> Scene:
     )
 
 
-def scene_model(config: Scene) -> SceneModel:
+def draw_target(seed: int, split: Split, index: int) -> Target:
+    """A mission's target: it keeps to the right of the street that the scene's fleet flies along, as fast as the fleet or not,
+    and is about its middle when the fleet is asked."""
+    name = scene_seed(seed, split, index)
+    flown = _Street.draw(stream(name, 0, MANNERS.index("street"), "calibrate.fleet"))
+    u = stream(name, 0, (), "calibrate.target").random(3)
+    speed = max(flown.speed_mps if u[0] < 0.7 else 12 * u[1], 0.5)
+    way = np.array([np.cos(flown.heading), np.sin(flown.heading)])
+    right = LANE_M * np.array([way[1], -way[0]])
+    here = flown.along_m + 10 * (2 * u[2] - 1)
+    ends = (right + (here + speed * (t_s - flown.t_s)) * way for t_s in (0.0, LAST_S))
+    return Target(waypoints_m=tuple((float(x), float(y)) for x, y in ends), speed_mps=speed)
+
+
+def scene_model(seed: int, split: Split, index: int) -> SceneModel:
     """The scene as every moment of it is asked for."""
-    return SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    bounds = (-AREA_M, -AREA_M, AREA_M, AREA_M)
+    return SceneModel(draw_scene(seed, split, index), draw_target(seed, split, index), bounds)
 
 
 def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Job]:
@@ -102,9 +122,11 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
     manner = MANNERS[index]
     now, old = _on_street(rng) if manner == "street" else _anywhere(rng, split)
     if split == "held-out":
-        asked = street_conditions if manner == "street" else conditions
-        egos = rng.permutation(DRONES)[:condition_egos]
-        return [job for ego in egos for job in asked(int(ego), now, old)]
+        egos = [int(ego) for ego in rng.permutation(DRONES)[:condition_egos]]
+        if manner == "anywhere":
+            return [job for ego in egos for job in conditions(ego, now, old)]
+        x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
+        return [job for ego in egos for job in street_conditions(ego, now, old, (x, y, 32.0))]
     jobs = [Job(ego, (), "masked", "confidence", "") for ego in now]
     return jobs + [_exchange(rng, ego, now, old) for ego in now for _ in range(2)]
 
@@ -157,12 +179,9 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         yield job(f"nearest 2, ρ = 0.1, boxes of the others, {rule}", 0.1, near[:2], boxes_of=near[2:], join=rule)
 
 
-def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Job]:
-    """One drone of a fleet that flies along a street, under exchanges as sorties have them; the mission's disc is about the
-    fleet's middle."""
+def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]], disc: Disc) -> Iterator[Job]:
+    """One drone of a fleet that flies along a street, under exchanges as sorties have them, in the mission's disc too."""
     peers = [i for i in range(len(now)) if i != ego]
-    x, y, _ = np.mean([c.position_m for c in now], axis=0)
-    disc = (float(x), float(y), 32.0)
 
     def job(
         name: str,
@@ -187,7 +206,7 @@ def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Captur
 def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
     """A jittered formation of five, 60 m up or so, now and a little earlier, with attitude and pose errors."""
     u = rng.random(9)
-    t_s = float(np.round(5 + 295 * u[0], 3))
+    t_s = _time_s(u[0])
     shape = "cross" if split == "held-out" or u[1] < 0.6 else "line" if u[1] < 0.8 else "wedge"
     spacing = 20.0 if split == "held-out" else 12 + 23 * u[2]
     altitude = 60.0 if split == "held-out" else 50 + 20 * u[3]
@@ -209,13 +228,11 @@ def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
 def _on_street(rng: np.random.Generator) -> Fleets:
     """A formation of five along the street through the origin, one way or the other: nose down by half a degree for each metre
     a second, heights known, everything else as a sortie's defaults are."""
-    u = rng.random(6)
-    t_s = float(np.round(5 + 295 * u[0], 3))
-    shape, spacing = list(_SHAPES)[int(4 * u[1])], 14 + 12 * u[2]
-    heading, speed = np.pi / 2 * int(4 * u[3]), 10 * u[4]
+    flown = _Street.draw(rng)
+    heading, speed = flown.heading, flown.speed_mps
     c, s = np.cos(heading), np.sin(heading)
-    along, across = AREA_M * (2 * u[5] - 1), 2.0 * rng.normal()
-    slots = (np.array([along, across]) + spacing * _SHAPES[shape]) @ np.array([[c, s], [-s, c]])
+    across_m = 2.0 * rng.normal()
+    slots = (np.array([flown.along_m, across_m]) + flown.spacing_m * _SHAPES[flown.shape]) @ np.array([[c, s], [-s, c]])
     poses = []
     for slot in slots:
         place = np.array([*slot, 60.0]) + 0.5 * rng.normal(size=3)
@@ -223,7 +240,29 @@ def _on_street(rng: np.random.Generator) -> Fleets:
         pitch, roll = np.radians(0.5 * speed + 1.7 * rng.normal()), np.radians(2.0) * rng.normal()
         error = np.array([*(0.2 * rng.normal(size=2)), 0.0])
         poses.append((place, (yaw, pitch, roll), error, np.radians(0.2) * rng.normal()))
-    return _captures(t_s, heading, speed, poses)
+    return _captures(flown.t_s, heading, speed, poses)
+
+
+@dataclass(frozen=True, slots=True)
+class _Street:
+    """How a fleet flies along a street through the origin: when, in which formation, which way, how fast, and how far along it."""
+
+    t_s: float
+    shape: str
+    spacing_m: float
+    heading: float
+    speed_mps: float
+    along_m: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> _Street:
+        u = rng.random(6)
+        shape, heading = list(_SHAPES)[int(4 * u[1])], np.pi / 2 * int(4 * u[3])
+        return cls(_time_s(u[0]), shape, 14 + 12 * u[2], heading, 10 * u[4], AREA_M * (2 * u[5] - 1))
+
+
+def _time_s(u: float) -> float:
+    return float(np.round(FIRST_S + (LAST_S - FIRST_S) * u, 3))
 
 
 def _captures(

@@ -24,7 +24,7 @@ from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.features import Eyes, Fleet
 from perception.surrogate.mirages import in_common
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import draw_scene, scene_model
+from perception.surrogate.plan import scene_model
 from perception.surrogate.rows import claim
 from perception.types import Boxes
 from scenarios.schema import Perception
@@ -46,7 +46,7 @@ def hang_together(
     Averaged ones tell how far errors of place do: of a part of 0 … 0.5 of the cars they have one sign for all. Each changes the other's gain a
     little, so the factor is looked for again.
     """
-    scenes = {k: scene_model(draw_scene(seed, "fit", k)) for k in dict.fromkeys(a.scene for a in asked)}
+    scenes = {k: scene_model(seed, "fit", k) for k in dict.fromkeys(a.scene for a in asked)}
     towns = {k: (scene, Eyes(scene)) for k, scene in scenes.items()}  # a part of a second each, and asked for often
     wanted = {rule: _gain(parameters, asked, towns, threshold, rule, own=True) for rule in ("nms", "average")}
     steps = 2 * len(FACTORS) + len(PARTS)
@@ -115,7 +115,7 @@ def seen_by_several(asked: Sequence[Asked], floor: float, seed: int) -> NDArray[
     seen, apart, turned = list[int](), list[float](), list[float]()
     others = 0
     for a in asked:
-        eyes = Eyes(scene_model(draw_scene(seed, a.split, a.scene)))
+        eyes = Eyes(scene_model(seed, a.split, a.scene))
         egos = [(j.ego, b.take(b.score >= floor)) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
         looks = eyes.look(Fleet.of([ego for ego, _ in egos]))
         # by where drones were: what they are wrong about that, they are wrong about in a sortie as well

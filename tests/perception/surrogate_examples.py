@@ -5,7 +5,7 @@ from __future__ import annotations
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import draw_scene, moment, scene_model
+from perception.surrogate.plan import moment, scene_model
 from scenarios.schema import Perception
 
 
@@ -14,9 +14,7 @@ def asked(parameters: Parameters, scenes: int) -> list[Asked]:
     out = []
     for scene in range(scenes):
         jobs = [j for j in moment(0, "fit", scene, 0) if not j.shares]
-        detector = SurrogateDetector.of(
-            scene_model(draw_scene(0, "fit", scene)), Perception(score_threshold=0.1), parameters, 5
-        )
+        detector = SurrogateDetector.of(scene_model(0, "fit", scene), Perception(score_threshold=0.1), parameters, 5)
         boxes = list(detector.detect_many([[(j.ego, ())] for j in jobs]))
         out.append(Asked("fit", scene, jobs, boxes, {}))
     return out

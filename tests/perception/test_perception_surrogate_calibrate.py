@@ -14,7 +14,8 @@ from perception.surrogate.collect import Asked, captures_of, collect, read
 from perception.surrogate.features import square
 from perception.surrogate.judge import IN_DISC, judge
 from perception.surrogate.model import SHIPPED, load
-from perception.surrogate.plan import AREA_M, MANNERS, Job, draw_scene, moment, scene_model
+from perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Job, draw_target, moment, scene_model
+from perception.traffic import TargetPath
 from perception.types import Boxes, Capture
 
 STREET = MANNERS.index("street")
@@ -49,6 +50,28 @@ def test_along_a_street_drones_fly_as_sorties_do(split: Any) -> None:
     assert ways == {0, 1, 2, 3}
     assert 4 < np.mean(speeds) < 6
     assert max(speeds) < 10.1
+
+
+def test_along_a_street_the_target_drives_below_the_fleet_and_the_disc_is_about_it() -> None:
+    speeds = []
+    for scene in range(40):
+        jobs = moment(0, "held-out", scene, STREET)
+        (t_s,) = {j.ego.t_s for j in jobs}
+        target = TargetPath.of(draw_target(0, "held-out", scene))
+        x, y, yaw = target.pose(t_s)
+        assert {j.disc for j in jobs} == {(x, y, 32.0)}
+        (car,) = np.flatnonzero(scene_model(0, "held-out", scene).cars_at(t_s).ids == 0)
+        assert car == 0
+        assert abs(np.cos(yaw) * y - np.sin(yaw) * x) == pytest.approx(LANE_M, abs=1e-9)
+        assert np.sin(yaw) * x - np.cos(yaw) * y > 0, "on the right"
+        ahead = {round(float(np.cos(j.ego.true_yaw_rad - yaw)), 2) for j in jobs}
+        assert ahead == {1.0}, "the way that the fleet flies"
+        away = [np.hypot(*np.subtract(j.ego.position_m[:2], (x, y))) for j in jobs]
+        assert min(away) < 70
+        was = target.pose(t_s - 1)
+        speeds.append(np.hypot(x - was[0], y - was[1]))
+    assert 0.4 < min(speeds) < max(speeds) < 12
+    assert np.std(speeds) > 1
 
 
 @pytest.mark.parametrize("index", range(len(MANNERS)))
@@ -143,6 +166,6 @@ def truth_of(scene: int, jobs: Sequence[Job]) -> list[Boxes]:
     from perception.detector import ground_truth
     from perception.geometry import FULL
 
-    model = scene_model(draw_scene(0, "held-out", scene))
+    model = scene_model(0, "held-out", scene)
     half = FULL.half_extent_m
     return [ground_truth(model, j.ego.t_s, j.ego.position_m[:2], half, j.ego.true_yaw_rad) for j in jobs]

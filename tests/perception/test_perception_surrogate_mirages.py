@@ -11,7 +11,7 @@ from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.features import Fleet
 from perception.surrogate.mirages import Mirages, in_common
 from perception.surrogate.model import SHIPPED, load
-from perception.surrogate.plan import draw_scene, scene_model
+from perception.surrogate.plan import scene_model
 from perception.surrogate.together import seen_by_several
 from perception.types import Capture
 from scenarios.schema import Perception
@@ -75,7 +75,7 @@ def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
         planted = replace(base, mirages=np.array([part, 0.5, 0.5, 0.1], np.float32))
         count = 0
         for town in towns:
-            model = scene_model(draw_scene(0, "fit", town))
+            model = scene_model(0, "fit", town)
             detector = SurrogateDetector.of(model, Perception(score_threshold=0.1), planted, 0)
             jobs: list[tuple[Capture, tuple[()]]] = [(c, ()) for c in cross(10.0, 20.0, 0.3)]
             count += sum(len(b) for b in detector.detect_many([jobs]))

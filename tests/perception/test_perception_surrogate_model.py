@@ -15,11 +15,12 @@ from scipy.special import expit
 
 from perception.scene import SceneModel
 from perception.surrogate.exchange import Exchange, covariates, pair
-from perception.surrogate.features import Eyes, Fleet
+from perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
 from perception.surrogate.fit import _in_common, _iou, _pairs, _poisson, _train
 from perception.surrogate.luck import BANDS
 from perception.surrogate.model import (
     BAND,
+    FORMAT,
     NETS,
     PLACE_COVARIATES,
     RANK_COVARIATES,
@@ -35,7 +36,7 @@ from scenarios.schema import Scene
 
 RNG = np.random.Generator(np.random.PCG64(5))
 START = RNG.bit_generator.state
-CARD = {"format": 4, "id": "x", "fusion": "disconet"}
+CARD = {"format": FORMAT, "id": "x", "fusion": "disconet"}
 
 
 @pytest.fixture(autouse=True)
@@ -61,14 +62,14 @@ def broken(path: Path, card: object = CARD, **changes: np.ndarray | None) -> Pat
     [
         (None, {}, "holds no calibration; `sortie calibrate` makes one"),
         ("{", {}, "its card is no JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
-        ({**CARD, "format": 7}, {}, "format is 7, must be 4; calibrate again"),
+        ({**CARD, "format": 7}, {}, f"format is 7, must be {FORMAT}; calibrate again"),
         ({**CARD, "fusion": 3}, {}, "card.fusion is 3, must be text"),
         (CARD, {"alike": None}, "tensor alike is missing"),
         (CARD, {"alike": np.zeros(2, np.float32)}, "tensor alike has shape [2], must be [4]"),
         (
             CARD,
             {"look.0.weight": np.zeros((2, 2), np.float32)},
-            "tensor look.0.weight has shape [2, 2], must be [15, any]",
+            f"tensor look.0.weight has shape [2, 2], must be [{len(LOOK_COVARIATES)}, any]",
         ),
         (CARD, {"alike": np.array([np.nan, 0, 0, 0], np.float32)}, "tensor alike holds values that are not finite"),
     ],
@@ -96,7 +97,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, parameters: Parameters) -> None
     assert again.card == parameters.card
     for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "mirages", "boxes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(parameters, name))
-    x = RNG.normal(size=(7, 15)).astype(np.float32)
+    x = RNG.normal(size=(7, len(LOOK_COVARIATES))).astype(np.float32)
     np.testing.assert_array_equal(again.nets["look"](x), parameters.nets["look"](x))
 
 

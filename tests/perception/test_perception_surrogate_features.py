@@ -1,0 +1,49 @@
+"""What looks say of a car's surroundings, against every pair of cars one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perception.scene import SceneModel
+from perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
+from perception.types import Capture
+from scenarios.schema import Scene, Target
+
+COLUMN = {name: k for k, name in enumerate(LOOK_COVARIATES)}
+TARGET = Target(waypoints_m=((-60.0, -1.75), (200.0, -1.75)), speed_mps=5)
+
+
+def capture(t_s: float, drone: int = 0) -> Capture:
+    at = (-60.0 + 5.0 * t_s + 20.0 * drone, 0.0, 60.0)
+    return Capture(drone, t_s, at, (0.0, 0.0, 0.0, 1.0), at, 0.0)
+
+
+@pytest.mark.parametrize("style", ["town", "old_town"])
+def test_the_next_car_is_the_nearest_of_all_parked_driving_or_the_target(style: str) -> None:
+    scene = SceneModel(Scene(style=style, parked_density=0.5, moving_cars_per_km=14), TARGET, (-60, -20, 200, 20))
+    captures = [capture(t, d) for t in (0.0, 3.7, 20.0) for d in range(2)]
+    looks, seen = Eyes(scene).look(Fleet.of(captures)), set()
+    for k, (of, here, yaw) in enumerate(zip(looks.capture, looks.world_m, looks.yaw_rad, strict=True)):
+        cars = scene.cars_at(captures[of].t_s)
+        away = np.stack([cars.x_m, cars.y_m], axis=1) - here
+        itself, following = np.argsort(np.hypot(*away.T))[:2]
+        close = max(0.0, 1.0 - float(np.hypot(*away[following])) / NEXT_M)
+        found = looks.covariates[k]
+        assert found[COLUMN["next"]] == pytest.approx(close, abs=1e-5)
+        angle, _ = axes(np.array([yaw]), here[None] - captures[of].position_m[:2])
+        ahead = np.array([np.cos(angle[0]), np.sin(angle[0])])
+        along = close * float(away[following] @ ahead) / max(float(np.hypot(*away[following])), 0.1)
+        assert found[COLUMN["next_along"]] == pytest.approx(along, abs=1e-5)
+        across = np.sqrt(max(close**2 - along**2, 0.0))
+        assert abs(found[COLUMN["next_across"]]) == pytest.approx(across, abs=2e-3)
+        if close:
+            seen.add((bool(cars.ids[itself] == 0), bool(cars.ids[following] == 0)))
+    assert seen == {(False, False), (False, True), (True, False)}  # and the target is next to something
+
+
+def test_a_car_that_is_alone_has_none_next_to_it() -> None:
+    scene = SceneModel(Scene(parked_density=0.0, moving_cars_per_km=0), TARGET, (-60, -20, 200, 20))
+    covariates = Eyes(scene).look(Fleet.of([capture(4.0)])).covariates
+    assert len(covariates) == 1
+    assert not covariates[:, [COLUMN[n] for n in ("next", "next_along", "next_across")]].any()
