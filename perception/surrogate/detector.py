@@ -14,10 +14,10 @@ from perception.geometry import FULL
 from perception.joining import joined, told
 from perception.scene import SceneModel
 from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
-from perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, turned
+from perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
 from perception.surrogate.luck import Drawn, Luck
 from perception.surrogate.mirages import Mirages
-from perception.surrogate.model import SHIPPED, Parameters, load, rank_covariates
+from perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from perception.surrogate.words import mixed, uniform
 from perception.town import Floats
 from perception.types import Boxes, Capture, Share
@@ -217,7 +217,7 @@ class SurrogateDetector:
         p, ego = self.parameters, exchange.ego
         rate = p.alarm_rates(alarm_covariates(exchange, looks, fleet, zeros, self._scene.config))
         job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - p.mirages[0]) * rate)[:, :, None])
-        own = _Alarms(job, self._pooled(band, luck.alarm_which[ego[job], band, k]))
+        own = _Alarms(job, self._pooled(fleet.yaw_rad[ego[job]], band, luck.alarm_which[ego[job], band, k]))
         seen = self._seen(rate, ego, fleet, luck)
         job, drawn = np.concatenate([own.job, seen.job]), np.concatenate([own.drawn, seen.drawn])
         loud = drawn[:, 5] >= self._config.score_threshold
@@ -234,18 +234,20 @@ class SurrogateDetector:
         job, thing = np.nonzero(seen[ego] & (things.rarity < expected[:, None]))
         capture, own = ego[job], luck_of[ego[job], thing]
         over = np.cumsum(rate[job], axis=1) > (uniform(own, 1) * rate[job].sum(axis=1))[:, None]
-        drawn = self._pooled(np.where(over.any(axis=1), over.argmax(axis=1), rate.shape[1] - 1), uniform(own, 2))
+        band = np.where(over.any(axis=1), over.argmax(axis=1), rate.shape[1] - 1)
+        drawn = self._pooled(fleet.yaw_rad[capture], band, uniform(own, 2))
         off = np.stack([ndtri(uniform(own, k)) for k in (3, 4, 5)], axis=1)
         away = turned(things.xy_m[thing] - fleet.position_m[capture, :2], -fleet.yaw_rad[capture])
         drawn[:, :2] = away * fleet.stretch[capture, None] + spread_m * off[:, :2]
         drawn[:, 4] = things.yaw_rad[thing] - fleet.yaw_rad[capture] + spread_rad * off[:, 2]
         return _Alarms(job, drawn)
 
-    def _pooled(self, band: NDArray[np.intp], luck: NDArray[np.floating]) -> Floats:
-        """Alarms [a, 6] that the detector had, of the given bands; `luck` [a] uniform."""
+    def _pooled(self, yaw_rad: Floats, band: NDArray[np.intp], luck: NDArray[np.floating]) -> Floats:
+        """Alarms [a, 6] that the detector had, of the given bands, by drones that flew along a street or askew, as these do;
+        `luck` [a] uniform."""
         pool = self.parameters.alarm_pool
-        which = np.minimum((luck * pool.shape[1]).astype(np.intp), pool.shape[1] - 1)
-        out: Floats = pool[band, which].astype(np.float64)
+        which = np.minimum((luck * pool.shape[2]).astype(np.intp), pool.shape[2] - 1)
+        out: Floats = pool[(square(yaw_rad) > SQUARE).astype(np.intp), band, which].astype(np.float64)
         return out
 
 

@@ -15,9 +15,9 @@ from scipy.special import expit, logit, ndtr, ndtri
 from torch import Tensor
 
 from perception.overlap import iou_pairs
-from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
+from perception.surrogate.exchange import ALARM_COVARIATES
 from perception.surrogate.features import axes, on_axes
-from perception.surrogate.model import BAND, NETS, SPREAD, Net, Parameters, rank_covariates, vague
+from perception.surrogate.model import BAND, NETS, SPREAD, SQUARE, Net, Parameters, kind_of, rank_covariates, vague
 from perception.surrogate.rows import Rows
 from scenarios.streams import stream
 
@@ -30,6 +30,8 @@ START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0]}
 CAR_M = (4.5, 1.9)
 """A car, about the towns' mean: to tell which boxes would count."""
 RESIDUALS, POOL, REACH = 2048, 512, 10.0
+FEWEST = 20
+"""Alarms of one band that are a pool of their own."""
 GROUPS, FACTORS = 4, (0.7, 1.4)
 """Of bands of residuals, each made longer or shorter by a factor within these bounds."""
 NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
@@ -79,18 +81,21 @@ def fit(
     centre, spread = followed + out[:, :5], np.exp(np.clip(out[:, 5:10], *SPREAD))
     residuals = (off - centre) / spread
     rng = stream(seed, 0, (), "calibrate.pool")
-    shared, unsure = rows.fused[found, FUSED_COVARIATES.index("senders")] > 0, vague(out)
+    kind, unsure = kind_of(covariates), vague(out)
     fits = _iou(off)
     pools = []
-    for of in (~shared, shared):
+    for k in range(4):
+        of = kind == k
+        if of.sum() < BAND:
+            of = kind // 2 == k // 2
         pool = _bands(residuals[of], unsure[of], fits[of])
         good = fits[of] >= 0.5
         pools.append(_as_good(pool, centre[of], spread[of], unsure[of], good, rows.score[found][of], rng))
     only = alone[found]
     alike.append(_in_common(fits[only] >= 0.5, _chance(fits[only] >= 0.5, unsure[only]), car[found][only]))
     tell("alarms")
-    edges, rate, pool = _alarms(rows, floor, rng)
-    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, rate, pool, NO_MIRAGES, boxes)
+    edges, rate, alarms = _alarms(rows, floor, rng)
+    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, rate, alarms, NO_MIRAGES, boxes)
     a, r, e, q, p, m, n = (np.asarray(v, np.float32) for v in singles)
     return Parameters(nets, a, r, e, q, p, m, n, card={})
 
@@ -267,8 +272,13 @@ def _alarms(rows: Rows, floor: float, rng: np.random.Generator) -> tuple[Array, 
     np.add.at(counts, (rows.alarm_job, band), 1.0)
     x = np.concatenate([np.ones((len(rows.job), 1)), rows.job], axis=1)
     rate = np.stack([_poisson(x, counts[:, b]) for b in range(len(BANDS))], axis=1)
-    pool = np.stack([rows.alarm[rng.choice(np.flatnonzero(band == b), POOL)] for b in range(len(BANDS))])
-    return edges, rate, pool
+    along = rows.job[rows.alarm_job, ALARM_COVARIATES.index("square")] > SQUARE
+    pools = []
+    for of in (~along, along):
+        mine = [np.flatnonzero((band == b) & of) for b in range(len(BANDS))]
+        mine = [m if len(m) >= FEWEST else np.flatnonzero(band == b) for b, m in enumerate(mine)]
+        pools.append(np.stack([rows.alarm[rng.choice(m, POOL)] for m in mine]))
+    return edges, rate, np.stack(pools)
 
 
 def _poisson(x: Array, y: Array, ridge: float = 3.0, rounds: int = 40) -> Array:

@@ -46,6 +46,8 @@ SPREAD = (-3.5, 2.0)
 """Bounds of log deviations."""
 BAND = 64
 """Residuals that were predicted as vaguely: a box's is one of these, and the best luck draws the one that lay best."""
+SQUARE = 0.5
+"""Squareness from which on a car, or a drone, counts as square."""
 _ROWS = 192
 
 
@@ -82,10 +84,10 @@ class Parameters:
 
     `alike` [4]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies;
     and the part of those whose boxes lie off to the same side for all.
-    `residuals` [2, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
-    first in each, and how vague (`vague`) predictions are from which on a band stands for them; alone and shared. `alarm_edges` [b + 1]: scores
-    between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [b, p, 5] where and how large they
-    were (`ALARM_COLUMNS`, ego's frame); `mirages` [4]: the part of the alarms that are of things which others may take for cars
+    `residuals` [4, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
+    first in each, and how vague (`vague`) predictions are from which on a band stands for them; pools as `kind_of`. `alarm_edges` [b + 1]: scores
+    between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [2, b, p, 6] where and how large they
+    were (`ALARM_COLUMNS`, ego's frame), of drones turned anyhow and of square ones; `mirages` [4]: the part of the alarms that are of things which others may take for cars
     as well, the chance that a drone does, and how far it puts them off, as deviations (m, rad); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
     above each, and how many boxes of nothing there are.
     """
@@ -140,9 +142,10 @@ class Parameters:
         their peers' mean shift they follow. `luck` [n] uniform: which of the residuals that were as vague; `thrown` [n, 4]: as
         `Drawn.thrown`, the sides as seen from here."""
         out = self.nets["place"](covariates)
-        shared, unsure = covariates[:, PLACE_COVARIATES.index("senders")] > 0, vague(out)
+        which, unsure = kind_of(covariates), vague(out)
         drawn = np.empty((len(out), 5), np.float32)
-        for kind, pool in ((~shared, self.residuals[0]), (shared, self.residuals[1])):
+        for k, pool in enumerate(self.residuals):
+            kind = which == k
             band = np.maximum(np.searchsorted(pool[::BAND, 5], unsure[kind], side="right") - 1, 0)
             drawn[kind] = pool[band * BAND + np.minimum((luck[kind] * BAND).astype(np.intp), BAND - 1), :5]
         common = thrown[:, 0] < self.alike[3]
@@ -156,6 +159,13 @@ class Parameters:
 
 def _spread(log: Singles) -> Singles:
     return np.asarray(np.exp(np.clip(log, *SPREAD)))
+
+
+def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
+    """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 shared, the odd ones of cars that stand square on
+    the map, which a network of cells puts elsewhere."""
+    shared, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "square"))
+    return 2 * (shared > 0).astype(np.intp) + (square > SQUARE)
 
 
 def vague(place: NDArray[Any]) -> NDArray[Any]:
@@ -237,10 +247,10 @@ def load(path: Path) -> Parameters:
             for name, sizes in NETS.items()
         },
         take("alike", 4),
-        take("residuals", 2, None, 6),
+        take("residuals", 4, None, 6),
         edges,
         take("alarm_rate", 1 + len(ALARM_COVARIATES), bands),
-        take("alarm_pool", bands, None, len(ALARM_COLUMNS)),
+        take("alarm_pool", 2, bands, None, len(ALARM_COLUMNS)),
         take("mirages", 4),
         take("boxes", 3, None),
         card,

@@ -176,7 +176,7 @@ def test_best_luck_places_best_among_what_was_predicted_as_vaguely(parameters: P
     off, _ = alone.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32), thrown(4000))
     fits = _iou(off.astype(np.float64))
     assert fits[:1000].mean() + 0.2 < fits[-1000:].mean()
-    rows = parameters.residuals.reshape(2, -1, BAND, 6)
+    rows = parameters.residuals.reshape(4, -1, BAND, 6)
     assert (rows[..., 5] == rows[..., :1, 5]).all()
     assert (np.diff(rows[:, :, 0, 5], axis=1) >= 0).all()
 
