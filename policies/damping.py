@@ -20,36 +20,38 @@ EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
 
-def believed(before: Descriptor | None, heard: Descriptor, hysteresis: float) -> Descriptor:
+def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
     """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
 
     The play operator (backlash) of width h in the logarithm: for a quantity u the value read is
     min(u, max(value read before, u / (1 + h))).
 
     Args:
-        before: what it read of that drone the last time; None the first time.
+        before: what it read of that drone the last time.
         heard: the drone's new descriptor.
         hysteresis: h, the share by which a quantity must rise before its rise is read, ≥ 0.
 
     Returns:
         A descriptor that is nowhere better than `heard`; `heard` itself where they are equal.
     """
-    if before is None or not hysteresis:
+    if not hysteresis:
         return heard
     part = 1.0 / (1.0 + hysteresis)
     links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
-    soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom
-    if len(links) == len(last):  # else the roster is another
-        links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
-    if soc > before.battery_soc:
-        soc = max(before.battery_soc, soc * part)
-    if cpu > before.cpu_headroom:
-        cpu = max(before.cpu_headroom, cpu * part)
-    if gpu > before.gpu_headroom:
-        gpu = max(before.gpu_headroom, gpu * part)
-    if (links, soc, cpu, gpu) == (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
+    read = (
+        tuple([_play(u, v, part) for u, v in zip(links, last, strict=True)]) if len(links) == len(last) else links,
+        _play(heard.battery_soc, before.battery_soc, part),
+        _play(heard.cpu_headroom, before.cpu_headroom, part),
+        _play(heard.gpu_headroom, before.gpu_headroom, part),
+    )
+    if read == (links, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
         return heard
+    links, soc, cpu, gpu = read
     return heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
+
+
+def _play(now: float, read_before: float, part: float) -> float:
+    return now if now <= read_before else max(read_before, now * part)
 
 
 class LinkState(NamedTuple):

@@ -19,31 +19,16 @@ MAPS = ("features", "raw")
 _ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
+OF_THE_LOOK = (
+    "range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "square", "next", "next_along",
+    "next_across",
+)  # fmt: skip
+"""What fusion takes over from the ego's own look."""
 FUSED_COVARIATES = (
     "own", "first", "second", "mean", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
-    "own_range", "own_visible", "own_margin", "own_nadir", "moving", "length", "across", "crowd", "altitude", "square",
-    "next", "next_along", "next_across",
+    *(f"own_{name}" for name in OF_THE_LOOK),
 )  # fmt: skip
-
-_OWN = tuple(
-    LOOK_COVARIATES.index(name)
-    for name in (
-        "range",
-        "visible",
-        "margin",
-        "nadir",
-        "moving",
-        "length",
-        "across",
-        "crowd",
-        "altitude",
-        "square",
-        "next",
-        "next_along",
-        "next_across",
-    )
-)
-"""What `FUSED_COVARIATES` take over from the ego's look."""
+_OWN = [LOOK_COVARIATES.index(name) for name in OF_THE_LOOK]
 _STYLES = ("old_town", "suburb", "yard")
 ALARM_COVARIATES = (
     "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",

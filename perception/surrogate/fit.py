@@ -86,7 +86,7 @@ def fit(
     pools = []
     for k in range(4):
         of = kind == k
-        if of.sum() < BAND:
+        if of.sum() < BAND:  # too few to draw from: square or not
             of = kind // 2 == k // 2
         pool = _bands(residuals[of], unsure[of], fits[of])
         good = fits[of] >= 0.5

@@ -164,7 +164,7 @@ def _spread(log: Singles) -> Singles:
 def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
     """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 shared, the odd ones of cars that stand square on
     the map, which a network of cells puts elsewhere."""
-    shared, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "square"))
+    shared, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "own_square"))
     return 2 * (shared > 0).astype(np.intp) + (square > SQUARE)
 
 

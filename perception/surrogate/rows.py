@@ -12,7 +12,7 @@ from perception import budget
 from perception.surrogate.collect import Asked, captures_of
 from perception.surrogate.exchange import Exchange, Pairs, alarm_covariates, cell_of, covariates, mean_shift, pair
 from perception.surrogate.features import Eyes, Fleet, Looks
-from perception.surrogate.plan import draw_scene, scene_model
+from perception.surrogate.plan import scene_model
 from perception.town import Floats
 from perception.types import Boxes
 
@@ -72,8 +72,8 @@ class Rows:
 
 def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
     """One scene's answers as rows; boxes below `floor` count as none."""
-    config = draw_scene(seed, asked.split, asked.scene)
-    eyes = Eyes(scene_model(seed, asked.split, asked.scene))
+    scene = scene_model(seed, asked.split, asked.scene)
+    eyes = Eyes(scene)
     captures = captures_of(asked.jobs)
     column = {c: i for i, c in enumerate(captures)}
     fleet = Fleet.of(captures)
@@ -113,7 +113,7 @@ def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
     keep = ~late[pairs.row]
     alarm = np.concatenate(alarms)
     alarm = alarm[~late[alarm[:, 0].astype(int)]]
-    of_jobs = alarm_covariates(exchange, looks, fleet, zeros, config)
+    of_jobs = alarm_covariates(exchange, looks, fleet, zeros, scene.config)
     of_jobs[late] = np.nan  # boxes that were sent are worked out, not fitted
     return Rows(
         looks.covariates, confidence, norm, above / 4096.0, above_norm / 4096.0, looks.car,

@@ -15,7 +15,7 @@ from perception.surrogate.features import square
 from perception.surrogate.judge import IN_DISC, judge
 from perception.surrogate.model import SHIPPED, load
 from perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Job, draw_target, moment, scene_model
-from perception.traffic import TargetPath
+from perception.traffic import TARGET_ID, TargetPath
 from perception.types import Boxes, Capture
 
 STREET = MANNERS.index("street")
@@ -60,10 +60,10 @@ def test_along_a_street_the_target_drives_below_the_fleet_and_the_disc_is_about_
         target = TargetPath.of(draw_target(0, "held-out", scene))
         x, y, yaw = target.pose(t_s)
         assert {j.disc for j in jobs} == {(x, y, 32.0)}
-        (car,) = np.flatnonzero(scene_model(0, "held-out", scene).cars_at(t_s).ids == 0)
-        assert car == 0
-        assert abs(np.cos(yaw) * y - np.sin(yaw) * x) == pytest.approx(LANE_M, abs=1e-9)
-        assert np.sin(yaw) * x - np.cos(yaw) * y > 0, "on the right"
+        cars = scene_model(0, "held-out", scene).cars_at(t_s)
+        assert (cars.x_m[0], cars.y_m[0], cars.yaw_rad[0]) == (x, y, yaw), "it is there to be seen"
+        assert cars.ids[0] == TARGET_ID
+        assert np.sin(yaw) * x - np.cos(yaw) * y == pytest.approx(LANE_M, abs=1e-9), "on the right of the street"
         ahead = {round(float(np.cos(j.ego.true_yaw_rad - yaw)), 2) for j in jobs}
         assert ahead == {1.0}, "the way that the fleet flies"
         away = [np.hypot(*np.subtract(j.ego.position_m[:2], (x, y))) for j in jobs]
@@ -126,6 +126,20 @@ def test_answers_are_kept_and_not_asked_for_again(tmp_path: Path, monkeypatch: p
             np.testing.assert_allclose(kept.boxes[-1].xy_m[0], jobs[-1].ego.position_m[:2], rtol=1e-6)
             assert all((ranks == c.drone).all() for c, ranks in kept.ranks.items())
     assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize("name", ["draw_target", "draw_scene", "moment"])
+def test_answers_to_another_question_are_not_taken_for_these(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan changes: the target drives elsewhere, the town is another, other fleets are asked."""
+    monkeypatch.setattr(collecting, "Probe", Told)
+    before = collect(tmp_path, 0, "fit", 3, STREET, None, "key")
+    changed = getattr(collecting, name)
+    monkeypatch.setattr(collecting, name, lambda seed, split, scene, *index: changed(seed, split, scene + 1, *index))
+    asked = Told.asked
+    assert collect(tmp_path, 0, "fit", 3, STREET, None, "key") != before
+    assert Told.asked > asked
 
 
 def test_answers_to_another_plan_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

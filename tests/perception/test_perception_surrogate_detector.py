@@ -280,3 +280,20 @@ def test_boxes_of_a_car_lie_off_to_the_same_side_of_it_whoever_looks(
         agreed = np.concatenate([agreed, np.array(pairs).reshape(-1, 3)])
     assert len(agreed) > 500
     assert ((agreed.mean(axis=0) > low) & (agreed.mean(axis=0) < high)).all(), agreed.mean(axis=0)
+
+
+@pytest.mark.parametrize("part", [0.0, 1.0])
+@pytest.mark.parametrize(("heading", "length_m"), [(0.0, 9.0), (np.pi / 2, 9.0), (0.4, 3.0)])
+def test_false_alarms_are_those_of_drones_along_a_street_or_askew(
+    detector: SurrogateDetector, heading: float, length_m: float, part: float
+) -> None:
+    """By their lengths, planted; a drone's own and those of things in the town alike."""
+    pool = detector.parameters.alarm_pool.copy()
+    pool[0, ..., 2], pool[1, ..., 2] = 3.0, 9.0
+    mirages = np.array([part, 0.5, 0.5, 0.1], np.float32)
+    planted = dataclasses.replace(detector.parameters, alarm_pool=pool, mirages=mirages)
+    some = SurrogateDetector.of(SceneModel(EMPTY, None, BOUNDS), Perception(), planted, 0)
+    fleet = cross(10.0, 20.0, heading)
+    lengths = np.concatenate([b.size_m[:, 0] for b in some.detect([(c, ()) for c in fleet])])
+    assert len(lengths) > 5
+    assert set(lengths.tolist()) == {length_m}

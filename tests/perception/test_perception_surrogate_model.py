@@ -276,3 +276,18 @@ def test_a_fit_returns_the_network_that_it_fitted() -> None:
 def test_parameters_cannot_be_changed(parameters: Parameters) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         parameters.alike = np.zeros(2)  # type: ignore[misc]
+
+
+def test_residuals_are_those_of_drones_alone_or_fleets_and_of_square_cars_or_others(parameters: Parameters) -> None:
+    """Pools that lie 0, 1, 2 and 3 m off along the car, planted; the networks say nothing."""
+    pools = np.zeros_like(parameters.residuals)
+    pools[..., 0] = np.arange(4)[:, None]
+    zero = Net((np.zeros((len(PLACE_COVARIATES), 11), np.float32),), (np.zeros(11, np.float32),))
+    planted = replace(
+        parameters, nets={**parameters.nets, "place": zero}, residuals=pools, alike=np.zeros(4, np.float32)
+    )
+    x = np.zeros((4, len(PLACE_COVARIATES)), np.float32)
+    x[2:, PLACE_COVARIATES.index("senders")] = 1.5
+    x[1::2, PLACE_COVARIATES.index("own_square")] = 0.9
+    off, _ = planted.place(x, np.full(4, 0.4, np.float32), thrown(4))
+    assert off[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]

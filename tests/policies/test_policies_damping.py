@@ -137,8 +137,8 @@ def read(values: list[float], field: str = "goodput", band: float = BAND) -> lis
     """What a policy reads of one quantity, value by value."""
     known, seen = None, []
     for value in values:
-        new = {"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}
-        known = believed(known, HEARD._replace(**new), band)  # type: ignore[arg-type]
+        heard = HEARD._replace(**({"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}))
+        known = heard if known is None else believed(known, heard, band)
         seen.append(known.peer_goodput_mbps[0] if field == "goodput" else getattr(known, field))
     return seen
 
