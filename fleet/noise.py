@@ -60,8 +60,8 @@ def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[
     """
     rate = 16 / (5 * time_s)
     d = rate * step_s  # from here on time is counted in 1/λ
-    driven = np.einsum("ij,tj...->ti...", np.linalg.cholesky(_lag_covariance(d)), normals)
-    driven[0] = np.einsum("ij,j...->i...", np.linalg.cholesky(_lag_covariance(math.inf)), normals[0])
+    driven = np.einsum("ij,tj...->ti...", _root(_lag_covariance(d)), normals)
+    driven[0] = np.einsum("ij,j...->i...", _root(_lag_covariance(math.inf)), normals[0])
     decay = math.exp(-d)
     lags: list[Array] = []
     for i in range(LAGS):  # exact transition: lag j feeds lag i by e^{−d}·d^{i−j}/(i−j)!
@@ -94,3 +94,14 @@ def _lag_covariance(d: float) -> Array:
     share = np.ones_like(m, dtype=float) if math.isinf(d) else gammainc(m, 2 * d)
     covariance: Array = factorial[m - 1] / (factorial[i] * factorial[j]) * 0.5**m * share
     return covariance
+
+
+def _root(covariance: Array) -> Array:
+    """The lower Cholesky factor, row by row: numpy's is off in other last bits with every build of its matrix library, and
+    so would be where a drone flies."""
+    root = np.zeros_like(covariance)
+    for i, row in enumerate(covariance):
+        for j in range(i + 1):
+            rest = row[j] - math.fsum(root[i, :j] * root[j, :j])
+            root[i, j] = math.sqrt(rest) if i == j else rest / root[j, j]
+    return root

@@ -91,12 +91,12 @@ def frame_path(
     since_s = time_s[:, None] - jump_s[:-1]
     _, turned, turning = spread(since_s, width_s)
     return FramePath(
-        position_m=points[0] + time_s[:, None] * velocity[0] + ramp @ jumps,
-        velocity_mps=velocity[0] + step @ jumps,
-        acceleration_mps2=slope @ jumps,
-        yaw_rad=course[0] + turned @ turn,
-        yaw_rate_radps=turning @ turn,
-        yaw_acceleration_radps2=bend(since_s, width_s) @ turn,
+        position_m=points[0] + time_s[:, None] * velocity[0] + _sums(ramp, jumps),
+        velocity_mps=velocity[0] + _sums(step, jumps),
+        acceleration_mps2=_sums(slope, jumps),
+        yaw_rad=course[0] + _sums(turned, turn),
+        yaw_rate_radps=_sums(turning, turn),
+        yaw_acceleration_radps2=_sums(bend(since_s, width_s), turn),
     )
 
 
@@ -106,3 +106,8 @@ def bend(since_s: Array, width_s: Array | float) -> Array:
     r = np.clip(since_s / knot_s + 1.5, 0.0, 3.0)
     bent: Array = (r - 3 * np.maximum(r - 1, 0.0) + 3 * np.maximum(r - 2, 0.0)) / knot_s**2
     return bent
+
+
+def _sums(parts: Array, of: Array) -> Array:
+    """`parts` @ `of`, added up in the same order on every machine; a matrix library's order is its own."""
+    return np.asarray(np.einsum("tw,w...->t...", parts, of))

@@ -263,8 +263,8 @@ def _middles(course: Course, drone: int, move: Move, other: int, theirs: Move) -
 def _distance_m(a: Array, b: Array) -> float:
     """From the origin to a segment."""
     along = b - a
-    length2 = float(along @ along)
-    t = min(1.0, max(0.0, -float(a @ along) / length2)) if length2 > 0.0 else 0.0
+    length2 = float((along * along).sum())
+    t = min(1.0, max(0.0, -float((a * along).sum()) / length2)) if length2 > 0.0 else 0.0
     return float(np.hypot(*(a + t * along)))
 
 

@@ -154,8 +154,10 @@ def rate_table(
     s50, slope = np.array(S50_DB)[: len(rates), None], np.array(SLOPE_PER_DB)[: len(rates), None]
     log_success = -np.logaddexp(0.0, -slope * (wide - s50))
     awgn = -np.expm1(log_success * (frame_bytes / REFERENCE_BYTES))
-    # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities
-    mean = np.stack([np.correlate(row, weights, mode="valid") for row in awgn])[:, : len(grid)].clip(0.0, 1.0)
+    # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities; einsum adds in the
+    # same order on every machine, np.correlate does not
+    windows = np.lib.stride_tricks.sliding_window_view(awgn, len(weights), axis=1)[:, : len(grid)]
+    mean = np.einsum("mgw,w->mg", windows, weights).clip(0.0, 1.0)
     best = (rates[:, None] * (1.0 - mean)).argmax(axis=0)
     dead = mean[0] > NO_LINK_PER
     columns = np.arange(len(grid))

@@ -43,8 +43,10 @@ class ShadowField:
 
     def between(self, positions_m: FloatArray, t_s: float) -> FloatArray:
         """[N, N] dB, symmetric, of links between [N, 3] positions (ENU, m) at a time; zero on the diagonal."""
-        first = np.exp(1j * (positions_m @ self._a + self._t * t_s + self._phase))
-        one_way = (first @ np.exp(1j * (positions_m @ self._b)).T).real
+        # einsum adds in one order; a matrix library's hangs on the machine and on how many drones there are
+        at_a, at_b = (np.einsum("nk,kw->nw", positions_m, waves) for waves in (self._a, self._b))
+        first = np.exp(1j * (at_a + self._t * t_s + self._phase))
+        one_way = np.einsum("iw,jw->ij", first, np.exp(1j * at_b)).real
         apart = np.sqrt(((positions_m[:, None] - positions_m[None]) ** 2).sum(axis=-1))
         # a link is the same from both ends; the two halves have the correlation e^{−2 |a − b| / d}
         both = np.sqrt(1.0 + np.exp(-2.0 * apart / self._distance_m))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from scipy.special import expit, ndtri
 
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES, beside
+from perception.town import Floats
 
 Singles = NDArray[np.float32]
 FORMAT = 5
@@ -49,32 +50,47 @@ BAND = 64
 SQUARE = 0.5
 """Squareness from which on a car, or a drone, counts as square."""
 _ROWS = 192
+"""At a time: few enough for the cache, and for the matrix library to start no threads."""
+_STEP = 2.0**-20
+"""Of activations and of weights alike."""
 
 
 @dataclass(frozen=True, slots=True)
 class Net:
-    """A network of one or more hidden layers with rectifiers; inputs are first put to mean 0 and deviation 1.
+    """A network of one or more layers with rectifiers between them; `weight` [in, out] and `bias` [out] of each.
 
-    `weight` and `bias` by layer, float32.
+    Its sums are exact, so that a row comes out the same to the bit whatever else is asked, and in whichever order the
+    matrix library of a machine adds: activations and weights are multiples of 2⁻²⁰, and a double holds any sum of their
+    products whose magnitudes add up to less than 2¹³.
     """
 
     weight: tuple[Singles, ...]
     bias: tuple[Singles, ...]
+    _layers: tuple[tuple[Floats, Floats], ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        layers = tuple(
+            (np.rint(w.astype(float) / _STEP) * _STEP, np.rint(b.astype(float) / _STEP))
+            for w, b in zip(self.weight, self.bias, strict=True)
+        )
+        object.__setattr__(self, "_layers", layers)
 
     def __call__(self, x: Singles) -> Singles:
-        """[n, in] → [n, out]; equally many rows at a time, so that a row comes out the same to the bit whatever else is asked,
-        and few enough for the cache and for the matrix library to start no threads."""
-        n = len(x)
-        out = np.empty((n, self.bias[-1].shape[0]), np.float32)
-        for at in range(0, n, _ROWS):
-            h = x[at : at + _ROWS]
-            if len(h) < _ROWS:
-                h = np.concatenate([h, np.zeros((_ROWS - len(h), x.shape[1]), np.float32)])
-            for w, b in zip(self.weight[:-1], self.bias[:-1], strict=True):
+        """[n, in] → [n, out]."""
+        out = np.empty((len(x), self.bias[-1].shape[0]), np.float32)
+        *hidden, (last, shift) = self._layers
+        for at in range(0, len(x), _ROWS):
+            h = np.multiply(x[at : at + _ROWS], 1.0 / _STEP, dtype=np.float64)
+            np.rint(h, out=h)
+            for w, b in hidden:
                 h = h @ w
                 h += b
                 np.maximum(h, 0.0, out=h)
-            out[at : at + _ROWS] = (h @ self.weight[-1] + self.bias[-1])[: n - at]
+                np.rint(h, out=h)
+            h = h @ last
+            h += shift
+            h *= _STEP
+            out[at : at + _ROWS] = h
         return out
 
 

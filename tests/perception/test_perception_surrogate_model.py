@@ -117,6 +117,25 @@ def test_a_net_is_its_layers_however_many_rows_it_takes() -> None:
     np.testing.assert_allclose(Net(weight, bias)(x), plain, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["look", "find", "place"])
+def test_a_row_of_a_net_is_the_same_to_the_bit_wherever_it_stands_and_whatever_order_it_is_added_in(
+    name: str, parameters: Parameters
+) -> None:
+    """A matrix library adds in an order of its own, by machine and by place in the matrix."""
+    net = parameters.nets[name]
+    (first, *others), (shift, *shifts) = net.weight, net.bias
+    x = RNG.normal(scale=2.0, size=(401, len(first))).astype(np.float32)
+    out = net(x)
+    for k in range(1, 40):
+        np.testing.assert_array_equal(net(x[k : 5 * k]), out[k : 5 * k])
+    inputs, hidden = RNG.permutation(len(first)), RNG.permutation(len(shift))
+    mixed = Net(
+        (first[inputs][:, hidden], others[0][hidden], *others[1:]),
+        (shift[hidden], *shifts),
+    )
+    np.testing.assert_array_equal(mixed(np.ascontiguousarray(x[:, inputs])), out)
+
+
 def test_better_luck_and_surer_drones_rank_higher(parameters: Parameters) -> None:
     x = np.zeros((50, len(RANK_COVARIATES)), np.float32)
     x[:, 0] = np.linspace(-4, 3, 50)

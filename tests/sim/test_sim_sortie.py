@@ -42,17 +42,25 @@ def test_the_same_sortie_twice_is_the_same_record(base: SortieRecord) -> None:
 WITH_NANS = {"descriptors", "directives", "mission", "transmissions"}  # NaN ≠ NaN; the fingerprint compares their bytes
 
 
-def test_another_process_gives_the_same_fingerprint(base: SortieRecord) -> None:
+@pytest.mark.parametrize("kernels", ["", "Haswell", "SkylakeX"])
+@pytest.mark.parametrize("extra", [[], ["perception.detector=surrogate", "radio.shadowing_distance_m=30"]])
+def test_another_process_gives_the_same_fingerprint_whatever_matrix_kernels_its_machine_has(
+    extra: list[str], kernels: str, base: SortieRecord
+) -> None:
+    """OpenBLAS adds in another order by processor."""
+    here = run_sortie(example(*extra)) if extra else base
     code = (
-        "from sim_examples import example; from sim.sortie import run_sortie; print(run_sortie(example()).fingerprint)"
+        "import sys; from sim_examples import example; from sim.sortie import run_sortie; "
+        "print(run_sortie(example(*sys.argv[1:])).fingerprint)"
     )
     for hash_seed in ("1", "2"):
         printed = subprocess.run(
-            [sys.executable, "-c", code],
+            [sys.executable, "-c", code, *extra],
             capture_output=True, text=True, check=True, cwd=__file__.rsplit("/", 1)[0],
-            env={"PYTHONHASHSEED": hash_seed, "PYTHONPATH": ":".join(p for p in sys.path if p)},
+            env={"PYTHONHASHSEED": hash_seed, "PYTHONPATH": ":".join(p for p in sys.path if p)}
+            | ({"OPENBLAS_CORETYPE": kernels} if kernels else {}),
         )  # fmt: skip
-        assert printed.stdout.strip() == base.fingerprint
+        assert printed.stdout.strip() == here.fingerprint
 
 
 @pytest.mark.parametrize("change", [{"seed": 2}, {"replication": 1}, {"policy": "silence"}])
