@@ -8,17 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
+from numba import njit
 
 from perception.geometry import FULL, IMAGE_PX, Geometry
+from perception.rays import fma
 from perception.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
-from perception.town import Bytes
+from perception.town import Bytes, FloatMap
 from perception.types import Capture
 
-_ROOT2 = float(np.sqrt(2.0))
+_F = np.float32
+_ZERO, _HALF, _ONE, _RIGHT, _BACK, _NADIR = _F(0.0), _F(0.5), _F(1.0), _F(2.0), _F(3.0), _F(4.0)
+_ROOT2, _HALF_H, _HALF_V, _NEAREST = _F(np.sqrt(2.0)), _F(HALF_H), _F(HALF_V), _F(0.1)
+_VIEW = _F(2.0 / len(CAMERAS))
+_INSET = _F(1.0 - 1.0 / HEIGHT_PX)
+"""Keeps bilinear taps inside the camera's own rows."""
 
 
 def ground_points(geometry: Geometry) -> torch.Tensor:
@@ -28,44 +35,58 @@ def ground_points(geometry: Geometry) -> torch.Tensor:
 
 
 @lru_cache(maxsize=4)
-def _planes(geometry: Geometry) -> tuple[torch.Tensor, torch.Tensor]:
+def _planes(geometry: Geometry) -> tuple[FloatMap, FloatMap]:
     x, y = ground_points(geometry).unbind(-1)
-    return x.contiguous(), y.contiguous()
+    return x.contiguous().numpy(), y.contiguous().numpy()
 
 
 def lift(views: Bytes, captures: Sequence[Capture], geometry: Geometry = FULL) -> torch.Tensor:
     """Camera views uint8 [n, 5, 90, 160, 3] to bird's-eye images uint8 [n, 4, 256, 256]: R, G, B, and 255 where any camera saw the ground."""
-    n = len(captures)
-    if n == 0:
-        return torch.empty(0, 4, IMAGE_PX, IMAGE_PX, dtype=torch.uint8)
-    atlas = torch.from_numpy(np.ascontiguousarray(views)).permute(0, 4, 1, 2, 3)
-    atlas = atlas.reshape(n, 3, len(CAMERAS) * HEIGHT_PX, -1).float()
-    grids, seen = zip(*(_sampling(c, geometry) for c in captures), strict=True)
-    rgb = F.grid_sample(atlas, torch.stack(grids), mode="bilinear", padding_mode="border", align_corners=False)
-    valid = torch.stack(seen)[:, None]
-    return torch.cat([rgb * valid, valid * 255.0], dim=1).round_().to(torch.uint8)
+    out = np.empty((len(captures), 4, IMAGE_PX, IMAGE_PX), np.uint8)
+    ground = _planes(geometry)
+    for seen, capture, image in zip(views, captures, out, strict=True):
+        level_to_body = tilt(capture.orientation_xyzw).T.astype(np.float32)
+        down = (level_to_body[:, 2].astype(float) * -max(capture.est_position_m[2], 1.0)).astype(np.float32)
+        _unproject(seen.reshape(len(CAMERAS) * HEIGHT_PX, -1, 3), level_to_body, down, *ground, image)
+    return torch.from_numpy(out)
 
 
-def _sampling(capture: Capture, geometry: Geometry) -> tuple[torch.Tensor, torch.Tensor]:
-    """For each pixel of the grid, where to look in the column of five views ([256, 256, 2], −1 … 1), and whether it is in one."""
-    level_to_body = torch.from_numpy(tilt(capture.orientation_xyzw).T.astype(np.float32))
-    down = -max(capture.est_position_m[2], 1.0)
-    ground_x, ground_y = _planes(geometry)
-    x, y, z = (torch.add(ground_x * r[0], ground_y, alpha=r[1]).add_(down * r[2]) for r in level_to_body.tolist())
-    depth = (-z).clamp_(min=0.1)
-    # straight down first: right is −y, image-down is −x
-    u, v = -y / (depth * HALF_H), -x / (depth * HALF_V)
-    nadir = (u.abs() < 1) & (v.abs() < 1) & (z < 0)
-    # else the camera of the quadrant: a forward and b right of it, pitched 45° down
-    lengthwise = x.abs() >= y.abs()
-    ahead = torch.where(lengthwise, x.abs(), y.abs())
-    right = torch.where(lengthwise, -y * x.sign(), x * y.sign())
-    camera = torch.where(lengthwise, torch.where(x >= 0, 0.0, 3.0), torch.where(y >= 0, 1.0, 2.0))
-    forward = (ahead - z) / _ROOT2
-    u = torch.where(nadir, u, right / (forward * HALF_H))
-    v = torch.where(nadir, v, (-ahead - z) / (_ROOT2 * forward * HALF_V))
-    camera = torch.where(nadir, 4.0, camera)
-    seen = (u.abs() < 1) & (v.abs() < 1) & (nadir | (forward > 1.0))
-    inset = 1.0 - 1.0 / HEIGHT_PX  # keep bilinear taps inside the camera's own rows
-    row = (camera + 0.5 + 0.5 * v.clamp(-inset, inset)) * (2.0 / len(CAMERAS)) - 1.0
-    return torch.stack([u.clamp(-1, 1), row], dim=-1), seen.float()
+@njit(nogil=True, cache=True)
+def _unproject(views: Any, turn: Any, down: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
+    """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [450, 160, 3]; into `out` [4, 256, 256]."""
+    rows, columns, _ = views.shape
+    for i in range(ground_x.shape[0]):
+        for j in range(ground_x.shape[1]):
+            gx, gy = ground_x[i, j], ground_y[i, j]
+            x = fma(turn[0, 1], gy, gx * turn[0, 0]) + down[0]
+            y = fma(turn[1, 1], gy, gx * turn[1, 0]) + down[1]
+            z = fma(turn[2, 1], gy, gx * turn[2, 0]) + down[2]
+            # straight down first: right is −y, image-down is −x
+            depth = max(-z, _NEAREST)
+            u, v, camera = -y / (depth * _HALF_H), -x / (depth * _HALF_V), _NADIR
+            seen = abs(u) < _ONE and abs(v) < _ONE and z < _ZERO
+            if not seen:  # the camera of the quadrant: a forward and b right of it, pitched 45° down
+                if abs(x) >= abs(y):
+                    ahead, right, camera = abs(x), (-y if x > _ZERO else y), (_ZERO if x >= _ZERO else _BACK)
+                else:
+                    ahead, right, camera = abs(y), (x if y > _ZERO else -x), (_ONE if y >= _ZERO else _RIGHT)
+                forward = (ahead - z) / _ROOT2
+                u, v = right / (forward * _HALF_H), (-ahead - z) / (_ROOT2 * forward * _HALF_V)
+                seen = abs(u) < _ONE and abs(v) < _ONE and forward > _ONE
+            if not seen:
+                out[:, i, j] = 0
+                continue
+            v = min(max(v, -_INSET), _INSET)
+            row = (camera + _HALF + _HALF * v) * _VIEW - _ONE
+            p = min(max(fma(u + _ONE, _F(0.5 * columns), -_HALF), _ZERO), _F(columns - 1))
+            q = min(max(fma(row + _ONE, _F(0.5 * rows), -_HALF), _ZERO), _F(rows - 1))
+            left, top = np.int32(p), np.int32(q)
+            after, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
+            w, n = p - _F(left), q - _F(top)
+            e, s = _ONE - w, _ONE - n
+            for k in range(3):
+                level = fma(_F(views[top, after, k]), w * s, _F(views[top, left, k]) * (e * s))
+                level = fma(_F(views[below, left, k]), e * n, level)
+                level = fma(_F(views[below, after, k]), w * n, level)
+                out[k, i, j] = np.uint8(np.rint(level))
+            out[3, i, j] = 255

@@ -2,9 +2,8 @@
 
 Each drone carries the cameras of UAV3D: front, left, right and back pitched 45° down and one that looks
 straight down, 70° horizontal field of view, 16:9, rendered at 160 × 90. They are fixed to the body, so a bank
-moves the view. A ray descends from the tallest thing in the window: 2 m slices are skipped where a coarse
-maximum map says that nothing is in reach, and walked in fine steps where something is (0.5 m of height,
-0.25 m below 2 m). The scenery is static; the moving cars of a moment are stamped into the rasters, and lifted out after.
+moves the view. `rays.py` walks the rays. The scenery is static; the moving cars of a moment are stamped into the rasters,
+and lifted out after.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
+from perception.rays import COARSE, FAR, FAR_REACH, REACH, see
 from perception.scene import SceneModel
 from perception.town import RES_M, TILE_M, Bytes, FloatMap, Floats
 from perception.traffic import Cars
@@ -28,12 +27,8 @@ VIEWS_SHAPE = (len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3)
 HALF_H = float(np.tan(np.radians(35.0)))
 """Tangent of half the horizontal field of view."""
 HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
-REACH = 3.0
-"""Rays flatter than 1:3 see haze: they meet the ground beyond the grid's corner."""
 MAX_REACH_M = 170.0
-_COARSE = 8
-_HAZE = (168, 178, 190)
-_SLICE_M = 2.0
+RES = np.float32(RES_M)
 
 
 def rotation(xyzw: Sequence[float]) -> Floats:
@@ -82,7 +77,7 @@ def _ray_table() -> Floats:
     return np.concatenate([local @ axes for axes in AXES])
 
 
-_RAYS = torch.from_numpy(_ray_table().astype(np.float32))
+_RAYS = _ray_table().astype(np.float32)
 
 
 class Window:
@@ -96,12 +91,14 @@ class Window:
         self.light = np.concatenate([np.concatenate([t.light for t in row], axis=1) for row in tiles])
         for patch in stamps(scene.parked_cars, self):
             patch.put(self)
-        rows, columns = self.height.shape
-        blocks = self.height.reshape(rows // _COARSE, _COARSE, columns // _COARSE, _COARSE).max(axis=(1, 3))
-        grown = np.pad(blocks, 1)
-        grown = np.maximum(np.maximum(grown[:-2], grown[1:-1]), grown[2:])
-        self.coarse = np.maximum(np.maximum(grown[:, :-2], grown[:, 1:-1]), grown[:, 2:])
+        self.coarse = _grown(_blocks(self.height, COARSE), 1)
+        self.far = _grown(_blocks(self.coarse, FAR // COARSE), FAR_REACH)
+        """Of scenery alone: it is asked above all cars."""
         self.top_m = float(self.height.max())
+
+    def pixel(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Where a place is, in pixels from the raster's edge (column, row)."""
+        return (x_m - self.x0_m) / RES_M, (y_m - self.y0_m) / RES_M
 
     @contextmanager
     def with_cars(self, cars: Cars) -> Iterator[None]:
@@ -112,7 +109,7 @@ class Window:
             patch.put(self)
         coarse = self.coarse.copy()
         for at, _, _ in undo:
-            reach = tuple(slice(max(s.start // _COARSE - 1, 0), (s.stop - 1) // _COARSE + 2) for s in at)
+            reach = tuple(slice(max(s.start // COARSE - 1, 0), (s.stop - 1) // COARSE + 2) for s in at)
             self.coarse[reach] = np.maximum(self.coarse[reach], self.height[at].max())
         try:
             yield
@@ -121,6 +118,20 @@ class Window:
                 self.height[at] = height
                 self.colour[at] = colour
             self.coarse[...] = coarse
+
+
+def _blocks(height: FloatMap, pixels: int) -> FloatMap:
+    """The highest of each block."""
+    rows, columns = (n // pixels for n in height.shape)
+    return np.asarray(height.reshape(rows, pixels, columns, pixels).max(axis=(1, 3)))
+
+
+def _grown(blocks: FloatMap, reach: int) -> FloatMap:
+    """The highest within so many blocks."""
+    padded = np.pad(blocks, reach)
+    for axis in (0, 1):
+        padded = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=axis).max(axis=-1)
+    return np.ascontiguousarray(padded)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,18 +192,18 @@ class Renderer:
         if not captures:
             return out
         window = self._window_over(captures)
-        gain = self.scene.config.brightness
+        gain = np.float32(self.scene.config.brightness)
         for t_s in dict.fromkeys(c.t_s for c in captures):
             here = [i for i, c in enumerate(captures) if c.t_s == t_s]
             with window.with_cars(self.scene.moving_cars(t_s)):
 
                 def one(i: int) -> None:
-                    with torch.inference_mode():
-                        image = _cast(window, captures[i])
-                        if gain != 1.0:
-                            image = (image * gain).to(torch.int16)
-                        image = image + _noise(self.seed, captures[i], image.numel()).view_as(image)
-                        out[i] = image.clamp_(0, 255).to(torch.uint8).view(out.shape[1:]).numpy()
+                    c = captures[i]
+                    turn = rotation(c.orientation_xyzw).T.astype(np.float32)
+                    eye = tuple(np.float32(v) for v in (*window.pixel(*c.position_m[:2]), c.position_m[2]))
+                    top_m = min(window.top_m, c.position_m[2] - 1.0)
+                    rasters = (window.height, window.coarse, window.far, window.colour)
+                    see(_RAYS, turn, eye, RES, top_m, *rasters, gain, _noise(self.seed, c), out[i].reshape(-1, 3))
 
                 for _ in each(one, here):
                     pass
@@ -215,75 +226,7 @@ class Renderer:
         return self._window
 
 
-def _cast(window: Window, capture: Capture) -> torch.Tensor:
-    """Colours uint8 [rays, 3] of one drone's rays."""
-    direction = _RAYS @ torch.from_numpy(rotation(capture.orientation_xyzw).T.astype(np.float32))
-    dx, dy, dz = direction.unbind(1)
-    down = torch.clamp(-dz, min=0.05)
-    bx, by = dx / (down * RES_M), dy / (down * RES_M)  # pixels sideways per metre of descent
-    z0 = capture.position_m[2]
-    ax = torch.add(bx * z0, (capture.position_m[0] - window.x0_m) / RES_M)
-    ay = torch.add(by * z0, (capture.position_m[1] - window.y0_m) / RES_M)
-    index, hit_z = _march(window, ax, ay, bx, by, min(window.top_m, z0 - 1.0))
-    colour = torch.from_numpy(window.colour).view(-1, 3).index_select(0, index)
-    wall = torch.from_numpy(window.height).view(-1).index_select(0, index) - hit_z > 0.8
-    side = torch.where(bx.abs() > by.abs(), 0.55, 0.75)
-    out = (colour * torch.where(wall, side, 1.0)[:, None]).to(torch.uint8)
-    haze = dx * dx + dy * dy > (-dz * REACH).clamp_(min=0.0) ** 2
-    if bool(haze.any()):
-        out[haze] = torch.tensor(_HAZE, dtype=torch.uint8)
-    return out
-
-
-def _march(
-    window: Window, ax: torch.Tensor, ay: torch.Tensor, bx: torch.Tensor, by: torch.Tensor, top_m: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where each ray (x = ax − z·bx, y = ay − z·by, pixels) first meets the height field: pixel index and z, both [n]."""
-    rows, columns = window.height.shape
-    fine, coarse = torch.from_numpy(window.height).view(-1), torch.from_numpy(window.coarse).view(-1)
-    wide = columns // _COARSE
-    result = _pixel(ax, ay, bx, by, 0.0, 1.0, rows, columns)
-    hit_z = torch.zeros(len(ax))
-    alive = torch.ones(len(ax), dtype=torch.bool)
-    for step in range(int(np.ceil(top_m / _SLICE_M)) - 1, -1, -1):
-        low = step * _SLICE_M
-        at = _pixel(ax, ay, bx, by, low + _SLICE_M / 2, 1 / _COARSE, rows // _COARSE, wide)
-        who = (coarse.index_select(0, at) > low).logical_and_(alive).nonzero().squeeze(1)
-        if not len(who):
-            continue
-        rax, ray, rbx, rby = (v.index_select(0, who) for v in (ax, ay, bx, by))
-        fine_step = 0.25 if step == 0 else 0.5
-        got, got_z = result.index_select(0, who), torch.zeros(len(who))
-        for k in range(int(_SLICE_M / fine_step)):  # upwards: the highest meeting is the first on the way down
-            z = low + k * fine_step
-            if z > 0.0:
-                index = _pixel(rax, ray, rbx, rby, z, 1.0, rows, columns)
-                found = fine.index_select(0, index) >= z
-                got = torch.where(found, index, got)
-                got_z.masked_fill_(found, z)
-        result.index_copy_(0, who, got)
-        hit_z.index_copy_(0, who, got_z)
-        alive.index_copy_(0, who, got_z == 0.0)
-    return result, hit_z
-
-
-def _pixel(
-    ax: torch.Tensor,
-    ay: torch.Tensor,
-    bx: torch.Tensor,
-    by: torch.Tensor,
-    z: float,
-    scale: float,
-    rows: int,
-    columns: int,
-) -> torch.Tensor:
-    """Flat index, int32 [n], of the raster cell that each ray is over at height z; the raster's edge goes on for ever."""
-    ix = torch.sub(ax, bx, alpha=z).mul_(scale).clamp_(0, columns - 1).to(torch.int32)
-    iy = torch.sub(ay, by, alpha=z).mul_(scale).clamp_(0, rows - 1).to(torch.int32)
-    return iy.mul_(columns).add_(ix)
-
-
-def _noise(seed: int, capture: Capture, size: int) -> torch.Tensor:
-    """Uniform sensor noise of −8 … 7 levels, int16, keyed by drone and millisecond."""
+def _noise(seed: int, capture: Capture) -> Bytes:
+    """Uniform sensor noise, uint8 [rays, 3] of 0 … 15 levels (8 is none), keyed by drone and millisecond."""
     rng = stream(seed, 0, (capture.drone, max(round(capture.t_s * 1e3), 0)), "camera.noise")
-    return torch.from_numpy((np.frombuffer(rng.bytes(size), np.uint8) & 15).astype(np.int16) - 8)
+    return np.asarray(np.frombuffer(rng.bytes(_RAYS.size), np.uint8) & np.uint8(15)).reshape(_RAYS.shape)
