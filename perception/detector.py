@@ -34,7 +34,7 @@ from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
 from perception.town import Bytes
 from perception.types import Boxes, Capture, Share
-from perception.warp import warp
+from perception.warp import arriving, rows, support
 from scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -256,19 +256,24 @@ class TorchDetector:
 
     def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> Tensor | None:
         """The head's output after fusion; None where no peer has a say in any cell."""
-        features = torch.stack([self._kept[s.capture].features for s in maps])
         # relative to the ego, so that float32 keeps millimetres kilometres from the origin
         x, y, yaw = ego.est_pose
         poses = [self._lies(s, now) for s in maps]
         there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
-        sent = torch.stack([self._sent(s) for s in maps])
-        warped, arrived, inside = warp(features, sent, torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
+        under = support(torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
+        weights, arrived = arriving(under, torch.stack([self._sent(s).flatten() for s in maps]))
         weight = torch.tensor([[s.weight for s in maps]])
-        part = takes_part(arrived[None, :, 0], inside[None, :, 0], weight, self._config.unsent_cells)
+        part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
         if not bool(part[:, 1:].any()):
             return None
-        agents = torch.cat([self._kept[ego].features[None], warped])[None]
-        out: Tensor = self._net.head(self._net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0)))[0]
+        tables = [self._kept[s.capture].features.permute(1, 2, 0).reshape(CELLS**2, -1) for s in maps]
+        taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
+
+        def said(at: Tensor) -> Tensor:
+            return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
+
+        fused = self._net.fusion.fuse(self._kept[ego].features, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+        out: Tensor = self._net.head(fused)[0]
         return out
 
     def _lies(self, share: Share, now: Mapping[int, Capture]) -> Pose:

@@ -57,6 +57,18 @@ def arriving(under: Support, sent: Tensor) -> tuple[Tensor, Tensor]:
     return weights / share.clamp_min(0.5) * arrived[..., None], arrived
 
 
+def rows(table: Tensor, cells: Tensor, weights: Tensor) -> Tensor:
+    """A peer's features [p, c] on chosen cells of the ego's grid.
+
+    Args:
+        table: [cells of the peer's grid, c].
+        cells, weights: [p, 4] as in `Support`.
+    """
+    # a weighted sum of four rows of the table, per cell: what embedding_bag is fast at
+    out: Tensor = F.embedding_bag(cells, table, mode="sum", per_sample_weights=weights)
+    return out
+
+
 def warp(
     features: Tensor, sent: Tensor, ego_pose: Tensor, peer_pose: Tensor, cell_m: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -75,8 +87,6 @@ def warp(
     under = support(ego_pose, peer_pose, cell_m)
     weights, arrived = arriving(under, sent.view(k, -1))
     taps = under.cells + torch.arange(k, device=features.device)[:, None, None, None] * CELLS**2
-    # a weighted sum of four rows of the peer's table of cells, per cell: what embedding_bag is fast at
-    table = features.permute(0, 2, 3, 1).reshape(k * CELLS**2, channels)
-    moved = F.embedding_bag(taps.view(-1, 4), table, mode="sum", per_sample_weights=weights.view(-1, 4))
+    moved = rows(features.permute(0, 2, 3, 1).reshape(k * CELLS**2, channels), taps.view(-1, 4), weights.view(-1, 4))
     moved = moved.view(k, CELLS, CELLS, channels).permute(0, 3, 1, 2)
     return moved, arrived[:, None], under.inside[:, None]

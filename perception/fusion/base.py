@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import torch
@@ -37,6 +38,18 @@ class Fusion(nn.Module):
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
         raise NotImplementedError
 
+    def fuse(self, own: Tensor, said: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
+        """One ego's fused map [1, c, h, w].
+
+        Args:
+            own: [c, h, w]; takes_part: [1 + k, h, w] and weight: [1 + k], as for `forward`.
+            said: gives what peers said on cells of the ego's grid, [p] row by row → [k, p, c].
+        """
+        channels, height, width = own.shape
+        peers = said(torch.arange(height * width)).view(-1, height, width, channels).permute(0, 3, 1, 2)
+        out: Tensor = self(torch.cat([own[None], peers])[None], takes_part[None], weight[None])
+        return out
+
     def fold(self) -> None:
         """Fold batch norms into the layers before them, for inference; what has none does nothing."""
 
@@ -63,6 +76,14 @@ class PerCell(Fusion):
         mixed = self.mix(said, part.index_select(1, at), weight.T.index_select(1, sample))
         own = agents[:, 0].permute(0, 2, 3, 1).reshape(-1, channels)
         return own.index_copy(0, at, mixed).view(n, height, width, channels).permute(0, 3, 1, 2)
+
+    def fuse(self, own: Tensor, said: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
+        part = takes_part.flatten(1)
+        at = part[1:].any(dim=0).nonzero().squeeze(1)
+        rows = own.permute(1, 2, 0).reshape(-1, len(own))
+        agents = torch.cat([rows[None, at], said(at)])
+        mixed = self.mix(agents, part.index_select(1, at), weight[:, None].expand(-1, len(at)))
+        return rows.index_copy(0, at, mixed).view(1, *own.shape[1:], -1).permute(0, 3, 1, 2)
 
     def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         """[agents, p, c] with who takes part and link weights, [agents, p] each → [p, c]; the ego is the first agent."""
