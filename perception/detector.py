@@ -29,6 +29,7 @@ from perception.fusion.base import takes_part
 from perception.fusion.registry import FUSIONS
 from perception.geometry import CELLS, FULL, in_square
 from perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
+from perception.memory import keep_freed
 from perception.model import folded
 from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
@@ -42,6 +43,7 @@ SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 KEPT_CAPTURES = 64
 MAPS, LATE = ("features", "raw"), ("detections", "tracks")
 Disc = tuple[float, float, float]
+Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
 __all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth", "shipped"]
@@ -78,13 +80,17 @@ def ground_truth(
 
 @dataclass(slots=True)
 class _Encoded:
-    """What is known of one capture: its features [80, 64, 64], and, when asked for, what it finds alone."""
+    """What is known of one capture, or under way: its features [80, 64, 64], and, when asked for, what it shows alone."""
 
-    features: Tensor
-    out: Tensor | None = None
-    boxes: Boxes | None = None
-    in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Tensor] = field(default_factory=dict)
+    features: Future[Tensor]
+    out: Future[Tensor] | None = None
+    """The head's output [7, 128, 128] without peers."""
+    boxes: Future[Boxes] | None = None
+    in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Future[Tensor]] = field(default_factory=dict)
     """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
+
+
+Known = Mapping[Capture, _Encoded]
 
 
 class TorchDetector:
@@ -100,7 +106,9 @@ class TorchDetector:
         ValueError: weights that are missing or do not fit, naming file and tensor, or that learned another fusion.
 
     One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
-    side as torch has threads when the detector is made (`torch.set_num_threads`). The numbers do not depend on it.
+    side as torch has threads when the detector is made (`torch.set_num_threads`). Tasks begin in the order in which they
+    are handed in, each after those that it waits for, so that no thread waits while there is work. The numbers do not
+    depend on it.
     """
 
     def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
@@ -116,6 +124,7 @@ class TorchDetector:
             raise InputError(
                 f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
             )
+        keep_freed()
         self._net = folded(net)
         self._renderer = Renderer(scene, seed)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
@@ -123,28 +132,35 @@ class TorchDetector:
             torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)
         )
 
-    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
+    def detect(self, jobs: Jobs) -> list[Boxes]:
         """Each ego's boxes from its own features and what it was sent, ENU, best first.
 
         A late share's map lies where its sender was at the capture, both poses being known: what has moved since
         lags, what stands still fits. Without `motion_compensation` it lies where its sender is now, if that is among
         the egos. Boxes travel in world coordinates and need none.
         """
+        return self.begin(jobs)()
+
+    def begin(self, jobs: Jobs) -> Callable[[], list[Boxes]]:
+        """Render what the jobs need and have the rest worked out in the background; the boxes are there when called for."""
         if self._fusion.shares == "nothing":
             jobs = [(ego, ()) for ego, _ in jobs]
-        self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
+        known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         look = {s.capture for s in shared if s.representation in LATE}
         look |= {ego for ego, shares in jobs if not any(self._is_fused(s) for s in shares)}
-        rank = [s.capture for s in shared if self._must_rank(s)]
-        self._each(lambda c: self._look_alone(c) if c in look else self._head_alone(c), dict.fromkeys([*look, *rank]))
+        for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
+            if capture in look:
+                self._look_alone(capture)
+            else:
+                self._head_alone(capture)
         if self._fusion.shares == "boxes":
-            self._each(
-                self._head_in_part,
-                {(s.capture, s.rho, s.roi, s.missing): s for s in shared if s.representation in MAPS}.values(),
-            )
+            for share in shared:
+                if share.representation in MAPS:
+                    self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
-        return self._each(lambda job: self._find(job[0], job[1], now), jobs)
+        found = [self._task(self._find, ego, shares, now, known) for ego, shares in jobs]
+        return lambda: [f.result() for f in found]
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
@@ -153,49 +169,46 @@ class TorchDetector:
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
         self._encode([capture])
-        self._each(self._look_alone, [capture])
-        return len(self._alone(capture).inside(roi))
+        return len(self._look_alone(capture).result().inside(roi))
 
     def camera_views(self, capture: Capture) -> Bytes:
         """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
         views: Bytes = self._renderer.render([capture])[0]
         return views
 
-    def _each(self, do: Callable[[Any], R], over: Iterable[Any]) -> list[R]:
-        """Run a task over its arguments side by side, each in one thread; results in order."""
+    def _task(self, do: Callable[..., R], *what: Any) -> Future[R]:
+        """Have it done by one thread."""
 
-        def task(what: Any) -> R:
+        def task() -> R:
             with torch.inference_mode():
-                return do(what)
+                return do(*what)
 
-        return list(self._pool.map(task, over))
+        return self._pool.submit(task)
 
-    def _encode(self, captures: Iterable[Capture]) -> None:
-        """Render and encode what is not kept yet; then drop the oldest beyond the limit."""
+    def _encode(self, captures: Iterable[Capture]) -> Known:
+        """Render what is not kept yet, encode it in the background, and drop the oldest beyond the limit."""
         wanted = list(dict.fromkeys(captures))
         missing = [c for c in wanted if c not in self._kept]
         views = np.empty((len(missing), *VIEWS_SHAPE), np.uint8)
-        features: dict[int, Future[Tensor]] = {}
 
         def encode(i: int, seen: Future[None]) -> Tensor:
-            seen.result()  # under way or done: tasks begin in the order in which they were handed in
-            with torch.inference_mode():
-                out: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
+            seen.result()
+            out: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
             return out
 
         def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
             """Render, and encode what is rendered while the last views are on their way."""
-            sights = {i: self._pool.submit(see, i) for i in over}
-            features.update({i: self._pool.submit(encode, i, seen) for i, seen in sights.items()})
+            sights = {i: self._task(see, i) for i in over}
+            for i, seen in sights.items():
+                self._kept[missing[i]] = _Encoded(self._task(encode, i, seen))
             return [seen.result() for seen in sights.values()]
 
         self._renderer.render(missing, side_by_side, views)
-        for i, capture in enumerate(missing):
-            self._kept[capture] = _Encoded(features[i].result())
         for capture in wanted:
             self._kept.move_to_end(capture)
         while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
             self._kept.popitem(last=False)
+        return {capture: self._kept[capture] for capture in wanted}
 
     def _must_rank(self, share: Share) -> bool:
         """Whether the sender's own head is needed to say which cells it sent."""
@@ -203,76 +216,76 @@ class TorchDetector:
             return False
         return _is_ranked(share)
 
-    def _head_alone(self, capture: Capture) -> Tensor:
-        """The head's output [7, 128, 128] without peers, worked out once."""
+    def _head_alone(self, capture: Capture) -> Future[Tensor]:
+        """The head's output without peers, worked out once."""
         kept = self._kept[capture]
         if kept.out is None:
-            kept.out = self._net.head(kept.features[None])[0]
+            features = kept.features
+            kept.out = self._task(lambda: self._net.head(features.result()[None])[0])
         return kept.out
 
-    def _look_alone(self, capture: Capture) -> None:
-        """Work out what the capture shows without peers, once."""
+    def _look_alone(self, capture: Capture) -> Future[Boxes]:
+        """What the capture shows without peers, worked out once."""
         kept = self._kept[capture]
         if kept.boxes is None:
-            kept.boxes = self._place(self._head_alone(capture), capture.est_pose)
-
-    def _alone(self, capture: Capture) -> Boxes:
-        boxes = self._kept[capture].boxes
-        assert boxes is not None  # noqa: S101 (looked at before)
-        return boxes
+            out = self._head_alone(capture)
+            kept.boxes = self._task(lambda: self._place(out.result(), capture.est_pose))
+        return kept.boxes
 
     def _place(self, out: Tensor, pose: Pose) -> Boxes:
         """The boxes of a head's output [7, 128, 128] in the world, suppressed."""
         local = decode(out, self._config.score_threshold).numpy()
         return suppress(Boxes.placed(local, pose), NMS_IOU)
 
-    def _sent(self, share: Share) -> Tensor:
+    def _sent(self, share: Share, known: Known) -> Tensor:
         """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""
         if share.representation == "raw":
             return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
-        kept = self._kept[share.capture]
+        kept = known[share.capture]
         if not _is_ranked(share):
             rank = np.zeros((CELLS, CELLS))
         elif self._config.cells_by == "norm":
-            rank = kept.features.norm(dim=0).numpy()
+            rank = kept.features.result().norm(dim=0).numpy()
         else:
-            rank = F.max_pool2d(self._head_alone(share.capture)[:1], 2)[0].numpy()
+            assert kept.out is not None  # noqa: S101 (`_must_rank`)
+            rank = F.max_pool2d(kept.out.result()[:1], 2)[0].numpy()
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
         return self._fusion.shares == "features" and share.representation in MAPS
 
-    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
+    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
-        out = self._fuse(ego, maps, now) if maps else None
-        if out is None:
-            self._look_alone(ego)
-            own = self._alone(ego)
-        else:
+        out = self._fuse(ego, maps, now, known) if maps else None
+        if out is not None:
             own = self._place(out, ego.est_pose)
-        late = [self._told(s, now) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+        elif (alone := known[ego].boxes) is not None:
+            own = alone.result()
+        else:
+            own = self._place(self._net.head(known[ego].features.result()[None])[0], ego.est_pose)
+        late = [self._told(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         return joined(ego.est_pose, own, out is not None, late, self._config.join)
 
-    def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> Tensor | None:
+    def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Tensor | None:
         """The head's output after fusion; None where no peer has a say in any cell."""
         # relative to the ego, so that float32 keeps millimetres kilometres from the origin
         x, y, yaw = ego.est_pose
         poses = [self._lies(s, now) for s in maps]
         there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
         under = support(torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
-        weights, arrived = arriving(under, torch.stack([self._sent(s).flatten() for s in maps]))
+        weights, arrived = arriving(under, torch.stack([self._sent(s, known).flatten() for s in maps]))
         weight = torch.tensor([[s.weight for s in maps]])
         part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
         if not bool(part[:, 1:].any()):
             return None
-        tables = [self._kept[s.capture].features.permute(1, 2, 0).reshape(CELLS**2, -1) for s in maps]
+        tables = [known[s.capture].features.result().permute(1, 2, 0).reshape(CELLS**2, -1) for s in maps]
         taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
 
         def said(at: Tensor) -> Tensor:
             return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
 
-        fused = self._net.fusion.fuse(self._kept[ego].features, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+        fused = self._net.fusion.fuse(known[ego].features.result(), said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         out: Tensor = self._net.head(fused)[0]
         return out
 
@@ -281,24 +294,36 @@ class TorchDetector:
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
         return capture.est_pose
 
-    def _told(self, share: Share, now: Mapping[int, Capture]) -> Told:
+    def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
         """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
         if share.representation in MAPS:
             lies = self._lies(share, now)
-            said = Told(self._place(self._head_in_part(share), lies), share.weight, lies, share.roi, share.rho < 1.0)
+            out = known[share.capture].in_part[_part(share)].result()
+            said = Told(self._place(out, lies), share.weight, lies, share.roi, share.rho < 1.0)
         else:
-            said = told(share, self._alone(share.capture))
+            alone = known[share.capture].boxes
+            assert alone is not None  # noqa: S101 (asked for with the job)
+            said = told(share, alone.result())
         return replace(said, boxes=sendable(said.boxes)) if self._fusion.shares == "boxes" else said
 
-    def _head_in_part(self, share: Share) -> Tensor:
-        """The head's output [7, 128, 128] from what was sent of a map, worked out once for a capture and a budget."""
-        kept, key = self._kept[share.capture], (share.rho, share.roi, share.missing)
-        sent = self._sent(share)
-        if bool(sent.all()):
-            return self._head_alone(share.capture)
-        if key not in kept.in_part:
-            kept.in_part[key] = self._net.head((kept.features * sent)[None])[0]
-        return kept.in_part[key]
+    def _head_in_part(self, share: Share, known: Known) -> None:
+        """The head's output from what was sent of a map, worked out once for a capture and a budget."""
+        kept = known[share.capture]
+        if _part(share) in kept.in_part:
+            return
+
+        def head() -> Tensor:
+            features, sent = kept.features.result(), self._sent(share, known)
+            if kept.out is not None and bool(sent.all()):
+                return kept.out.result()
+            out: Tensor = self._net.head((features * sent)[None])[0]
+            return out
+
+        kept.in_part[_part(share)] = self._task(head)
+
+
+def _part(share: Share) -> tuple[float, Disc | None, tuple[int, ...]]:
+    return share.rho, share.roi, share.missing
 
 
 def _is_ranked(share: Share) -> bool:

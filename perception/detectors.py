@@ -34,6 +34,14 @@ class Detector(Protocol):
 
 
 @runtime_checkable
+class DetectsAhead(Protocol):
+    """A detector that works in the background: a sortie flies on to the next moment while it looks at this one."""
+
+    def begin(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> Callable[[], list[Boxes]]:
+        """Begin what `detect` does; what is returned waits for it."""
+
+
+@runtime_checkable
 class DetectsMany(Protocol):
     """A detector that need not be asked at once: a sortie gathers its moments and asks for many together."""
 

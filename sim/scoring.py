@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 import simpy
 
 from fleet.agent import Agent, Received
-from perception.detectors import DetectsMany
+from perception.detectors import DetectsAhead, DetectsMany
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Scenario
 from sim.record import REPRESENTATIONS, Recorder
@@ -44,7 +45,8 @@ Moment = tuple[float, list[tuple[Capture, list[Share]]]]
 class Scorer:
     """Runs the detector over the fleet at the scored frames' fusion times.
 
-    A detector that takes many moments together is asked when `flush` is called, any other at the moment itself.
+    A detector that takes many moments together is asked when `flush` is called, any other at the moment itself; one that
+    works in the background may take until the next moment.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class Scorer:
         self._env, self._scenario, self._detector = env, scenario, detector
         self._agents, self._recorder = agents, recorder
         self._waiting: list[Moment] = []
+        self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
 
     def start(self) -> None:
@@ -82,12 +85,17 @@ class Scorer:
             if a.latest is not None
         ]
         self._waiting.append((now_s, jobs))
-        if not isinstance(self._detector, DetectsMany):
+        if isinstance(self._detector, DetectsAhead):
+            self._begun.append(self._detector.begin(jobs))
+            self.flush(but=1)
+        elif not isinstance(self._detector, DetectsMany):
             self.flush()
 
-    def flush(self) -> None:
-        """Write down what the moments since the last call come to."""
-        waiting, self._waiting = self._waiting, []
+    def flush(self, but: int = 0) -> None:
+        """Write down what the moments since the last call come to, but the latest so many."""
+        n = len(self._waiting) - but
+        waiting, self._waiting = self._waiting[:n], self._waiting[n:]
+        begun, self._begun = self._begun[:n], self._begun[n:]
         asked = [(t_s, ego, shares) for t_s, jobs in waiting for ego, shares in jobs]
         if not asked:
             return
@@ -98,7 +106,8 @@ class Scorer:
             found = detector.detect_many([jobs for _, jobs in waiting])
             truths = detector.truth_many([t_s for t_s, _, _ in asked], [ego for _, ego, _ in asked])
         else:
-            found = (boxes for _, jobs in waiting for boxes in detector.detect(jobs))
+            ready = begun or [partial(detector.detect, jobs) for _, jobs in waiting]
+            found = (boxes for wait in ready for boxes in wait())
             truths = (detector.truth(t_s, ego) for t_s, ego, _ in asked)
         for (now_s, ego, shares), boxes, truth in zip(asked, found, truths, strict=True):
             rows["detections"].append((now_s, ego.drone, boxes))

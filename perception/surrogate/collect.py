@@ -42,8 +42,8 @@ class Probe(TorchDetector):
         """What ranks its cells, [2, 64, 64]: the logit of their confidence, and their features' norm."""
         self._encode([capture])
         with torch.inference_mode():
-            confidence = F.max_pool2d(self._head_alone(capture)[:1], 2)[0]
-            norm = self._kept[capture].features.norm(dim=0)
+            confidence = F.max_pool2d(self._head_alone(capture).result()[:1], 2)[0]
+            norm = self._kept[capture].features.result().norm(dim=0)
         return torch.stack([confidence, norm]).numpy()
 
 
