@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.rays import COARSE, FAR, FAR_REACH, REACH, see
 from perception.scene import SceneModel
+from perception.stamping import raised, restore, saved, stamp
 from perception.town import RES_M, TILE_M, Bytes, FloatMap, Floats
 from perception.traffic import Cars
 from perception.types import Capture
@@ -29,6 +31,7 @@ HALF_H = float(np.tan(np.radians(35.0)))
 HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
 MAX_REACH_M = 170.0
 RES = np.float32(RES_M)
+FloatOrArray = TypeVar("FloatOrArray", float, Floats)
 
 
 def rotation(xyzw: Sequence[float]) -> Floats:
@@ -89,35 +92,43 @@ class Window:
         self.height = np.concatenate([np.concatenate([t.height_m for t in row], axis=1) for row in tiles])
         self.colour = np.concatenate([np.concatenate([t.albedo for t in row], axis=1) for row in tiles])
         self.light = np.concatenate([np.concatenate([t.light for t in row], axis=1) for row in tiles])
-        for patch in stamps(scene.parked_cars, self):
-            patch.put(self)
+        self._stamp(scene.parked_cars)
         self.coarse = _grown(_blocks(self.height, COARSE), 1)
         self.far = _grown(_blocks(self.coarse, FAR // COARSE), FAR_REACH)
         """Of scenery alone: it is asked above all cars."""
         self.top_m = float(self.height.max())
 
-    def pixel(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Where a place is, in pixels from the raster's edge (column, row)."""
+    def pixel(self, x_m: FloatOrArray, y_m: FloatOrArray) -> tuple[FloatOrArray, FloatOrArray]:
+        """Where places are, in pixels from the raster's edge (column, row)."""
         return (x_m - self.x0_m) / RES_M, (y_m - self.y0_m) / RES_M
 
     @contextmanager
     def with_cars(self, cars: Cars) -> Iterator[None]:
         """The window with `cars` in it, for the time of the block."""
-        undo = []
-        for patch in stamps(cars, self):
-            undo.append((patch.at, self.height[patch.at].copy(), self.colour[patch.at].copy()))
-            patch.put(self)
-        coarse = self.coarse.copy()
-        for at, _, _ in undo:
-            reach = tuple(slice(max(s.start // COARSE - 1, 0), (s.stop - 1) // COARSE + 2) for s in at)
-            self.coarse[reach] = np.maximum(self.coarse[reach], self.height[at].max())
+        spans, _ = self._spans(cars)
+        scenery, coarse = saved(self.height, self.colour, spans), self.coarse.copy()
+        self._stamp(cars)
+        raised(self.height, self.coarse, COARSE, spans)
         try:
             yield
         finally:
-            for at, height, colour in reversed(undo):
-                self.height[at] = height
-                self.colour[at] = colour
+            restore(self.height, self.colour, spans, *scenery)
             self.coarse[...] = coarse
+
+    def _spans(self, cars: Cars) -> tuple[NDArray[np.int64], Floats]:
+        """Rows and columns [n, 4] that cars may cover, none for those that are not whole in the window; and their middles [n, 2], pixels."""
+        reach = 0.5 * np.hypot(cars.length_m, cars.width_m) / RES_M
+        x, y = self.pixel(cars.x_m, cars.y_m)
+        spans = np.stack([np.floor(y - reach), np.ceil(y + reach), np.floor(x - reach), np.ceil(x + reach)], axis=1)
+        rows, columns = self.height.shape
+        spans[(spans[:, 0] < 0) | (spans[:, 1] > rows) | (spans[:, 2] < 0) | (spans[:, 3] > columns)] = 0
+        return spans.astype(np.int64), np.stack([x, y], axis=1)
+
+    def _stamp(self, cars: Cars) -> None:
+        spans, middles = self._spans(cars)
+        turns = np.stack([np.cos(cars.yaw_rad), np.sin(cars.yaw_rad)], axis=1)
+        sizes = np.stack([cars.length_m, cars.width_m, cars.height_m], axis=1)
+        stamp(self.height, self.colour, self.light, RES_M, spans, middles, turns, sizes, cars.colour)
 
 
 def _blocks(height: FloatMap, pixels: int) -> FloatMap:
@@ -132,43 +143,6 @@ def _grown(blocks: FloatMap, reach: int) -> FloatMap:
     for axis in (0, 1):
         padded = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=axis).max(axis=-1)
     return np.ascontiguousarray(padded)
-
-
-@dataclass(frozen=True, slots=True)
-class _Patch:
-    at: tuple[slice, slice]
-    height: FloatMap
-    colour: Bytes
-
-    def put(self, window: Window) -> None:
-        """Raise the window to the patch where the patch is higher (a canopy over a car keeps hiding it)."""
-        over = self.height > window.height[self.at]
-        lit = self.colour * window.light[self.at][..., None]
-        window.height[self.at] = np.where(over, self.height, window.height[self.at])
-        window.colour[self.at] = np.where(over[..., None], lit, window.colour[self.at]).astype(np.uint8)
-
-
-def stamps(cars: Cars, window: Window) -> Iterator[_Patch]:
-    """Each car as a small raster: bonnet and boot at 0.62 of its height, a cabin with dark glass at its ends."""
-    rows, columns = window.height.shape
-    reach = 0.5 * np.hypot(cars.length_m, cars.width_m)
-    px, py = (cars.x_m - window.x0_m) / RES_M, (cars.y_m - window.y0_m) / RES_M
-    x0, x1 = np.floor(px - reach / RES_M).astype(int), np.ceil(px + reach / RES_M).astype(int)
-    y0, y1 = np.floor(py - reach / RES_M).astype(int), np.ceil(py + reach / RES_M).astype(int)
-    cos, sin = np.cos(cars.yaw_rad), np.sin(cars.yaw_rad)
-    for k in np.flatnonzero((x0 >= 0) & (y0 >= 0) & (x1 <= columns) & (y1 <= rows)):
-        dx = (np.arange(x0[k], x1[k]) + 0.5 - px[k])[None, :] * RES_M
-        dy = (np.arange(y0[k], y1[k]) + 0.5 - py[k])[:, None] * RES_M
-        u = (cos[k] * dx + sin[k] * dy) / cars.length_m[k]  # −0.5 … 0.5 from tail to nose
-        v = (cos[k] * dy - sin[k] * dx) / cars.width_m[k]
-        body = (np.abs(u) < 0.5) & (np.abs(v) < 0.5)
-        cabin = (u > -0.42) & (u < 0.24)
-        glass = cabin & ((u > 0.12) | (u < -0.34))
-        top = np.float32(cars.height_m[k])
-        height = np.where(body, np.where(cabin, top, 0.62 * top), np.float32(-1.0)).astype(np.float32)
-        colour = np.broadcast_to(cars.colour[k], (*u.shape, 3)).copy()
-        colour[glass] = (30, 34, 42)
-        yield _Patch((slice(int(y0[k]), int(y1[k])), slice(int(x0[k]), int(x1[k]))), height, colour)
 
 
 class Renderer:

@@ -9,6 +9,7 @@ from perception_examples import capture, cross
 
 from perception.ap import match
 from perception.detector import TorchDetector, ground_truth
+from perception.joining import told
 from perception.scene import SceneModel
 from perception.types import Boxes, Capture, Share
 from scenarios.schema import Perception, Scene, Target
@@ -127,7 +128,7 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
     assert len(joined) >= len(single)
     assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
-    tracks = detector._told(share(fleet[2], "tracks", roi=roi), {}).boxes
+    tracks = told(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
     assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
 
@@ -136,6 +137,21 @@ def test_a_late_share_is_rendered_as_it_was(detector: TorchDetector, fleet: list
     now = [(fleet[0], [share(c) for c in fleet[1:]])]
     late = [(fleet[0], [share(c._replace(t_s=c.t_s - 2.0)) for c in fleet[1:]])]
     assert not same(detector.detect(now)[0], detector.detect(late)[0])
+
+
+def test_moments_begun_together_are_one_after_the_other(
+    scene: SceneModel, fleet: list[Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when what one needs is no longer kept once the next has begun."""
+    monkeypatch.setattr("perception.detector.KEPT_CAPTURES", 1)
+    fleets = [[c._replace(t_s=c.t_s + late) for c in fleet[:3]] for late in (0.0, 0.5, 1.0)]
+    asked = [[(ego, [share(c, rho=0.05) for c in f if c is not ego]) for ego in f] for f in fleets]
+    detector = TorchDetector(scene, Perception(), seed=1)
+    waiting = [detector.begin(jobs) for jobs in asked]
+    together = [wait() for wait in reversed(waiting)][::-1]
+    for jobs, found in zip(asked, together, strict=True):
+        alone = TorchDetector(scene, Perception(), seed=1).detect(jobs)
+        assert all(same(a, b) for a, b in zip(found, alone, strict=True))
 
 
 def test_threshold_cuts(scene: SceneModel, fleet: list[Capture]) -> None:
