@@ -20,6 +20,11 @@ EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
 
+_NOTHING = Descriptor._make([()] * len(Descriptor._fields))
+_latest = (_NOTHING, _NOTHING, 0.0, _NOTHING)
+"""What was asked last, and its answer: a broadcast is heard by a whole fleet that knew the same before."""
+
+
 def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
     """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
 
@@ -34,24 +39,27 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
     Returns:
         A descriptor that is nowhere better than `heard`; `heard` itself where they are equal.
     """
+    global _latest
     if not hysteresis:
         return heard
+    if _latest[0] is before and _latest[1] is heard and _latest[2] == hysteresis:
+        return _latest[3]
     part = 1.0 / (1.0 + hysteresis)
     links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
-    read = (
-        tuple([_play(u, v, part) for u, v in zip(links, last, strict=True)]) if len(links) == len(last) else links,
-        _play(heard.battery_soc, before.battery_soc, part),
-        _play(heard.cpu_headroom, before.cpu_headroom, part),
-        _play(heard.gpu_headroom, before.gpu_headroom, part),
-    )
-    if read == (links, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
-        return heard
-    links, soc, cpu, gpu = read
-    return heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
-
-
-def _play(now: float, read_before: float, part: float) -> float:
-    return now if now <= read_before else max(read_before, now * part)
+    soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom
+    if len(links) == len(last):  # else the roster is another
+        links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
+    if soc > before.battery_soc:
+        soc = max(before.battery_soc, soc * part)
+    if cpu > before.cpu_headroom:
+        cpu = max(before.cpu_headroom, cpu * part)
+    if gpu > before.gpu_headroom:
+        gpu = max(before.gpu_headroom, gpu * part)
+    read = heard
+    if (links, soc, cpu, gpu) != (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
+        read = heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
+    _latest = before, heard, hysteresis, read
+    return read
 
 
 class LinkState(NamedTuple):
