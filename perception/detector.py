@@ -193,8 +193,10 @@ class TorchDetector:
 
         def encode(i: int, seen: Future[None]) -> Tensor:
             seen.result()
-            out: Tensor = self._net.encoder(lift(views[i : i + 1], missing[i : i + 1]))[0]
-            return out
+            image = lift(views[i : i + 1], missing[i : i + 1])
+            with self._reckoning():
+                features: Tensor = self._net.encoder(image)[0]
+            return features
 
         def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
             """Render, and encode what is rendered while the last views are on their way."""
@@ -216,12 +218,21 @@ class TorchDetector:
             return False
         return _is_ranked(share)
 
+    def _reckoning(self) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16, enabled=self._config.precision == "bfloat16")
+
+    def _head(self, features: Tensor) -> Tensor:
+        """[1, 80, 64, 64] → [7, 128, 128]."""
+        with self._reckoning():
+            out: Tensor = self._net.head(features)[0]
+        return out.float()
+
     def _head_alone(self, capture: Capture) -> Future[Tensor]:
         """The head's output without peers, worked out once."""
         kept = self._kept[capture]
         if kept.out is None:
             features = kept.features
-            kept.out = self._task(lambda: self._net.head(features.result()[None])[0])
+            kept.out = self._task(lambda: self._head(features.result()[None]))
         return kept.out
 
     def _look_alone(self, capture: Capture) -> Future[Boxes]:
@@ -263,7 +274,7 @@ class TorchDetector:
         elif (alone := known[ego].boxes) is not None:
             own = alone.result()
         else:
-            own = self._place(self._net.head(known[ego].features.result()[None])[0], ego.est_pose)
+            own = self._place(self._head(known[ego].features.result()[None]), ego.est_pose)
         late = [self._told(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         return joined(ego.est_pose, own, out is not None, late, self._config.join)
 
@@ -286,8 +297,7 @@ class TorchDetector:
             return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
 
         fused = self._net.fusion.fuse(known[ego].features.result(), said, part[0], F.pad(weight[0], (1, 0), value=1.0))
-        out: Tensor = self._net.head(fused)[0]
-        return out
+        return self._head(fused)
 
     def _lies(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""
@@ -316,8 +326,7 @@ class TorchDetector:
             features, sent = kept.features.result(), self._sent(share, known)
             if kept.out is not None and bool(sent.all()):
                 return kept.out.result()
-            out: Tensor = self._net.head((features * sent)[None])[0]
-            return out
+            return self._head((features * sent)[None])
 
         kept.in_part[_part(share)] = self._task(head)
 

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from perception_examples import capture, cross
 
 from perception.ap import match
@@ -152,6 +153,23 @@ def test_moments_begun_together_are_one_after_the_other(
     for jobs, found in zip(asked, together, strict=True):
         alone = TorchDetector(scene, Perception(), seed=1).detect(jobs)
         assert all(same(a, b) for a, b in zip(found, alone, strict=True))
+
+
+def test_half_the_digits_find_the_same_cars(detector: TorchDetector, scene: SceneModel, fleet: list[Capture]) -> None:
+    short = TorchDetector(scene, Perception(precision="bfloat16"), seed=1)
+    jobs = [(ego, [share(c, rho=0.1) for c in fleet if c is not ego]) for ego in fleet]
+    for exact, found in zip(detector.detect(jobs), short.detect(jobs), strict=True):
+        sure = exact.take(exact.score > 0.5)
+        assert len(sure) > 3
+        assert not same(exact, found)
+        # sure boxes are there again, where they were and as sure, but for those of two peaks that are as high
+        far = np.hypot(*(sure.xy_m[:, None] - found.xy_m[None]).transpose(2, 0, 1))
+        again = far.min(axis=1) < 0.2
+        assert again.mean() > 0.95
+        np.testing.assert_allclose(found.score[far.argmin(axis=1)][again], sure.score[again], atol=0.05)
+    features = short._kept[fleet[0]].features.result()
+    assert features.dtype == torch.float32
+    assert torch.equal(features, features.half().float()), "as the radio carries them"
 
 
 def test_threshold_cuts(scene: SceneModel, fleet: list[Capture]) -> None:

@@ -226,6 +226,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.recording": ("OTHER", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.recorded_fusion": ("FUSION", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.weights": ("WEIGHTS", ()),
+    "perception.precision": ("bfloat16", ()),
     "perception.sample_rate_hz": ("5", ()),
     "perception.fusion_delay_s": ("0.2", ()),
     "perception.max_age_s": ("0.05", ()),
