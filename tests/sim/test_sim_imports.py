@@ -5,14 +5,17 @@ from __future__ import annotations
 import subprocess
 import sys
 
-HEAVY = {"torch", "scipy.stats", "scipy.signal", "scipy.interpolate", "networkx", "rerun", "matplotlib"}
+import pytest
+
+HEAVY = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.interpolate", "networkx", "rerun", "matplotlib"}
 """Each takes from a fifth of a second to some seconds."""
 
 
-def test_flying_without_a_detector_loads_nothing_heavy() -> None:
+@pytest.mark.parametrize("detector", ["none", "surrogate"])
+def test_flying_without_the_network_loads_nothing_heavy(detector: str) -> None:
     fly = (
         "import sys; from scenarios.load import load; from sim.sortie import run_sortie\n"
-        "run_sortie(load('track_target', ['perception.detector=none', 'duration_s=2', "
+        f"run_sortie(load('track_target', ['perception.detector={detector}', 'duration_s=2', "
         "'mission.phases=[{at_s: 0, phase: search}]']))\n"
         "print(*sys.modules, sep='\\n')"
     )
