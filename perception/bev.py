@@ -12,20 +12,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 
+from perception.compiled import compiled, fma
 from perception.geometry import FULL, IMAGE_PX, Geometry
-from perception.rays import fma
 from perception.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
 from perception.town import Bytes, FloatMap
 from perception.types import Capture
 
 _F = np.float32
-_ZERO, _HALF, _ONE, _RIGHT, _BACK, _NADIR = _F(0.0), _F(0.5), _F(1.0), _F(2.0), _F(3.0), _F(4.0)
-_ROOT2, _HALF_H, _HALF_V, _NEAREST = _F(np.sqrt(2.0)), _F(HALF_H), _F(HALF_V), _F(0.1)
-_VIEW = _F(2.0 / len(CAMERAS))
-_INSET = _F(1.0 - 1.0 / HEIGHT_PX)
-"""Keeps bilinear taps inside the camera's own rows."""
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+_FRONT, _LEFT, _RIGHT, _BACK, _NADIR = _F(0.0), _F(1.0), _F(2.0), _F(3.0), _F(4.0)
+_ROOT2, _NEAREST, _VIEW = _F(np.sqrt(2.0)), _F(0.1), _F(2.0 / 5)
+_LENS = np.array([HALF_H, HALF_V, 1.0 - 1.0 / HEIGHT_PX], np.float32)
+"""Tangents of half the fields of view; and how far rows are looked for, so that bilinear taps stay in the camera's own."""
 
 
 def ground_points(geometry: Geometry) -> torch.Tensor:
@@ -47,14 +46,15 @@ def lift(views: Bytes, captures: Sequence[Capture], geometry: Geometry = FULL) -
     for seen, capture, image in zip(views, captures, out, strict=True):
         level_to_body = tilt(capture.orientation_xyzw).T.astype(np.float32)
         down = (level_to_body[:, 2].astype(float) * -max(capture.est_position_m[2], 1.0)).astype(np.float32)
-        _unproject(seen.reshape(len(CAMERAS) * HEIGHT_PX, -1, 3), level_to_body, down, *ground, image)
+        _unproject(seen.reshape(len(CAMERAS) * HEIGHT_PX, -1, 3), level_to_body, down, _LENS, *ground, image)
     return torch.from_numpy(out)
 
 
-@njit(nogil=True, cache=True)
-def _unproject(views: Any, turn: Any, down: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
+@compiled
+def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
     """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [450, 160, 3]; into `out` [4, 256, 256]."""
     rows, columns, _ = views.shape
+    half_h, half_v, inset = lens
     for i in range(ground_x.shape[0]):
         for j in range(ground_x.shape[1]):
             gx, gy = ground_x[i, j], ground_y[i, j]
@@ -63,20 +63,20 @@ def _unproject(views: Any, turn: Any, down: Any, ground_x: Any, ground_y: Any, o
             z = fma(turn[2, 1], gy, gx * turn[2, 0]) + down[2]
             # straight down first: right is −y, image-down is −x
             depth = max(-z, _NEAREST)
-            u, v, camera = -y / (depth * _HALF_H), -x / (depth * _HALF_V), _NADIR
+            u, v, camera = -y / (depth * half_h), -x / (depth * half_v), _NADIR
             seen = abs(u) < _ONE and abs(v) < _ONE and z < _ZERO
             if not seen:  # the camera of the quadrant: a forward and b right of it, pitched 45° down
                 if abs(x) >= abs(y):
-                    ahead, right, camera = abs(x), (-y if x > _ZERO else y), (_ZERO if x >= _ZERO else _BACK)
+                    ahead, right, camera = abs(x), (-y if x > _ZERO else y), (_FRONT if x >= _ZERO else _BACK)
                 else:
-                    ahead, right, camera = abs(y), (x if y > _ZERO else -x), (_ONE if y >= _ZERO else _RIGHT)
+                    ahead, right, camera = abs(y), (x if y > _ZERO else -x), (_LEFT if y >= _ZERO else _RIGHT)
                 forward = (ahead - z) / _ROOT2
-                u, v = right / (forward * _HALF_H), (-ahead - z) / (_ROOT2 * forward * _HALF_V)
+                u, v = right / (forward * half_h), (-ahead - z) / (_ROOT2 * forward * half_v)
                 seen = abs(u) < _ONE and abs(v) < _ONE and forward > _ONE
             if not seen:
                 out[:, i, j] = 0
                 continue
-            v = min(max(v, -_INSET), _INSET)
+            v = min(max(v, -inset), inset)
             row = (camera + _HALF + _HALF * v) * _VIEW - _ONE
             p = min(max(fma(u + _ONE, _F(0.5 * columns), -_HALF), _ZERO), _F(columns - 1))
             q = min(max(fma(row + _ONE, _F(0.5 * rows), -_HALF), _ZERO), _F(rows - 1))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -107,8 +107,7 @@ class TorchDetector:
 
     One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
     side as torch has threads when the detector is made (`torch.set_num_threads`). Tasks begin in the order in which they
-    are handed in, each after those that it waits for, so that no thread waits while there is work. The numbers do not
-    depend on it.
+    are handed in, and what a task waits for is settled, and handed in, before it is. The numbers do not depend on it.
     """
 
     def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
@@ -148,7 +147,7 @@ class TorchDetector:
         known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         look = {s.capture for s in shared if s.representation in LATE}
-        look |= {ego for ego, shares in jobs if not any(self._is_fused(s) for s in shares)}
+        look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
                 self._look_alone(capture)
@@ -159,6 +158,8 @@ class TorchDetector:
                 if share.representation in MAPS:
                     self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
+        # as things stand: what is asked for later stands behind these tasks, and none may wait for it
+        known = {capture: replace(kept) for capture, kept in known.items()}
         found = [self._task(self._find, ego, shares, now, known) for ego, shares in jobs]
         return lambda: [f.result() for f in found]
 
@@ -190,6 +191,7 @@ class TorchDetector:
         wanted = list(dict.fromkeys(captures))
         missing = [c for c in wanted if c not in self._kept]
         views = np.empty((len(missing), *VIEWS_SHAPE), np.uint8)
+        encoded: dict[Capture, _Encoded] = {}
 
         def encode(i: int, seen: Future[None]) -> Tensor:
             seen.result()
@@ -201,11 +203,14 @@ class TorchDetector:
         def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
             """Render, and encode what is rendered while the last views are on their way."""
             sights = {i: self._task(see, i) for i in over}
-            for i, seen in sights.items():
-                self._kept[missing[i]] = _Encoded(self._task(encode, i, seen))
-            return [seen.result() for seen in sights.values()]
+            encoded.update({missing[i]: _Encoded(self._task(encode, i, seen)) for i, seen in sights.items()})
+            try:
+                return [seen.result() for seen in sights.values()]
+            finally:  # the moment's cars leave the scenery when nobody looks any more
+                wait(sights.values())
 
         self._renderer.render(missing, side_by_side, views)
+        self._kept.update(encoded)
         for capture in wanted:
             self._kept.move_to_end(capture)
         while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
@@ -322,10 +327,12 @@ class TorchDetector:
         if _part(share) in kept.in_part:
             return
 
+        out = kept.out  # as it stands: a task waits for none behind it
+
         def head() -> Tensor:
             features, sent = kept.features.result(), self._sent(share, known)
-            if kept.out is not None and bool(sent.all()):
-                return kept.out.result()
+            if out is not None and bool(sent.all()):
+                return out.result()
             return self._head((features * sent)[None])
 
         kept.in_part[_part(share)] = self._task(head)

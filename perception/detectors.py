@@ -35,7 +35,10 @@ class Detector(Protocol):
 
 @runtime_checkable
 class DetectsAhead(Protocol):
-    """A detector that works in the background: a sortie flies on to the next moment while it looks at this one."""
+    """A detector that works in the background: a sortie flies on to the next moment while it looks at this one.
+
+    One that has `begin` is asked by it alone: who overrides `detect` overrides `begin`.
+    """
 
     def begin(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> Callable[[], list[Boxes]]:
         """Begin what `detect` does; what is returned waits for it."""

@@ -10,7 +10,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
 def keep_freed(most_bytes: int = 256 << 20, block_bytes: int = 32 << 20) -> bool:
-    """Keep up to so much freed memory, in blocks of up to so much, for the whole process; whether it could be had.
+    """Have each thread's heap keep up to so much freed memory, in blocks of up to so much; whether it could be had.
 
     A network's maps are of megabytes. glibc takes such blocks from the kernel and gives them back, page by page, at every
     layer: a tenth of a detection's time. Other C libraries are left as they are.

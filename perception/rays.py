@@ -2,7 +2,7 @@
 
 A ray descends from the tallest thing in the window: slices of `SLICE_M` are skipped where a coarse maximum map says that
 nothing is in reach, eight metres at once where a still coarser one says so, and walked in fine steps where something is
-(0.5 m of height, 0.25 m below 2 m). Arithmetic is float32, rounded as written: the images are the same on every machine.
+(0.5 m of height, 0.25 m below 2 m). Arithmetic is float32, rounded as written: the same arguments give the same image on every machine.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.core.typing.templates import Signature
-from numba.extending import intrinsic
+
+from perception.compiled import compiled, fma
 
 COARSE, FAR, FAR_REACH = 8, 32, 2
 """Pixels a side of the blocks of the two maximum maps, the coarser in how many blocks around it."""
@@ -27,25 +26,14 @@ _REACH, _SLICE, _TO_COARSE, _TO_FAR = _F(REACH), _F(SLICE_M), _F(1 / COARSE), _F
 _SIDE_X, _SIDE_Y = _F(0.55), _F(0.75)
 
 
-def _fma(_: Any, a: Any, b: Any, c: Any) -> tuple[Signature, Any]:
-    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
-        return builder.fma(*args)
-
-    return types.float32(types.float32, types.float32, types.float32), generate
-
-
-fma: Any = intrinsic(_fma)
-"""a · b + c of float32, rounded once; for compiled code."""
-
-
-@njit(nogil=True, cache=True)
+@compiled
 def _cell(x: Any, y: Any, scale: Any, rows: Any, columns: Any) -> Any:
     """The flat index of the block over which a ray is; the raster's edge goes on for ever."""
     column = np.int32(min(max(x * scale, _ZERO), _F(columns - 1)))
     return np.uint32(np.int32(min(max(y * scale, _ZERO), _F(rows - 1))) * np.int32(columns) + column)
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def see(
     rays: Any, turn: Any, eye: Any, res_m: Any, top_m: Any, heights: Any, coarses: Any, fars: Any, colours: Any,
     gain: Any, noise: Any, out: Any,
@@ -109,11 +97,11 @@ def see(
             out[i, k] = _noisy(_exposed(_F(np.int32(_F(colour[at, k]) * light)), gain), noise[i, k])
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _exposed(level: Any, gain: Any) -> Any:
     return np.int32(level * gain)
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _noisy(level: Any, noise: Any) -> Any:
     return np.uint8(min(max(level + np.int32(noise) - np.int32(8), np.int32(0)), np.int32(255)))

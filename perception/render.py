@@ -35,8 +35,15 @@ FloatOrArray = TypeVar("FloatOrArray", float, Floats)
 
 
 def rotation(xyzw: Sequence[float]) -> Floats:
-    """The matrix [3, 3] that takes body (FLU) vectors to world (ENU), from a unit quaternion x, y, z, w."""
-    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / np.linalg.norm(xyzw)
+    """The matrix [3, 3] that takes body (FLU) vectors to world (ENU), from a quaternion x, y, z, w.
+
+    Raises:
+        ValueError: one without a length.
+    """
+    norm = float(np.sqrt(np.square(np.asarray(xyzw, dtype=np.float64)).sum()))
+    if not 0.0 < norm < np.inf:
+        raise ValueError(f"orientation_xyzw is {tuple(xyzw)}, must have a finite length above 0")
+    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / norm
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -160,7 +167,7 @@ class Renderer:
         """Camera images of all captures, uint8 [n, 5, 90, 160, 3], in the order of `CAMERAS`.
 
         `each` runs a function over captures, `map` or a pool's `map`; the images are the same. They are written `into`
-        an array of that shape, where one is given, each whole when its function is done.
+        an array of that shape in C order, where one is given, each whole when its function is done.
         """
         out = np.empty((len(captures), *VIEWS_SHAPE), np.uint8) if into is None else into
         if not captures:

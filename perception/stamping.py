@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from perception.compiled import compiled
 
 _F = np.float32
 _BONNET, _LOWEST = _F(0.62), _F(-1.0)
 _GLASS = (np.uint8(30), np.uint8(34), np.uint8(42))
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def stamp(
     height: Any, colour: Any, light: Any, res_m: Any, spans: Any, middles: Any, turns: Any, sizes: Any, colours: Any
 ) -> None:
@@ -47,7 +48,7 @@ def stamp(
                     colour[r, c, i] = np.uint8(_F(_GLASS[i] if glass else colours[k, i]) * light[r, c])
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def raised(height: Any, coarse: Any, block: Any, spans: Any) -> None:
     """Have the map of the highest of each block, and of those around it, know what was stamped."""
     rows, columns = coarse.shape
@@ -61,7 +62,7 @@ def raised(height: Any, coarse: Any, block: Any, spans: Any) -> None:
                 coarse[r, c] = max(coarse[r, c], top)
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def saved(height: Any, colour: Any, spans: Any) -> tuple[Any, Any]:
     """What stands where cars will be stamped, span after span, [pixels] and [pixels, 3]."""
     pixels = 0
@@ -77,7 +78,7 @@ def saved(height: Any, colour: Any, spans: Any) -> tuple[Any, Any]:
     return heights, colours
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def restore(height: Any, colour: Any, spans: Any, heights: Any, colours: Any) -> None:
     """Undo `stamp`, given what was `saved` before."""
     i = 0

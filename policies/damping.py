@@ -3,7 +3,8 @@
 Before the policy a hysteresis band (`believed`): of what can flicker, what a policy reads falls at once and rises only
 by more than the band, so that a threshold switches up that much higher than it switches down. After it a dwell time
 (`damp`): reductions at once, upgrades once they were asked for without a break for so long, repeats for free. The
-number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both.
+number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both; the first
+keeps its last answer.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
     global _latest
     if not hysteresis:
         return heard
-    if _latest[0] is before and _latest[1] is heard and _latest[2] == hysteresis:
-        return _latest[3]
+    known, last_heard, band, answer = _latest  # in one go: another thread may fly a sortie of its own
+    if known is before and last_heard is heard and band == hysteresis:
+        return answer
     part = 1.0 / (1.0 + hysteresis)
     links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
     soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom

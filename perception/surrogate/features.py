@@ -97,7 +97,7 @@ class Traffic:
         ]
         self.size_m: Floats = np.concatenate(size)
         colour = np.concatenate([parked.colour, lanes.colour, np.array([TARGET_COLOUR], np.uint8)[:extra]])
-        self.tone: Floats = colour @ _TONE
+        self.tone: Floats = np.einsum("nc,c->n", colour, _TONE)
         self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
         self.parked_xy: Floats = np.stack([parked.x_m, parked.y_m], 1)
         self._next_parked = _next_of(self.parked_xy)

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from perception_examples import capture, cross
 
+from perception import render
 from perception.ap import match
 from perception.detector import TorchDetector, ground_truth
 from perception.joining import told
@@ -153,6 +155,45 @@ def test_moments_begun_together_are_one_after_the_other(
     for jobs, found in zip(asked, together, strict=True):
         alone = TorchDetector(scene, Perception(), seed=1).detect(jobs)
         assert all(same(a, b) for a, b in zip(found, alone, strict=True))
+
+
+@pytest.mark.parametrize(("fusion", "asked"), [("disconet", 0), ("late", 1)])
+def test_what_is_asked_while_a_moment_is_under_way_holds_nobody_up(scene: SceneModel, fusion: str, asked: int) -> None:
+    """With one thread a task that waited for one behind it would wait for ever: what it needs must be before it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        detector = TorchDetector(scene, Perception(fusion=fusion), seed=1)
+    finally:
+        torch.set_num_threads(threads)
+    two = [
+        c._replace(position_m=(x, 0.0, 60.0), est_position_m=(x, 0.0, 60.0))
+        for c, x in zip(cross(0.0, 0.0, 0.0), (0.0, 400.0), strict=False)
+    ]
+    begun = detector.begin([(two[0], [share(two[1])])])  # too far away to have a say
+    waiting = ThreadPoolExecutor(2)
+    count = waiting.submit(detector.count_boxes, two[asked], None)
+    assert len(waiting.submit(begun).result(timeout=60.0)[0]) > 0
+    assert count.result(timeout=60.0) > 0
+
+
+def test_a_moment_that_fails_leaves_nothing_behind(
+    scene: SceneModel, fleet: list[Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detector, jobs = TorchDetector(scene, Perception(), seed=1), [(c, []) for c in fleet]
+    whole = [len(b) for b in TorchDetector(scene, Perception(), seed=1).detect(jobs)]
+    noise = render._noise
+
+    def fails(seed: int, capture: Capture) -> np.ndarray:
+        if capture is fleet[0]:
+            raise MemoryError("planted")
+        return noise(seed, capture)
+
+    monkeypatch.setattr(render, "_noise", fails)
+    with pytest.raises(MemoryError, match="planted"):
+        detector.detect(jobs)
+    monkeypatch.setattr(render, "_noise", noise)
+    assert [len(b) for b in detector.detect(jobs)] == whole
 
 
 def test_half_the_digits_find_the_same_cars(detector: TorchDetector, scene: SceneModel, fleet: list[Capture]) -> None:

@@ -8,6 +8,7 @@ from perception_examples import capture
 from scipy.ndimage import map_coordinates
 
 from perception.bev import ground_points, lift
+from perception.compiled import compiled
 from perception.geometry import FULL
 from perception.rays import COARSE, FAR, FAR_REACH, HAZE, REACH, see
 from perception.render import AXES, HALF_H, HALF_V, HEIGHT_PX, VIEWS_SHAPE, WIDTH_PX, tilt
@@ -104,3 +105,12 @@ def test_the_lift_reads_each_ground_point_where_a_pinhole_puts_it(pitch: float, 
     off = np.abs(image[..., :3] - expected)[where >= 0]
     assert (off <= 0.51).mean() > 0.9999
     assert off.max() < 2.0, "single precision on the edge of a square"
+
+
+def test_loops_are_compiled_also_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere(*_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", nowhere)
+    twice = compiled(lambda x: 2.0 / x)
+    assert (twice(4.0), twice(0.0)) == (0.5, np.inf)

@@ -37,6 +37,12 @@ def test_rotation_agrees_with_scipy() -> None:
     assert rotation(q) == pytest.approx(Rotation.from_quat(q).as_matrix())
 
 
+@pytest.mark.parametrize("broken", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, float("nan"), 1.0), (0.0, float("inf"), 0.0, 1.0)])
+def test_an_attitude_without_a_length_is_refused(broken: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ValueError, match=r"orientation_xyzw is .*, must have a finite length above 0"):
+        Renderer(only_target(10.0, 5.0), 1).render([capture()._replace(orientation_xyzw=broken)])
+
+
 def test_tilt_is_the_attitude_without_heading() -> None:
     q = Rotation.from_euler("ZYX", [2.0, -0.2, 0.3]).as_quat()
     assert tilt(q) == pytest.approx(Rotation.from_euler("ZYX", [0.0, -0.2, 0.3]).as_matrix())
