@@ -136,7 +136,12 @@ def open_engine(workers: int = 0, scheduler: str | None = None) -> Iterator[Engi
         raise RunError(
             "dask.distributed is missing: pip install 'sortie-sim[campaign]', or fly with --workers 0"
         ) from error
-    with dask.config.set({"distributed.scheduler.allowed-failures": 3, "distributed.comm.timeouts.connect": "15s"}):
+    settings = {
+        "distributed.scheduler.allowed-failures": 3,
+        "distributed.comm.timeouts.connect": "15s",
+        "distributed.worker.profile.enabled": False,  # a sample every 10 ms, and nobody looks at them
+    }
+    with dask.config.set(settings):
         if scheduler is not None:
             try:
                 client = Client(scheduler, timeout="15s", set_as_default=False)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from perception.memory import keep_freed
 from scenarios.schema import Scenario
 from sim.campaign.code import code_version, file_digest
 from sim.expect import metric
@@ -67,7 +68,7 @@ def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[Result], float]:
     begin_s = time.perf_counter()
     if code_version() != code:
         raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
-    _one_thread()
+    _set_up()
     return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
 
 
@@ -148,8 +149,10 @@ def _check_file(path: str, digest: str) -> None:
 
 
 @functools.cache
-def _one_thread() -> None:
-    """Sums in one order: a matrix product on two threads may round differently than on one."""
+def _set_up() -> None:
+    """Sums in one order: a matrix product on two threads may round differently than on one. And freed memory stays: dask's
+    nanny has its workers give back every 64 KiB, which costs a third of a run."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)
+    keep_freed()
