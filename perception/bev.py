@@ -22,9 +22,10 @@ from perception.types import Capture
 _F = np.float32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 _FRONT, _LEFT, _RIGHT, _BACK, _NADIR = _F(0.0), _F(1.0), _F(2.0), _F(3.0), _F(4.0)
-_ROOT2, _NEAREST, _VIEW = _F(np.sqrt(2.0)), _F(0.1), _F(2.0 / 5)
-_LENS = np.array([HALF_H, HALF_V, 1.0 - 1.0 / HEIGHT_PX], np.float32)
-"""Tangents of half the fields of view; and how far rows are looked for, so that bilinear taps stay in the camera's own."""
+_ROOT2, _NEAREST = _F(np.sqrt(2.0)), _F(0.1)
+_LENS = np.array([HALF_H, HALF_V, 1.0 - 1.0 / HEIGHT_PX, 2.0 / len(CAMERAS)], np.float32)
+"""Tangents of half the fields of view; how far rows are looked for, so that bilinear taps stay in the camera's own; and what a
+camera takes of the column of views (−1 … 1)."""
 
 
 def ground_points(geometry: Geometry) -> torch.Tensor:
@@ -54,7 +55,7 @@ def lift(views: Bytes, captures: Sequence[Capture], geometry: Geometry = FULL) -
 def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
     """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [450, 160, 3]; into `out` [4, 256, 256]."""
     rows, columns, _ = views.shape
-    half_h, half_v, inset = lens
+    half_h, half_v, inset, view = lens
     for i in range(ground_x.shape[0]):
         for j in range(ground_x.shape[1]):
             gx, gy = ground_x[i, j], ground_y[i, j]
@@ -77,7 +78,7 @@ def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, groun
                 out[:, i, j] = 0
                 continue
             v = min(max(v, -inset), inset)
-            row = (camera + _HALF + _HALF * v) * _VIEW - _ONE
+            row = (camera + _HALF + _HALF * v) * view - _ONE
             p = min(max(fma(u + _ONE, _F(0.5 * columns), -_HALF), _ZERO), _F(columns - 1))
             q = min(max(fma(row + _ONE, _F(0.5 * rows), -_HALF), _ZERO), _F(rows - 1))
             left, top = np.int32(p), np.int32(q)

@@ -3,8 +3,7 @@
 Before the policy a hysteresis band (`believed`): of what can flicker, what a policy reads falls at once and rises only
 by more than the band, so that a threshold switches up that much higher than it switches down. After it a dwell time
 (`damp`): reductions at once, upgrades once they were asked for without a break for so long, repeats for free. The
-number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both; the first
-keeps its last answer.
+number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both.
 """
 
 from __future__ import annotations
@@ -21,11 +20,6 @@ EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
 
-_NOTHING = Descriptor._make([()] * len(Descriptor._fields))
-_latest = (_NOTHING, _NOTHING, 0.0, _NOTHING)
-"""What was asked last, and its answer: a broadcast is heard by a whole fleet that knew the same before."""
-
-
 def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
     """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
 
@@ -40,12 +34,8 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
     Returns:
         A descriptor that is nowhere better than `heard`; `heard` itself where they are equal.
     """
-    global _latest
     if not hysteresis:
         return heard
-    known, last_heard, band, answer = _latest  # in one go: another thread may fly a sortie of its own
-    if known is before and last_heard is heard and band == hysteresis:
-        return answer
     part = 1.0 / (1.0 + hysteresis)
     links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
     soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom
@@ -57,11 +47,9 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
         cpu = max(before.cpu_headroom, cpu * part)
     if gpu > before.gpu_headroom:
         gpu = max(before.gpu_headroom, gpu * part)
-    read = heard
-    if (links, soc, cpu, gpu) != (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
-        read = heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
-    _latest = before, heard, hysteresis, read
-    return read
+    if (links, soc, cpu, gpu) == (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
+        return heard
+    return heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
 
 
 class LinkState(NamedTuple):

@@ -18,7 +18,7 @@ from perception.geometry import CELLS, Geometry
 from perception.harness.condition import CellsBy
 from perception.harness.contract import Exchange, FleetFrames, Floats
 from perception.model import CarNet, folded
-from perception.warp import Support, arriving, support
+from perception.warp import Support, arriving, rows, support
 
 CPU = torch.device("cpu")
 BATCH = 5
@@ -128,9 +128,7 @@ class CarNetView:
         k = len(e.peers)
         first = torch.tensor(e.peers, device=at.device)[:, None, None] * CELLS**2
         taps = under.cells.view(k, -1, 4)[:, at] + first
-        moved = F.embedding_bag(
-            taps.view(-1, 4), self._table, mode="sum", per_sample_weights=weights.view(k, -1, 4)[:, at].view(-1, 4)
-        )
+        moved = rows(self._table, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
         return moved.view(k, len(at), -1)
 
     def _mix(self, said: torch.Tensor, part: torch.Tensor) -> torch.Tensor:

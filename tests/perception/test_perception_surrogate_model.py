@@ -136,6 +136,16 @@ def test_a_row_of_a_net_is_the_same_to_the_bit_wherever_it_stands_and_whatever_o
     np.testing.assert_array_equal(mixed(np.ascontiguousarray(x[:, inputs])), out)
 
 
+@pytest.mark.parametrize("name", ["look", "rank", "rank_norm", "find", "place"])
+def test_sums_of_the_shipped_nets_stay_where_they_are_exact(name: str, parameters: Parameters) -> None:
+    """Magnitudes of products below 2¹³ for any covariates within ±10, worst signs all along."""
+    net, reach = parameters.nets[name], np.full(len(parameters.nets[name].weight[0]), 10.0)
+    for weight, bias in zip(net.weight, net.bias, strict=True):
+        reach = reach @ np.abs(weight)
+        assert reach.max() < 2.0**13
+        reach = reach + np.abs(bias)
+
+
 def test_better_luck_and_surer_drones_rank_higher(parameters: Parameters) -> None:
     x = np.zeros((50, len(RANK_COVARIATES)), np.float32)
     x[:, 0] = np.linspace(-4, 3, 50)

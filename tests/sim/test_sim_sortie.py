@@ -305,3 +305,11 @@ def test_duty_cycle_rests_the_computer() -> None:
     rested, worked = (outcome(run_sortie(example(), p))["energy_j"]["compute"] for p in (resting, awake))
     idle = 5 * 6 * 10.0
     assert rested - idle == pytest.approx(0.2 * (worked - idle), rel=0.15)
+
+
+def test_a_detector_that_works_ahead_leaves_the_same_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = example("perception.detector=torch", "perception.sample_rate_hz=5", "duration_s=2.5")
+    ahead = run_sortie(scenario)
+    assert ahead.tables["fusions"].num_rows == 5 * 13
+    monkeypatch.setattr("sim.scoring.DetectsAhead", type("Nobody", (), {}))
+    assert run_sortie(scenario).fingerprint == ahead.fingerprint
