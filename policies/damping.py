@@ -37,9 +37,12 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
     if not hysteresis:
         return heard
     part = 1.0 / (1.0 + hysteresis)
-    links, last = heard.peer_goodput_mbps, before.peer_goodput_mbps
-    soc, cpu, gpu = heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom
-    if len(links) == len(last):  # else the roster is another
+    # taken apart and built anew as a whole: every drone reads every other one in every frame
+    (
+        stamp, agent, at, turn, velocity, footprint, told_soc, told_cpu, told_gpu, told_links, grid, flags, phase, region, targets,
+    ) = heard  # fmt: skip
+    soc, cpu, gpu, links, last = told_soc, told_cpu, told_gpu, told_links, before.peer_goodput_mbps
+    if links != last and len(links) == len(last):  # else the roster is another
         links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
     if soc > before.battery_soc:
         soc = max(before.battery_soc, soc * part)
@@ -47,9 +50,11 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
         cpu = max(before.cpu_headroom, cpu * part)
     if gpu > before.gpu_headroom:
         gpu = max(before.gpu_headroom, gpu * part)
-    if (links, soc, cpu, gpu) == (heard.peer_goodput_mbps, heard.battery_soc, heard.cpu_headroom, heard.gpu_headroom):
+    if soc == told_soc and cpu == told_cpu and gpu == told_gpu and links == told_links:
         return heard
-    return heard._replace(peer_goodput_mbps=links, battery_soc=soc, cpu_headroom=cpu, gpu_headroom=gpu)
+    return Descriptor(
+        stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets
+    )
 
 
 class LinkState(NamedTuple):
