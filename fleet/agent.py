@@ -317,7 +317,7 @@ class Agent:
             if link is None:
                 link = links[peer] = _Link(me, peer)
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
-            if asked is not link.asked or age_s > fresh_s or link.state.asking_since_s is not None:
+            if asked != link.asked or age_s > fresh_s or link.state.asking_since_s is not None:
                 self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
@@ -344,8 +344,12 @@ class Agent:
         if self.handshake_bytes:
             self._shake_hands(capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
+        made: dict[tuple[Any, ...], Payload | None] = {}  # what goes to several peers is made once
         for directive in self.gate.due(self.env.now):
-            payload = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
+            what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
+            if what not in made:
+                made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
+            payload = made[what]
             if payload is not None:
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)
 

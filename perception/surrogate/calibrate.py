@@ -18,6 +18,7 @@ from perception.geometry import FULL
 from perception.surrogate.collect import FLOOR, Asked, collect, read
 from perception.surrogate.fit import fit
 from perception.surrogate.judge import WITHIN, Verdict, judge
+from perception.surrogate.levels import level
 from perception.surrogate.model import Parameters, save
 from perception.surrogate.plan import MANNERS, THRESHOLD, Split, scene_model
 from perception.surrogate.rows import Rows, rows_of
@@ -63,7 +64,7 @@ def calibrate(
     for k, asked in enumerate(fitted):
         rows.append(rows_of(asked, floor, seed))
         tell("rows", k + 1, len(fitted))
-    parts = iter(range(1, 6))
+    parts = iter(range(1, 6))  # those of `fit`
     parameters = fit(Rows.join(rows), _boxes(fitted, seed), floor, seed, progress=lambda _: tell("fit", next(parts), 5))
     facts: dict[str, Any] = {
         "fusion": config.fusion,
@@ -73,8 +74,15 @@ def calibrate(
         "held_out": held_out,
     }
     parameters = replace(parameters, mirages=seen_by_several(fitted, floor, seed), card={**facts, "id": ""})
+    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels", done, of))
     parameters = hang_together(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("together", done, of))
-    arrays = [parameters.alike, parameters.mirages, *(w for n in parameters.nets.values() for w in n.weight)]
+    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels again", done, of))
+    arrays = [
+        parameters.alike,
+        parameters.mirages,
+        parameters.residuals,
+        *(w for n in parameters.nets.values() for w in n.weight),
+    ]
     digest = hashlib.blake2b(b"".join(np.ascontiguousarray(w).tobytes() for w in arrays), digest_size=4)
     facts["id"] = f"{config.fusion}-{key}-{digest.hexdigest()}"
     parameters = replace(parameters, card=facts)
@@ -140,7 +148,7 @@ def card(parameters: Parameters, verdict: Verdict) -> str:
     """The calibration's card, Markdown."""
     f = parameters.card
     levels = "\n".join(
-        f"| {v.condition} | {v.torch:.3f} | {v.surrogate:.3f} | {v.error:+.3f} | {'yes' if abs(v.error) <= WITHIN else 'no'} |"
+        f"| {v.condition} | {v.torch:.3f} | {v.surrogate:.3f} | {v.error:+.3f} [{v.low:+.3f}, {v.high:+.3f}] | {'yes' if abs(v.error) <= WITHIN else 'no'} |"
         for v in verdict.levels
     )
     orders = "\n".join(
@@ -157,7 +165,7 @@ with fusion {f["fusion"]}, weights {f["weights"]}. Boxes below a score of {param
 
 ## AP@0.5 on held-out scenes
 
-{f["held_out"]} scenes, {verdict.levels[0].egos} moments a condition. {within} of {len(verdict.levels)} conditions within ±{WITHIN:g}.
+{f["held_out"]} scenes, {verdict.levels[0].egos} moments a condition; the error with its 95 % interval by whole scenes. {within} of {len(verdict.levels)} conditions within ±{WITHIN:g}.
 
 | condition | torch | surrogate | error | within ±{WITHIN:g} |
 |---|---|---|---|---|

@@ -20,19 +20,20 @@ _ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
 OF_THE_LOOK = (
-    "range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "square", "next", "next_along",
+    "range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "strange", "square", "next", "next_along",
     "next_across",
 )  # fmt: skip
 """What fusion takes over from the ego's own look."""
 FUSED_COVARIATES = (
-    "own", "first", "second", "mean", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
+    "own", "first", "second", "mean", "many", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
     *(f"own_{name}" for name in OF_THE_LOOK),
 )  # fmt: skip
 _OWN = [LOOK_COVARIATES.index(name) for name in OF_THE_LOOK]
+_MOVING = LOOK_COVARIATES.index("moving")
 _STYLES = ("old_town", "suburb", "yard")
 ALARM_COVARIATES = (
     "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
-    *_STYLES, "square",
+    *_STYLES, "square", "aimed", "moving", "late", "gone",
 )  # fmt: skip
 
 
@@ -187,7 +188,7 @@ def covariates(
     rank: NDArray[np.float32],
     zeros: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """What fusion makes of each pair depends on: [n, 26] float32, as `FUSED_COVARIATES`.
+    """What fusion makes of each pair depends on: [n, 28] float32, as `FUSED_COVARIATES`.
 
     Args:
         confidence: [looks] the logit that each drone gives each car on its own.
@@ -197,7 +198,7 @@ def covariates(
     """
     n, k = pairs.peer.shape
     first, second = np.full((2, n), NO_PEER, np.float32)
-    total, silent, sure, off, shift_first, middle_x, middle_y, deep = np.zeros((8, n), np.float32)
+    square, total, silent, sure, off, shift_first, middle_x, middle_y, deep = np.zeros((9, n), np.float32)
     allow = exchange.arrived / np.maximum(exchange.allowed, 1.0)
     for j in range(k):
         weight = exchange.weight[pairs.row, j].astype(np.float32)
@@ -209,6 +210,7 @@ def covariates(
         shift_first = np.where(best, away, shift_first)
         second = np.maximum(second, np.minimum(theirs, first))
         first = np.maximum(first, theirs)
+        square += came * came
         total += came
         sure += came * theirs
         off += came * away
@@ -218,13 +220,14 @@ def covariates(
         middle_y += came * y
         silent += np.where(zeros & (pairs.peer[:, j] >= 0), weight - came, np.float32(0.0))
     count = np.maximum(total, np.float32(1e-6))
+    many = total * total / np.maximum(square, np.float32(1e-12))  # as many as so many of equal weight
     mean = np.where(total > 0, sure / count, np.float32(NO_PEER))
     spread = np.sqrt(middle_x * middle_x + middle_y * middle_y) / (1.0 + total)
     most = np.log(np.maximum(np.where(exchange.sender >= 0, exchange.arrived, 1.0).max(axis=1, initial=1.0), 1.0)) / 8.0
     part = np.where(exchange.sender >= 0, allow, 0.0).max(axis=1, initial=0.0)
     own = looks.covariates[pairs.look]
     columns = (
-        confidence[pairs.look], first, second, mean, total, silent, total / (1.0 + total + silent), shift_first, off / count,
+        confidence[pairs.look], first, second, mean, many, total, silent, total / (1.0 + total + silent), shift_first, off / count,
         spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in _OWN),
     )  # fmt: skip
     return beside(n, columns)
@@ -245,8 +248,9 @@ def mean_shift(
 def alarm_covariates(
     exchange: Exchange, looks: Looks, fleet: Fleet, zeros: NDArray[np.bool_], scene: Scene
 ) -> NDArray[np.float32]:
-    """What the number of false alarms depends on, [m, 14] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
-    light, how much of how many maps was sent, and whether the drone flies square to the streets."""
+    """What the number of false alarms depends on, [m, 18] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
+    light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was asked
+    for, and how far cars have moved since: a moving one has a second box where an older map shows it."""
     m = len(exchange.ego)
     cars = np.diff(looks.first)[exchange.ego]
     shares = (exchange.sender >= 0).sum(axis=1)
@@ -255,10 +259,15 @@ def alarm_covariates(
     seams = np.where(zeros, 0.0, np.sqrt(np.clip(received, 0, 1) * np.clip(shares - received, 0, 4)))
     plenty = np.where(shares > 0, np.log10(np.maximum(received, 1e-3)), 0.0)
     shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
+    some, there = np.maximum(shares, 1), exchange.sender >= 0
+    aimed = np.where(shares > 0, np.where(there, exchange.allowed, 0.0).sum(axis=1) / (some * CELLS**2), 1.0)
+    age_s = np.where(there, fleet.t_s[exchange.ego, None] - fleet.t_s[exchange.sender], 0.0).sum(axis=1) / some
+    moves = np.concatenate([np.zeros(1), np.cumsum(looks.covariates[:, _MOVING], dtype=np.float64)])
+    moving = np.diff(moves[looks.first])[exchange.ego] / 10.0
     columns = (
         np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
         scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in _STYLES),
-        square(fleet.yaw_rad[exchange.ego]),
+        square(fleet.yaw_rad[exchange.ego]), aimed, moving, age_s / 0.2, moving * age_s / 0.2,
     )  # fmt: skip
     return beside(m, columns)
 

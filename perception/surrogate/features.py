@@ -26,8 +26,10 @@ HALF_V = HALF_H * 90 / 160
 """The cameras' half angles, as in `render.py`, which needs torch."""
 LOOK_COVARIATES = (
     "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
-    "crowd", "altitude", "square", "next", "next_along", "next_across",
+    "crowd", "altitude", "strange", "square", "next", "next_along", "next_across",
 )  # fmt: skip
+LEARNED_AT_M = 60.0
+"""The height at which networks are trained: what is higher or lower is strange to them."""
 NEXT_M = 8.0
 """A car that stands farther away from the next one has none."""
 SQUARE_RAD = np.radians(3.0)
@@ -69,7 +71,7 @@ class Fleet:
 @dataclass(frozen=True, slots=True)
 class Looks:
     """n looks, capture by capture, cars ascending: `capture` [n], `car` [n] (column of `Traffic`), `xy_m` [n, 2] where the
-    drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 18] float32 as
+    drone's map shows the car, in its level frame, `world_m` [n, 2] and `yaw_rad` [n] the same in ENU, `covariates` [n, 19] float32 as
     `LOOK_COVARIATES`, `index` [c, cars] (−1: no look); those of capture c are `first[c]` to `first[c + 1]`."""
 
     capture: Ints
@@ -219,8 +221,8 @@ class Eyes:
         columns = (
             reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
             (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
-            traffic.size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / 60.0 - 1.0,
-            square(yaw - fleet.yaw_rad[capture]), close, way[:, 0], way[:, 1],
+            traffic.size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / LEARNED_AT_M - 1.0,
+            np.abs(eye[:, 2] / LEARNED_AT_M - 1.0), square(yaw - fleet.yaw_rad[capture]), close, way[:, 0], way[:, 1],
         )  # fmt: skip
         return beside(len(car), columns)
 

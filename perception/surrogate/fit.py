@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,15 +17,26 @@ from torch import Tensor
 from perception.overlap import iou_pairs
 from perception.surrogate.exchange import ALARM_COVARIATES
 from perception.surrogate.features import axes, on_axes
-from perception.surrogate.model import BAND, NETS, SPREAD, SQUARE, Net, Parameters, kind_of, rank_covariates, vague
+from perception.surrogate.model import (
+    BAND,
+    KINDS,
+    NETS,
+    SPREAD,
+    SQUARE,
+    Net,
+    Parameters,
+    kind_of,
+    rank_covariates,
+    vague,
+)
 from perception.surrogate.rows import Rows
 from scenarios.streams import stream
 
 Array = NDArray[Any]
-HIDDEN = {"look": (32, 32), "rank": (16,), "rank_norm": (16,), "find": (32, 24), "place": (48, 32)}
-STEPS = {"look": 5000, "rank": 5000, "rank_norm": 5000, "find": 5000, "place": 10_000}
+HIDDEN = {"look": (32, 32), "rank": (16,), "rank_norm": (16,), "find": (32, 24), "place": (48, 32), "alarms": (24,)}
+STEPS = {"look": 5000, "rank": 5000, "rank_norm": 5000, "find": 10_000, "place": 10_000, "alarms": 5000}
 """Of every network. With fewer, AP moves by 0.01 from one seed of a fit to the next; where boxes lie decides it most."""
-START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0]}
+START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0], "find": [0.0, 0.0, 1.0, -1.0, 0.0, 0.0]}
 """First outputs, so that a mixture's components part."""
 CAR_M = (4.5, 1.9)
 """A car, about the towns' mean: to tell which boxes would count."""
@@ -35,8 +46,10 @@ FEWEST = 20
 GROUPS, FACTORS = 4, (0.7, 1.4)
 """Of bands of residuals, each made longer or shorter by a factor within these bounds."""
 NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
-BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.94, 0.975, 0.99])
+BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.95, 0.98, 0.995])
 """Quantiles of the alarms' scores between which they are counted."""
+RATES = (-12.0, 8.0)
+"""Bounds of log rates."""
 
 
 def fit(
@@ -68,7 +81,7 @@ def fit(
     at = torch.tensor(float(logit(floor)))
     loss = partial(_find_loss, floor=at)
     nets["find"], out = _train("find", rows.fused, {"hit": found, "q": q}, loss, seed)
-    chance = expit(out[:, 0]) * ndtr((out[:, 1] - float(at)) / np.exp(np.clip(out[:, 2], *SPREAD)))
+    chance = expit(out[:, 0]) * (1.0 - _below(np.full(len(out), float(at)), out[:, 1:]))
     alike.append(_in_common(found[alone], chance[alone], car[alone]))
     tell("place")
     covariates = np.concatenate([rows.fused, rows.score[:, None]], axis=1)[found]
@@ -84,20 +97,22 @@ def fit(
     kind, unsure = kind_of(covariates), vague(out)
     fits = _iou(off)
     pools = []
-    for k in range(4):
-        of = kind == k
-        if of.sum() < BAND:  # too few to draw from: square or not
-            of = kind // 2 == k // 2
+    for k in range(KINDS):
+        wider = (kind == k, kind // 2 == k // 2, (kind >= 2) == (k >= 2), kind >= 0)
+        of = next((of for of in wider if of.sum() >= BAND), wider[-1])  # too few to draw from: square or not, and so on
         pool = _bands(residuals[of], unsure[of], fits[of])
         good = fits[of] >= 0.5
         pools.append(_as_good(pool, centre[of], spread[of], unsure[of], good, rows.score[found][of], rng))
     only = alone[found]
     alike.append(_in_common(fits[only] >= 0.5, _chance(fits[only] >= 0.5, unsure[only]), car[found][only]))
     tell("alarms")
-    edges, rate, alarms = _alarms(rows, floor, rng)
-    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, rate, alarms, NO_MIRAGES, boxes)
-    a, r, e, q, p, m, n = (np.asarray(v, np.float32) for v in singles)
-    return Parameters(nets, a, r, e, q, p, m, n, card={})
+    edges, counts, alarms = _alarms(rows, floor, rng)
+    ask = np.isfinite(rows.job).all(axis=1)
+    start = np.log(counts[ask].mean(axis=0) + 1e-3).tolist()
+    nets["alarms"], _ = _train("alarms", rows.job[ask], {"count": counts[ask]}, _count_loss, seed, start=start)
+    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, alarms, NO_MIRAGES, boxes)
+    a, r, e, p, m, n = (np.asarray(v, np.float32) for v in singles)
+    return Parameters(nets, a, r, e, p, m, n, card={})
 
 
 def _bands(residuals: Array, unsure: Array, fits: Array) -> Array:
@@ -142,6 +157,7 @@ def _train(
     seed: int,
     steps: int | None = None,
     batch: int = 2048,
+    start: Sequence[float] | None = None,
 ) -> tuple[Net, Array]:
     """A network fitted by Adam with a falling rate, and its outputs for all rows."""
     inputs, outputs = NETS[name]
@@ -158,7 +174,7 @@ def _train(
     linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
         linear[-1].weight.mul_(0.1)
-        linear[-1].bias.copy_(torch.tensor(START.get(name, [0.0] * outputs)))
+        linear[-1].bias.copy_(torch.tensor(start or START.get(name, [0.0] * outputs)))
     optimiser = torch.optim.AdamW(net.parameters(), 4e-3, weight_decay=0.03)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=steps)
     generator = torch.Generator().manual_seed(seed)
@@ -187,9 +203,22 @@ def _normal(x: Tensor, mean: Tensor, log_spread: Tensor) -> Tensor:
 
 
 def _look_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
-    low = torch.nn.functional.logsigmoid(-out[:, 0]) + _normal(y["c"], out[:, 2], out[:, 4])
-    high = torch.nn.functional.logsigmoid(out[:, 0]) + _normal(y["c"], out[:, 1], out[:, 3])
-    return -torch.logaddexp(low, high).mean()
+    return -_of_two(y["c"], out).mean()
+
+
+def _of_two(x: Tensor, out: Tensor) -> Tensor:
+    """Log density of a mixture of two normals, `out` [n, 5] as the model draws from it."""
+    low = torch.nn.functional.logsigmoid(-out[:, 0]) + _normal(x, out[:, 2], out[:, 4])
+    high = torch.nn.functional.logsigmoid(out[:, 0]) + _normal(x, out[:, 1], out[:, 3])
+    return torch.logaddexp(low, high)
+
+
+def _below(x: Array, out: Array) -> Array:
+    """What part of such a mixture lies below x [n]."""
+    p = expit(out[:, 0])
+    low = ndtr((x - out[:, 2]) / np.exp(np.clip(out[:, 4], *SPREAD)))
+    high = ndtr((x - out[:, 1]) / np.exp(np.clip(out[:, 3], *SPREAD)))
+    return np.asarray(p * high + (1 - p) * low)
 
 
 def _normal_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
@@ -197,12 +226,20 @@ def _normal_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
 
 
 def _find_loss(out: Tensor, y: dict[str, Tensor], floor: Tensor) -> Tensor:
-    spread = out[:, 2].clamp(*SPREAD)
-    above = torch.special.log_ndtr((out[:, 1] - floor) * torch.exp(-spread))
-    p = torch.nn.functional.logsigmoid(out[:, 0])
+    score, log = out[:, 1:], torch.nn.functional.logsigmoid
+    upper, lower = (
+        torch.special.log_ndtr((score[:, k] - floor) * torch.exp(-score[:, k + 2].clamp(*SPREAD))) for k in (1, 2)
+    )
+    above = torch.logaddexp(log(score[:, 0]) + upper, log(-score[:, 0]) + lower)
+    p = log(out[:, 0])
     missed = torch.log1p(-torch.exp((p + above).clamp(max=-1e-6)))
-    seen = p + _normal(y["q"], out[:, 1], spread)
+    seen = p + _of_two(y["q"], score)
     return -torch.where(y["hit"] > 0, seen, missed).mean()
+
+
+def _count_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
+    rate = out.clamp(*RATES)
+    return (torch.exp(rate) - y["count"] * rate).sum(dim=1).mean()  # Poisson
 
 
 def _place_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
@@ -217,11 +254,7 @@ def _place_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
 def _alike(rows: Rows, out: Array, looks: Array) -> float:
     """What part of a look's luck is the car's own: correlation, over pairs of such `looks` at one car, of where in its
     predicted distribution each fell."""
-    out, seen = out[looks], rows.confidence[looks]
-    p = expit(out[:, 0])
-    low = ndtr((seen - out[:, 2]) / np.exp(np.clip(out[:, 4], *SPREAD)))
-    high = ndtr((seen - out[:, 1]) / np.exp(np.clip(out[:, 3], *SPREAD)))
-    z = ndtri(np.clip(p * high + (1 - p) * low, 1e-4, 1 - 1e-4))
+    z = ndtri(np.clip(_below(rows.confidence[looks], out[looks]), 1e-4, 1 - 1e-4))
     a, b = _pairs(rows.look_object[looks])
     return float(np.clip((z[a] * z[b]).mean() / max(z.var(), 1e-6), 0.0, 0.95))
 
@@ -260,7 +293,7 @@ def _pairs(group: Array) -> tuple[Array, Array]:
 
 
 def _alarms(rows: Rows, floor: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Bands of scores, a Poisson regression of the count in each, and alarms to draw from."""
+    """Bands of scores, how many of each job's alarms lie in each, and alarms to draw from."""
     score = rows.alarm[:, 5]
     if len(score) < 50:
         raise ValueError(f"{len(score)} false alarms above {floor:g}, at least 50 are needed; calibrate on more scenes")
@@ -270,25 +303,10 @@ def _alarms(rows: Rows, floor: float, rng: np.random.Generator) -> tuple[Array, 
     band = np.clip(np.searchsorted(edges, score, side="right") - 1, 0, len(BANDS) - 1)
     counts = np.zeros((len(rows.job), len(BANDS)))
     np.add.at(counts, (rows.alarm_job, band), 1.0)
-    x = np.concatenate([np.ones((len(rows.job), 1)), rows.job], axis=1)
-    rate = np.stack([_poisson(x, counts[:, b]) for b in range(len(BANDS))], axis=1)
     along = rows.job[rows.alarm_job, ALARM_COVARIATES.index("square")] > SQUARE
     pools = []
     for of in (~along, along):
         mine = [np.flatnonzero((band == b) & of) for b in range(len(BANDS))]
         mine = [m if len(m) >= FEWEST else np.flatnonzero(band == b) for b, m in enumerate(mine)]
         pools.append(np.stack([rows.alarm[rng.choice(m, POOL)] for m in mine]))
-    return edges, rate, np.stack(pools)
-
-
-def _poisson(x: Array, y: Array, ridge: float = 3.0, rounds: int = 40) -> Array:
-    """Log-linear Poisson regression [c] by Newton's method; all but the first coefficient are held to 0 by a ridge."""
-    beta = np.zeros(x.shape[1])
-    beta[0] = np.log(y.mean() + 1e-3)
-    hold = np.full(len(beta), ridge)
-    hold[0] = 1e-3
-    for _ in range(rounds):
-        mean = np.exp(np.clip(x @ beta, -12, 8))
-        step = np.linalg.solve((x * mean[:, None]).T @ x + np.diag(hold), x.T @ (y - mean) - hold * beta)
-        beta += np.clip(step, -1.0, 1.0)
-    return beta
+    return edges, counts, np.stack(pools)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from perception.ap import Matched, average_precision, match
-from perception.harness.statistics import compare
+from perception.harness.statistics import compare, interval, rank, resamples
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
@@ -36,12 +36,14 @@ CONTRASTS = (
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One condition's AP@0.5 by both, on `egos` moments."""
+    """One condition's AP@0.5 by both, on `egos` moments; the error with its 95 % interval by whole scenes."""
 
     condition: str
     torch: float
     surrogate: float
     error: float
+    low: float
+    high: float
     egos: int
 
 
@@ -85,6 +87,7 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
     theirs: dict[str, list[Matched]] = {}
     ours: dict[str, list[Matched]] = {}
     scenes: dict[str, list[int]] = {}
+    drawn: dict[str, list[int]] = {}
     for asked in held_out:
         scene = scene_model(seed, asked.split, asked.scene)
         truths = None
@@ -99,17 +102,28 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
                 for i, boxes in zip(mine, detector.detect_many(jobs), strict=True):
                     for name, disc in _regions(asked.jobs[i]):
                         ours.setdefault(name, []).append(match(boxes, truths[i], disc))
+                        drawn.setdefault(name, []).append(asked.scene)
                         if repeat == 0:
                             found = asked.boxes[i].take(asked.boxes[i].score >= THRESHOLD)
                             theirs.setdefault(name, []).append(match(found, truths[i], disc))
                             scenes.setdefault(name, []).append(asked.scene)
-    ap = {name: (average_precision(theirs[name]), average_precision(ours[name])) for name in theirs}
-    levels = [Level(name, a, b, b - a, len(theirs[name])) for name, (a, b) in ap.items()]
+    levels = [_level(name, theirs[name], ours[name], scenes[name], drawn[name]) for name in theirs]
+    ap = {v.condition: v.surrogate for v in levels}
     orders = []
     for a, b in (pair for pair in CONTRASTS if ap.keys() >= set(pair)):
         d = compare(theirs[a], theirs[b], scenes[a])
-        orders.append(Order(a, b, d.delta, d.low, d.high, ap[b][1] - ap[a][1]))
+        orders.append(Order(a, b, d.delta, d.low, d.high, ap[b] - ap[a]))
     return Verdict(levels, orders)
+
+
+def _level(
+    name: str, theirs: Sequence[Matched], ours: Sequence[Matched], scenes: Sequence[int], drawn: Sequence[int]
+) -> Level:
+    torch, surrogate = rank(theirs, scenes), rank(ours, drawn)
+    weights = resamples(len(torch.truths))
+    a, b = average_precision(theirs), average_precision(ours)
+    low, high = interval(surrogate.ap(weights) - torch.ap(weights))
+    return Level(name, a, b, b - a, low, high, len(theirs))
 
 
 def _regions(job: Job) -> list[tuple[str, Disc | None]]:

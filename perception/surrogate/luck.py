@@ -24,7 +24,7 @@ BANDS, ALARMS = 8, 24
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Of looks l and captures c: `look` [l] uniform, `rank` [l] normal, `find` [l, 2] uniform and normal, `residual` [l] uniform,
+    """Of looks l and captures c: `look` [l] uniform, `rank` [l] normal, `find` [l, 2] uniform, `residual` [l] uniform,
     `alarm_at` [c, 8, 24] arrivals of processes of rate 1, `alarm_which` [c, 8, 24] uniform, `moment` [c] numbers to draw more by; `thrown`
     [l, 4], of the car whoever looks: uniform, and to which side (−1, 1) along it, across it and in heading boxes of it lie off,
     where it is one of those whose boxes all do."""
@@ -57,7 +57,7 @@ class Luck:
         one = mixed(moment[looks.capture] ^ self._car[looks.car])
         fate = self._fate[:, looks.car]
         look, found, placed = np.where(np.isnan(fate), [uniform(one, k) for k in range(3)], fate)
-        ranked, scored = (ndtri(uniform(one, k)) for k in (3, 4))
+        ranked, scored = ndtri(uniform(one, 3)), uniform(one, 4)
         alarm = moment[:, None] + np.arange(1, 2 * BANDS * ALARMS + 1, dtype=np.uint64) * np.uint64(GAMMA)
         drawn = uniform(alarm, 8).reshape(len(captures), 2, BANDS, ALARMS)
         arrivals = np.cumsum(-np.log(drawn[:, 0]), axis=-1)

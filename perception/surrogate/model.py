@@ -6,7 +6,7 @@ Five parts, each fitted to what the torch detector did:
 - **rank**: what part of the drone's cells rank above the car's cell, given how sure it is: whether a budget sends it.
 - **find**: what fusion makes of it: a box or none, and its score.
 - **place**: how far that box is off, along the car, across it, in heading, length and width.
-- **alarms**: how many boxes there are of nothing, by score.
+- **alarms**: how many boxes there are of nothing, in bands of scores.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
+from perception.geometry import CELLS
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES, beside
+from perception.surrogate.luck import BANDS
 from perception.town import Floats
 
 Singles = NDArray[np.float32]
-FORMAT = 5
+FORMAT = 6
 RANK_COVARIATES = ("confidence", "range", "visible", "nadir", "cars", "brightness", "shade")
 PLACE_COVARIATES = (*FUSED_COVARIATES, "score")
 ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")
@@ -36,8 +38,9 @@ NETS: dict[str, tuple[int, int]] = {
     "look": (len(LOOK_COVARIATES), 5),
     "rank": (len(RANK_COVARIATES), 2),
     "rank_norm": (len(RANK_COVARIATES), 2),
-    "find": (len(FUSED_COVARIATES), 3),
+    "find": (len(FUSED_COVARIATES), 6),
     "place": (len(PLACE_COVARIATES), 11),
+    "alarms": (len(ALARM_COVARIATES), BANDS),
 }
 """Inputs and outputs of each network."""
 SHIPPED = Path(__file__).parent / "weights" / "surrogate.safetensors"
@@ -49,6 +52,10 @@ BAND = 64
 """Residuals that were predicted as vaguely: a box's is one of these, and the best luck draws the one that lay best."""
 SQUARE = 0.5
 """Squareness from which on a car, or a drone, counts as square."""
+KINDS = 8
+"""Of boxes, each with residuals of its own (`kind_of`)."""
+FEW, WHOLE = np.log(0.02 * CELLS**2) / 8.0, np.log(0.99 * CELLS**2) / 8.0
+"""The cells, as `FUSED_COVARIATES` has them, up to which a map counts as a few, and from which on as a whole one."""
 _ROWS = 192
 """At a time: few enough for the cache, and for the matrix library to start no threads."""
 _STEP = 2.0**-20
@@ -100,9 +107,9 @@ class Parameters:
 
     `alike` [4]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies;
     and the part of those whose boxes lie off to the same side for all.
-    `residuals` [4, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
+    `residuals` [8, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
     first in each, and how vague (`vague`) predictions are from which on a band stands for them; pools as `kind_of`. `alarm_edges` [b + 1]: scores
-    between which alarms are counted; `alarm_rate` [1 + covariates, b]: log rates; `alarm_pool` [2, b, p, 6] where and how large they
+    between which alarms are counted; `alarm_pool` [2, b, p, 6] where and how large they
     were (`ALARM_COLUMNS`, ego's frame), of drones turned anyhow and of square ones; `mirages` [4]: the part of the alarms that are of things which others may take for cars
     as well, the chance that a drone does, and how far it puts them off, as deviations (m, rad); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
     above each, and how many boxes of nothing there are.
@@ -112,7 +119,6 @@ class Parameters:
     alike: Singles
     residuals: Singles
     alarm_edges: Singles
-    alarm_rate: Singles
     alarm_pool: Singles
     mirages: Singles
     boxes: Singles
@@ -133,13 +139,7 @@ class Parameters:
     def confidence(self, covariates: Singles, luck: Singles) -> Singles:
         """How sure each drone is of each car on its own, a logit [n]; `luck` [n] uniform: the worst falls to the lower
         of the two normals, and within each to its lower end."""
-        out = self.nets["look"](covariates)
-        u, low = luck.astype(np.float64), expit(-out[:, 0].astype(np.float64))
-        high = u >= low
-        within = ndtri(np.clip(np.where(high, (u - low) / (1.0 - low), u / low), 1e-6, 1.0 - 1e-6))
-        mean = np.where(high, out[:, 1], out[:, 2])
-        spread = _spread(np.where(high, out[:, 3], out[:, 4]))
-        return np.asarray(mean + spread * within, np.float32)
+        return _of_two(self.nets["look"](covariates), luck)
 
     def rank(self, covariates: Singles, luck: Singles, by: str = "confidence") -> Singles:
         """The fraction [n] of the drone's cells that rank above; `luck` [n] standard normal."""
@@ -147,9 +147,9 @@ class Parameters:
         return np.asarray(np.minimum(np.exp(out[:, 0] + _spread(out[:, 1]) * luck), 1.0), np.float32)
 
     def find(self, covariates: Singles, luck: Singles) -> Singles:
-        """Scores [n], 0 where there is no box; `luck` [n, 2]: uniform, and standard normal."""
+        """Scores [n], 0 where there is no box; `luck` [n, 2] uniform: whether there is one, and how high its score."""
         out = self.nets["find"](covariates)
-        score = expit(out[:, 1] + _spread(out[:, 2]) * luck[:, 1])
+        score = expit(_of_two(out[:, 1:], luck[:, 1]))
         return np.where((luck[:, 0] < expit(out[:, 0])) & (score >= self.floor), score, 0.0).astype(np.float32)
 
     def place(self, covariates: Singles, luck: Singles, thrown: Singles) -> tuple[Singles, Singles]:
@@ -170,7 +170,18 @@ class Parameters:
 
     def alarm_rates(self, covariates: Singles) -> Singles:
         """Expected alarms of each job in each band of scores, [m, b]."""
-        return np.asarray(np.exp(Net((self.alarm_rate[1:],), (self.alarm_rate[0],))(covariates)))
+        return np.asarray(np.exp(self.nets["alarms"](covariates)))
+
+
+def _of_two(out: Singles, luck: Singles) -> Singles:
+    """Draws [n] from mixtures of two normals, `out` [n, 5]: the upper one's logit, means and log deviations of the upper and of
+    the lower one. `luck` [n] uniform: the worst falls to the lower normal, and within each to its lower end."""
+    u, low = luck.astype(np.float64), expit(-out[:, 0].astype(np.float64))
+    high = u >= low
+    within = ndtri(np.clip(np.where(high, (u - low) / (1.0 - low), u / low), 1e-6, 1.0 - 1e-6))
+    mean = np.where(high, out[:, 1], out[:, 2])
+    spread = _spread(np.where(high, out[:, 3], out[:, 4]))
+    return np.asarray(mean + spread * within, np.float32)
 
 
 def _spread(log: Singles) -> Singles:
@@ -178,10 +189,12 @@ def _spread(log: Singles) -> Singles:
 
 
 def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
-    """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 shared, the odd ones of cars that stand square on
-    the map, which a network of cells puts elsewhere."""
-    shared, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "own_square"))
-    return 2 * (shared > 0).astype(np.intp) + (square > SQUARE)
+    """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 with a few cells of others' maps, 4 and 5 with more, 6
+    and 7 with all, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
+    elsewhere."""
+    shared, cells, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "cells", "own_square"))
+    kind = (shared > 0) * (1 + (cells > FEW) + (cells > WHOLE))
+    return np.asarray(2 * kind + (square > SQUARE), np.intp)
 
 
 def vague(place: NDArray[Any]) -> NDArray[Any]:
@@ -202,7 +215,7 @@ def save(path: Path, parameters: Parameters) -> None:
     """Write them as safetensors with the card in the metadata, under a temporary name first."""
     tensors: dict[str, Singles] = {
         name: getattr(parameters, name)
-        for name in ("alike", "residuals", "alarm_edges", "alarm_rate", "alarm_pool", "mirages", "boxes")
+        for name in ("alike", "residuals", "alarm_edges", "alarm_pool", "mirages", "boxes")
     }
     for name, net in parameters.nets.items():
         for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
@@ -255,18 +268,15 @@ def load(path: Path) -> Parameters:
             raise ValueError(f"{path}: tensor {name} has shape {list(found.shape)}, must be [{wanted}]")
         return np.asarray(found, np.float32)
 
-    edges = take("alarm_edges", None)
-    bands = len(edges) - 1
     return Parameters(
         {
             name: _net(take, name, *sizes, layers=sum(t.startswith(f"{name}.") for t in tensors) // 2)
             for name, sizes in NETS.items()
         },
         take("alike", 4),
-        take("residuals", 4, None, 6),
-        edges,
-        take("alarm_rate", 1 + len(ALARM_COVARIATES), bands),
-        take("alarm_pool", 2, bands, None, len(ALARM_COLUMNS)),
+        take("residuals", KINDS, None, 6),
+        take("alarm_edges", BANDS + 1),
+        take("alarm_pool", 2, BANDS, None, len(ALARM_COLUMNS)),
         take("mirages", 4),
         take("boxes", 3, None),
         card,

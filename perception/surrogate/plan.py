@@ -33,6 +33,8 @@ DRONES = 5
 THRESHOLD = 0.1
 """Boxes count from this score on."""
 BUDGETS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
+DRAWN, PLAIN = 4, 3
+"""Exchanges that a drone is asked under for the fit."""
 AGES_S = (0.1, 0.2, 0.4)
 """How much older than the ego's a share may be."""
 STYLES = ("town", "old_town", "suburb", "yard")
@@ -115,7 +117,8 @@ def scene_model(seed: int, split: Split, index: int) -> SceneModel:
 def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Job]:
     """What is asked at moment `index` of a scene.
 
-    For the fit, every drone is asked alone and under two drawn exchanges. Held out, the first `condition_egos` drones are
+    For the fit, every drone is asked alone, under some exchanges that are drawn in every respect, and under some plain ones: all
+    others, one budget, everywhere and at once. Held out, the first `condition_egos` drones are
     asked under every condition of the moment's manner.
     """
     rng = stream(scene_seed(seed, split, scene), 0, index, "calibrate.fleet")
@@ -128,7 +131,8 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
         x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
         return [job for ego in egos for job in street_conditions(ego, now, old, (x, y, 32.0))]
     jobs = [Job(ego, (), "masked", "confidence", "") for ego in now]
-    return jobs + [_exchange(rng, ego, now, old) for ego in now for _ in range(2)]
+    jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(DRAWN)]
+    return jobs + [_plain(rng, ego, now) for ego in now for _ in range(PLAIN)]
 
 
 def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Job]:
@@ -209,7 +213,7 @@ def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
     t_s = _time_s(u[0])
     shape = "cross" if split == "held-out" or u[1] < 0.6 else "line" if u[1] < 0.8 else "wedge"
     spacing = 20.0 if split == "held-out" else 12 + 23 * u[2]
-    altitude = 60.0 if split == "held-out" else 50 + 20 * u[3]
+    altitude = 60.0 if split == "held-out" or u[3] < 0.5 else 30 + 40 * u[3]
     position_error, heading_error = 0.2, np.radians(0.2)
     if split == "fit" and u[4] < 0.5:
         position_error, heading_error = 0.05 + 0.5 * u[5], np.radians(1.0 * u[6])
@@ -291,13 +295,25 @@ def _captures(
     return now, old
 
 
+def _rho(everything: float, u: float) -> float:
+    """A drawn budget: all of it with the given chance, else evenly spread in its logarithm from 0.4 % on."""
+    return 1.0 if everything < 0.3 else float(0.004 * 250.0**u)
+
+
+def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> Job:
+    """All others send a drawn part of their maps as they are now."""
+    rho = _rho(*rng.random(2))
+    shares = tuple(Share(c, "features", rho, None, 1.0) for c in now if c is not ego)
+    return Job(ego, shares, "masked", "confidence", "")
+
+
 def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]) -> Job:
     """A drawn exchange: who, how many cells, where, how old, what a cell that was not sent counts as."""
     u = rng.random(9)
     peers = rng.permutation([c.drone for c in now if c is not ego])[: 1 + int(4 * u[0])]
     if u[0] > 0.6:
         peers = np.array([c.drone for c in now if c is not ego])
-    rho = 1.0 if u[1] < 0.3 else float(0.008 * 125.0 ** u[2])
+    rho = _rho(u[1], u[2])
     roi = None
     if u[3] < 0.25:
         x, y = np.array(ego.position_m[:2]) + rng.uniform(-45, 45, 2)
@@ -306,6 +322,8 @@ def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: d
     if u[5] < 0.2:
         ages[:] = ages[0]
     weights = rng.random(len(peers)) if u[6] < 0.15 else np.ones(len(peers))
+    if u[6] < 0.075:
+        weights[:] = weights[0]
     shares = tuple(
         Share((old[float(a)] if a else now)[p], "features", rho, roi, float(w))
         for p, a, w in zip(peers, ages, weights, strict=True)

@@ -26,9 +26,9 @@ Array = NDArray[Any]
 class Rows:
     """Rows of one or more scenes.
 
-    Looks (l): `look` [l, 18] covariates, `confidence` [l] and `norm` [l] what ranks the car's best cell, `above` [l] and
+    Looks (l): `look` [l, 19] covariates, `confidence` [l] and `norm` [l] what ranks the car's best cell, `above` [l] and
     `above_norm` [l] the fraction of all cells that rank higher, `look_object` [l] which car of which scene, `look_cars` [l] how many its capture shows.
-    Fusions (f): `fused` [f, 26] covariates, `score` [f] (0: no box), `offset` [f, 5] box against car (ahead, left, yaw, log
+    Fusions (f): `fused` [f, 28] covariates, `score` [f] (0: no box), `offset` [f, 5] box against car (ahead, left, yaw, log
     length, log width), `xy_m` [f, 2] the car in the ego's frame, `heading` [f] and how it is turned there,
     `shift` [f, 2] the mean that its peers' maps are off.
     Jobs (j): `job` [j, …] covariates of false alarms, `alarms` [j] how many; alarms (a): `alarm_job` [a], `alarm` [a, 6] (x, y of

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.model import Parameters
-from perception.surrogate.plan import moment, scene_model
+from perception.surrogate.plan import Job, moment, scene_model
 from scenarios.schema import Perception
 
 
-def asked(parameters: Parameters, scenes: int) -> list[Asked]:
-    """What a surrogate would have answered where the detector is asked."""
+def asked(parameters: Parameters, scenes: int, takes: Callable[[Job], bool] | None = None) -> list[Asked]:
+    """What a surrogate would have answered where the detector is asked, of a drone alone or of the jobs that it `takes`."""
     out = []
     for scene in range(scenes):
-        jobs = [j for j in moment(0, "fit", scene, 0) if not j.shares]
+        jobs = [j for j in moment(0, "fit", scene, 0) if (takes(j) if takes else not j.shares)]
         detector = SurrogateDetector.of(scene_model(0, "fit", scene), Perception(score_threshold=0.1), parameters, 5)
-        boxes = list(detector.detect_many([[(j.ego, ())] for j in jobs]))
+        boxes = list(detector.detect_many([[(j.ego, j.shares)] for j in jobs]))
         out.append(Asked("fit", scene, jobs, boxes, {}))
     return out

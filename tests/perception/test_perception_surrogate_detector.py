@@ -15,7 +15,14 @@ from perception.detectors import DetectsMany
 from perception.geometry import in_square
 from perception.scene import SceneModel
 from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.exchange import Exchange, pair
+from perception.surrogate.exchange import (
+    ALARM_COVARIATES,
+    FUSED_COVARIATES,
+    Exchange,
+    alarm_covariates,
+    covariates,
+    pair,
+)
 from perception.surrogate.features import Eyes, Fleet
 from perception.surrogate.luck import Luck
 from perception.surrogate.rows import claim
@@ -297,3 +304,46 @@ def test_false_alarms_are_those_of_drones_along_a_street_or_askew(
     lengths = np.concatenate([b.size_m[:, 0] for b in some.detect([(c, ()) for c in fleet])])
     assert len(lengths) > 5
     assert set(lengths.tolist()) == {length_m}
+
+
+def test_what_false_alarms_hang_on_is_what_was_asked_for_and_how_far_cars_have_driven_since() -> None:
+    """An ego with a whole map of now, a half one 0.2 s old and a disc 0.4 s old; and one with nothing, over one car that drives."""
+    scene = SceneModel(EMPTY, Target(waypoints_m=((-40.0, 0.0), (40.0, 0.0)), speed_mps=8.0), BOUNDS)
+    ego = capture(0.0, 0.0, t_s=5.0)
+    peers = [capture(5.0, 5.0 * k, drone=k + 1, t_s=5.0 - 0.2 * k) for k in range(3)]
+    given: list[tuple[float, tuple[float, float, float] | None]] = [(1.0, None), (0.5, None), (1.0, (0.0, 0.0, 32.0))]
+    jobs = [(ego, [Share(p, "features", *g, 1.0) for p, g in zip(peers, given, strict=True)]), (peers[0], [])]
+    captures = [ego, *peers]
+    fleet = Fleet.of(captures)
+    exchange = Exchange.of(jobs, {c: i for i, c in enumerate(captures)})
+    x = alarm_covariates(exchange, Eyes(scene).look(fleet), fleet, np.zeros(2, bool), scene.config)
+    told = dict(zip(ALARM_COVARIATES, x.T.tolist(), strict=True))
+    disc = np.pi * 10**2 / 4096
+    assert told["sharing"] == [0.75, 0.0]
+    assert told["aimed"] == pytest.approx([(1 + 1 + disc) / 3, 1.0])
+    assert told["received"] == pytest.approx([(1 + 0.5 + disc) / 4, 0.0], abs=1e-4)
+    assert told["moving"] == pytest.approx([0.1, 0.1])
+    assert told["late"] == pytest.approx([1.0, 0.0])
+    assert told["gone"] == pytest.approx([0.1, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("weights", "many"), [((0.5, 1.0, 0.5, 0.5), 3.0), ((1.0, 1.0, 0.0, 1.0), 2.0), ((1.0, 1.0, 0.5, 0.0), 1.8)]
+)
+def test_senders_are_counted_by_head_and_by_weight(weights: tuple[float, ...], many: float) -> None:
+    """Four, of which one's cell did not come; unequal weights count as fewer, one of nothing not at all."""
+    scene = SceneModel(EMPTY, Target(waypoints_m=((10.0, 0.0),)), BOUNDS)
+    captures = [capture(0.0, 0.0), *(capture(5.0, 5.0 * k, drone=k + 1) for k in range(4))]
+    fleet, shares = (
+        Fleet.of(captures),
+        [Share(p, "features", 1.0, None, w) for p, w in zip(captures[1:], weights, strict=True)],
+    )
+    exchange = Exchange.of([(captures[0], [s for s in shares if s.weight > 0])], {c: i for i, c in enumerate(captures)})
+    looks = Eyes(scene).look(fleet)
+    pairs = pair(exchange, looks, fleet)
+    sent = np.array([[k != 1 for k, w in enumerate(weights) if w > 0]])
+    sure = np.zeros(len(looks.car), np.float32)
+    x = covariates(pairs, exchange, looks, sure, sent, np.full(sent.shape, 0.1, np.float32), np.zeros(1, bool))
+    told = dict(zip(FUSED_COVARIATES, x[0].tolist(), strict=True))
+    assert told["many"] == pytest.approx(many)
+    assert told["senders"] == pytest.approx(sum(weights) - weights[1])
