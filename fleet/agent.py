@@ -317,7 +317,8 @@ class Agent:
             if link is None:
                 link = links[peer] = _Link(me, peer)
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
-            if asked != link.asked or age_s > fresh_s or link.state.asking_since_s is not None:
+            changed = asked is not link.asked and asked != link.asked
+            if changed or age_s > fresh_s or link.state.asking_since_s is not None:
                 self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 

@@ -74,9 +74,8 @@ def calibrate(
         "held_out": held_out,
     }
     parameters = replace(parameters, mirages=seen_by_several(fitted, floor, seed), card={**facts, "id": ""})
-    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels", done, of))
     parameters = hang_together(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("together", done, of))
-    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels again", done, of))
+    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels", done, of))
     arrays = [
         parameters.alike,
         parameters.mirages,

@@ -30,6 +30,8 @@ PROBE = 1.05
 """A factor that tells what longer residuals cost."""
 GENTLE = 0.1
 """AP that residuals e times as long cost at the least: where it seems to be less, luck has the larger say."""
+DRAWS = 3
+"""Of the surrogate's luck: much of it is a car's own, the same for all who look, so that few draws are a rough measure."""
 BOUNDS = (0.7, 1.4)
 
 
@@ -41,18 +43,18 @@ def level(
     towns = {k: (scene, Eyes(scene)) for k, scene in scenes.items()}  # a part of a second each, and asked for often
     config = Perception(score_threshold=threshold)
 
-    def detector(of: Parameters, k: int) -> SurrogateDetector:
+    def detector(of: Parameters, k: int, draw: int) -> SurrogateDetector:
         scene, eyes = towns[k]
-        return SurrogateDetector.of(scene, config, of, 0, eyes)
+        return SurrogateDetector.of(scene, config, of, draw, eyes)
 
-    runs = [_Runs.of(a, detector(parameters, a.scene), threshold) for a in asked]
+    runs = [_Runs.of(a, detector(parameters, a.scene, 0), threshold) for a in asked]
     wanted = _by_group([pair for r in runs for pair in r.theirs])
 
     def over(factor: Floats) -> Floats:
         """How much too high AP is."""
         some = longer(parameters, factor)
-        reached = _by_group([pair for r in runs for pair in r.ours(detector(some, r.scene))])
-        return np.nan_to_num(reached - wanted)
+        found = [pair for r in runs for k in range(DRAWS) for pair in r.ours(detector(some, r.scene, k))]
+        return np.nan_to_num(_by_group(found) - wanted)
 
     tell(0, ROUNDS + 1)
     factor = np.ones(KINDS)
@@ -85,8 +87,9 @@ def group_of(job: Job) -> int | None:
     for s in job.shares:
         if s.representation != "features" or s.roi or s.weight < 1.0 or s.missing or s.capture.t_s != job.ego.t_s:
             return None
-    cells = np.log(max(job.shares[0].rho * CELLS**2, 1.0)) / 8.0
-    return 2 * (1 + int(cells > FEW) + int(cells > WHOLE)) + along
+    rho = job.shares[0].rho
+    few = np.log(max(rho * CELLS**2, 1.0)) / 8.0 <= FEW
+    return 2 * (3 if rho > WHOLE else 1 if few else 2) + along
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,8 +54,9 @@ SQUARE = 0.5
 """Squareness from which on a car, or a drone, counts as square."""
 KINDS = 8
 """Of boxes, each with residuals of its own (`kind_of`)."""
-FEW, WHOLE = np.log(0.02 * CELLS**2) / 8.0, np.log(0.99 * CELLS**2) / 8.0
-"""The cells, as `FUSED_COVARIATES` has them, up to which a map counts as a few, and from which on as a whole one."""
+FEW, WHOLE = np.log(0.015 * CELLS**2) / 8.0, 0.99
+"""The cells, as `FUSED_COVARIATES` has them, up to which a map counts as a few; and the part of what was asked for, be it a region's,
+from which on as a whole one."""
 _ROWS = 192
 """At a time: few enough for the cache, and for the matrix library to start no threads."""
 _STEP = 2.0**-20
@@ -190,10 +191,11 @@ def _spread(log: Singles) -> Singles:
 
 def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
     """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 with a few cells of others' maps, 4 and 5 with more, 6
-    and 7 with all, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
+    and 7 with all that were asked for, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
     elsewhere."""
-    shared, cells, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "cells", "own_square"))
-    kind = (shared > 0) * (1 + (cells > FEW) + (cells > WHOLE))
+    names = ("senders", "cells", "part", "own_square")
+    shared, cells, part, square = (fused[:, FUSED_COVARIATES.index(name)] for name in names)
+    kind = (shared > 0) * (1 + ((cells > FEW) | (part > WHOLE)) + (part > WHOLE))
     return np.asarray(2 * kind + (square > SQUARE), np.intp)
 
 

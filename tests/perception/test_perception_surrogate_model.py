@@ -350,7 +350,8 @@ def test_residuals_are_those_of_drones_alone_or_fleets_and_of_square_cars_or_oth
     )
     x = np.zeros((KINDS, len(PLACE_COVARIATES)), np.float32)
     x[2:, PLACE_COVARIATES.index("senders")] = 1.5
-    x[2:, PLACE_COVARIATES.index("cells")] = np.log((40, 40, 2048, 2048, 4096, 4096)) / 8
+    x[2:, PLACE_COVARIATES.index("cells")] = np.log((40, 40, 2048, 2048, 60, 60)) / 8
+    x[2:, PLACE_COVARIATES.index("part")] = (0.01, 0.01, 0.5, 0.5, 1.0, 1.0)  # of a map, of one, and of a small region
     x[1::2, PLACE_COVARIATES.index("own_square")] = 0.9
     off, _ = planted.place(x, np.full(KINDS, 0.4, np.float32), thrown(KINDS))
     assert off[:, 0].tolist() == list(range(KINDS))
