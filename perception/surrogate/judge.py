@@ -16,7 +16,7 @@ from scenarios.schema import Perception
 
 WITHIN = 0.02
 """The error of AP that a calibration is to keep."""
-REPEATS = 8
+REPEATS = 4
 IN_DISC = ", in the disc"
 CONTRASTS = (
     ("alone", "all-4, ρ = 0.01"), ("alone", "all-4, ρ = 0.25"), ("alone", "all-4, ρ = 0.25, 32 m"), ("alone", "detections"),

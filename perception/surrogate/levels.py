@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.ap import Matched, average_precision, match
-from perception.geometry import CELLS
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
 from perception.surrogate.features import Eyes, square
@@ -88,8 +87,7 @@ def group_of(job: Job) -> int | None:
         if s.representation != "features" or s.roi or s.weight < 1.0 or s.missing or s.capture.t_s != job.ego.t_s:
             return None
     rho = job.shares[0].rho
-    few = np.log(max(rho * CELLS**2, 1.0)) / 8.0 <= FEW
-    return 2 * (3 if rho > WHOLE else 1 if few else 2) + along
+    return 2 * (1 + (rho > FEW) + (rho > WHOLE)) + along
 
 
 @dataclass(frozen=True, slots=True)

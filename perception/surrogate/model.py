@@ -23,7 +23,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
-from perception.geometry import CELLS
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES, beside
 from perception.surrogate.luck import BANDS
@@ -54,9 +53,8 @@ SQUARE = 0.5
 """Squareness from which on a car, or a drone, counts as square."""
 KINDS = 8
 """Of boxes, each with residuals of its own (`kind_of`)."""
-FEW, WHOLE = np.log(0.015 * CELLS**2) / 8.0, 0.99
-"""The cells, as `FUSED_COVARIATES` has them, up to which a map counts as a few; and the part of what was asked for, be it a region's,
-from which on as a whole one."""
+FEW, WHOLE = 0.015, 0.99
+"""The part of the cells that were asked for, be it a region's, up to which they are a few, and from which on all."""
 _ROWS = 192
 """At a time: few enough for the cache, and for the matrix library to start no threads."""
 _STEP = 2.0**-20
@@ -193,9 +191,8 @@ def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
     """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 with a few cells of others' maps, 4 and 5 with more, 6
     and 7 with all that were asked for, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
     elsewhere."""
-    names = ("senders", "cells", "part", "own_square")
-    shared, cells, part, square = (fused[:, FUSED_COVARIATES.index(name)] for name in names)
-    kind = (shared > 0) * (1 + ((cells > FEW) | (part > WHOLE)) + (part > WHOLE))
+    shared, part, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "part", "own_square"))
+    kind = (shared > 0) * (1 + (part > FEW) + (part > WHOLE))
     return np.asarray(2 * kind + (square > SQUARE), np.intp)
 
 

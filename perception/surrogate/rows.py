@@ -31,7 +31,7 @@ class Rows:
     Fusions (f): `fused` [f, 28] covariates, `score` [f] (0: no box), `offset` [f, 5] box against car (ahead, left, yaw, log
     length, log width), `xy_m` [f, 2] the car in the ego's frame, `heading` [f] and how it is turned there,
     `shift` [f, 2] the mean that its peers' maps are off.
-    Jobs (j): `job` [j, …] covariates of false alarms, `alarms` [j] how many; alarms (a): `alarm_job` [a], `alarm` [a, 6] (x, y of
+    Jobs (j): `job` [j, …] covariates of false alarms; alarms (a): `alarm_job` [a], `alarm` [a, 6] (x, y of
     the ego's frame, length, width, yaw, score).
     """
 

@@ -347,3 +347,28 @@ def test_senders_are_counted_by_head_and_by_weight(weights: tuple[float, ...], m
     told = dict(zip(FUSED_COVARIATES, x[0].tolist(), strict=True))
     assert told["many"] == pytest.approx(many)
     assert told["senders"] == pytest.approx(sum(weights) - weights[1])
+
+
+@pytest.mark.parametrize("age_s", [0.5, 2.0, 60.0])
+def test_older_maps_than_any_that_was_fitted_give_no_more_false_alarms_than_the_oldest_that_was(
+    detector: SurrogateDetector, scene: SceneModel, age_s: float
+) -> None:
+    def expected(age_s: float) -> np.ndarray:
+        ego = capture(10.0, 20.0, t_s=70.0)
+        peers = [capture(10.0, 5.0 * k, drone=k + 1, t_s=70.0 - age_s) for k in range(4)]
+        jobs = [(ego, [Share(p, "features", 0.25, None, 1.0) for p in peers])]
+        fleet = Fleet.of([ego, *peers])
+        exchange = Exchange.of(jobs, {c: i for i, c in enumerate([ego, *peers])})
+        x = alarm_covariates(exchange, Eyes(scene).look(fleet), fleet, np.zeros(1, bool), scene.config)
+        return detector.parameters.alarm_rates(x)
+
+    np.testing.assert_allclose(expected(age_s), expected(0.4), rtol=1e-3)
+    assert expected(0.4).sum() < 100
+
+
+def test_a_fleet_of_twenty_has_no_more_false_alarms_than_plausible(detector: SurrogateDetector) -> None:
+    """A handful a drone, as of five."""
+    fleet = [capture(10.0 * (i % 5), 12.0 * (i // 5), drone=i) for i in range(20)]
+    boxes = detector.detect(shared(fleet, 0.1))
+    few = detector.detect(shared(fleet[:5], 0.1))
+    assert np.mean([len(b) for b in boxes]) < 1.6 * np.mean([len(b) for b in few])

@@ -16,9 +16,11 @@ from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
 from perception.scene import SceneModel
-from perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
+from perception.surrogate.exchange import ALARM_COVARIATES, ALARM_RANGES, FUSED_COVARIATES, Exchange, covariates, pair
 from perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
+from perception.surrogate.fit import BANDS as QUANTILES
 from perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
+from perception.surrogate.luck import BANDS
 from perception.surrogate.model import (
     BAND,
     FORMAT,
@@ -308,6 +310,11 @@ def test_rates_of_false_alarms_are_found_where_they_bend() -> None:
         np.testing.assert_allclose(found, rate[at].mean(axis=0), rtol=0.15)
 
 
+def test_as_many_bands_are_counted_as_a_moment_has_draws_for() -> None:
+    assert len(QUANTILES) == BANDS == NETS["alarms"][1]
+    assert len(ALARM_RANGES) == len(ALARM_COVARIATES)
+
+
 def test_scores_are_found_as_they_are_spread_above_the_floor_below_which_they_are_not_told() -> None:
     """Two heaps of scores, the lower one half hidden; what is found, and the scores' quantiles, come back."""
     n, floor = 30_000, -1.0
@@ -350,8 +357,7 @@ def test_residuals_are_those_of_drones_alone_or_fleets_and_of_square_cars_or_oth
     )
     x = np.zeros((KINDS, len(PLACE_COVARIATES)), np.float32)
     x[2:, PLACE_COVARIATES.index("senders")] = 1.5
-    x[2:, PLACE_COVARIATES.index("cells")] = np.log((40, 40, 2048, 2048, 60, 60)) / 8
-    x[2:, PLACE_COVARIATES.index("part")] = (0.01, 0.01, 0.5, 0.5, 1.0, 1.0)  # of a map, of one, and of a small region
+    x[2:, PLACE_COVARIATES.index("part")] = (0.01, 0.01, 0.5, 0.5, 1.0, 1.0)
     x[1::2, PLACE_COVARIATES.index("own_square")] = 0.9
     off, _ = planted.place(x, np.full(KINDS, 0.4, np.float32), thrown(KINDS))
     assert off[:, 0].tolist() == list(range(KINDS))
