@@ -11,12 +11,15 @@ from perception.surrogate.plan import Job, moment, scene_model
 from scenarios.schema import Perception
 
 
-def asked(parameters: Parameters, scenes: int, takes: Callable[[Job], bool] | None = None) -> list[Asked]:
-    """What a surrogate would have answered where the detector is asked, of a drone alone or of the jobs that it `takes`."""
+def asked(
+    parameters: Parameters, scenes: int, takes: Callable[[Job], bool] | None = None, draw: int = 5
+) -> list[Asked]:
+    """What a surrogate would have answered where the detector is asked, of a drone alone or of the jobs that it `takes`;
+    `draw` of its luck."""
     out = []
     for scene in range(scenes):
         jobs = [j for j in moment(0, "fit", scene, 0) if (takes(j) if takes else not j.shares)]
-        detector = SurrogateDetector.of(scene_model(0, "fit", scene), Perception(score_threshold=0.1), parameters, 5)
+        detector = SurrogateDetector.of(scene_model(0, "fit", scene), Perception(score_threshold=0.1), parameters, draw)
         boxes = list(detector.detect_many([[(j.ego, j.shares)] for j in jobs]))
         out.append(Asked("fit", scene, jobs, boxes, {}))
     return out

@@ -54,19 +54,21 @@ def test_two_budgets_are_no_plain_job() -> None:
 
 
 @pytest.mark.slow
-def test_residuals_that_are_too_short_or_too_long_get_their_length_again() -> None:
-    """Drones alone and with whole maps, whose boxes lie off by 1.2 times, and 0.9 times, what the fit says."""
+def test_residuals_that_are_too_short_or_too_long_get_their_length_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drones alone and with whole maps, whose boxes lie off by 1.2 times, and 0.9 times, what the fit says; by the same luck, so
+    that nothing else tells them apart."""
+    monkeypatch.setattr("perception.surrogate.levels.DRAWS", 1)
     parameters = load(SHIPPED)
     planted = np.ones(KINDS)
     planted[[0, 1]], planted[[6, 7]] = 1.2, 0.9
-    theirs = asked(longer(parameters, planted), 50, lambda j: group_of(j) in (0, 6))
+    theirs = asked(longer(parameters, planted), 50, lambda j: group_of(j) in (0, 6), draw=0)
     told: list[tuple[int, int]] = []
     found = level(parameters, theirs, 0, 0.1, lambda *at: told.append(at))
     factor = (found.residuals[..., :5] / np.where(parameters.residuals == 0, 1, parameters.residuals)[..., :5]).max(
         axis=(1, 2)
     )
-    assert factor[0] == pytest.approx(1.2, abs=0.05)
-    assert factor[6] == pytest.approx(0.9, abs=0.05)
+    assert factor[0] == pytest.approx(1.2, abs=0.03)
+    assert factor[6] == pytest.approx(0.9, abs=0.03)
     assert factor[[2, 3, 4, 5]].tolist() == [1.0] * 4, "nothing is known of them"
     np.testing.assert_array_equal(found.residuals[..., 5], parameters.residuals[..., 5])
     assert told[0][0] == 0
