@@ -25,7 +25,7 @@ OF_THE_LOOK = (
 )  # fmt: skip
 """What fusion takes over from the ego's own look."""
 FUSED_COVARIATES = (
-    "own", "first", "second", "mean", "many", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "cells", "part", "margin",
+    "own", "first", "second", "mean", "many", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "density", "part", "margin",
     *(f"own_{name}" for name in OF_THE_LOOK),
 )  # fmt: skip
 _OWN = [LOOK_COVARIATES.index(name) for name in OF_THE_LOOK]
@@ -35,14 +35,6 @@ ALARM_COVARIATES = (
     "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
     *_STYLES, "square", "aimed", "moving", "late", "gone",
 )  # fmt: skip
-
-ALARM_RANGES = (
-    (-1.7, 1.0), (-0.3, 0.1), (0.0, 2.15), (0.0, 1.0), (0.0, 1.0), (0.0, 2.0), (0.0, 1.0), (-3.0, 0.61), (-0.3, 0.3), (-0.3, 0.3),
-    (0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (0.0, 5.0), (0.0, 2.0), (0.0, 10.0),
-)  # fmt: skip
-"""What calibrations draw (`plan`), four peers at the most."""
-OLDEST_S = 0.4
-"""No share is older there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +252,7 @@ def alarm_covariates(
     """What the number of false alarms depends on, [m, 18] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
     light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was asked
     for, how many cars move, how old the maps are, and both multiplied: a moving car has a second box where an older map shows
-    it. Held to `ALARM_RANGES`: a network knows nothing of what lies beyond."""
+    it."""
     m = len(exchange.ego)
     cars = np.diff(looks.first)[exchange.ego]
     shares = (exchange.sender >= 0).sum(axis=1)
@@ -271,16 +263,15 @@ def alarm_covariates(
     shade = (1.0 - scene.overcast) / np.tan(np.radians(scene.sun_elevation_deg))
     some, there = np.maximum(shares, 1), exchange.sender >= 0
     aimed = np.where(shares > 0, np.where(there, exchange.allowed, 0.0).sum(axis=1) / (some * CELLS**2), 1.0)
-    ages_s = np.minimum(fleet.t_s[exchange.ego, None] - fleet.t_s[exchange.sender], OLDEST_S)
-    age_s = np.where(there, ages_s, 0.0).sum(axis=1) / some
+    age_s = np.where(there, fleet.t_s[exchange.ego, None] - fleet.t_s[exchange.sender], 0.0).sum(axis=1) / some
     moves = np.concatenate([np.zeros(1), np.cumsum(looks.covariates[:, _MOVING], dtype=np.float64)])
-    moving = np.minimum(np.diff(moves[looks.first])[exchange.ego] / 10.0, 5.0)
+    moving = np.diff(moves[looks.first])[exchange.ego] / 10.0
     columns = (
         np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
         scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in _STYLES),
         square(fleet.yaw_rad[exchange.ego]), aimed, moving, age_s / 0.2, moving * age_s / 0.2,
     )  # fmt: skip
-    return np.clip(beside(m, columns), *np.array(ALARM_RANGES, np.float32).T)
+    return beside(m, columns)
 
 
 def cell_of(xy_m: Floats) -> tuple[Ints, Ints]:

@@ -21,6 +21,7 @@ from perception.surrogate.model import (
     BAND,
     KINDS,
     NETS,
+    RATES,
     SPREAD,
     SQUARE,
     Net,
@@ -48,8 +49,6 @@ GROUPS, FACTORS = 4, (0.7, 1.4)
 NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
 BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.95, 0.98, 0.995])
 """Quantiles of the alarms' scores between which they are counted."""
-RATES = (-12.0, 8.0)
-"""Bounds of log rates."""
 
 
 def fit(
@@ -110,9 +109,10 @@ def fit(
     ask = np.isfinite(rows.job).all(axis=1)
     start = np.log(counts[ask].mean(axis=0) + 1e-3).tolist()
     nets["alarms"], _ = _train("alarms", rows.job[ask], {"count": counts[ask]}, _count_loss, seed, start=start)
-    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, alarms, NO_MIRAGES, boxes)
-    a, r, e, p, m, n = (np.asarray(v, np.float32) for v in singles)
-    return Parameters(nets, a, r, e, p, m, n, card={})
+    ends = np.stack([rows.job[ask].min(axis=0), rows.job[ask].max(axis=0)])
+    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, ends, alarms, NO_MIRAGES, boxes)
+    a, r, e, x, p, m, n = (np.asarray(v, np.float32) for v in singles)
+    return Parameters(nets, a, r, e, x, p, m, n, card={})
 
 
 def _bands(residuals: Array, unsure: Array, fits: Array) -> Array:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from perception.ap import Matched, average_precision, match
 from perception.surrogate.collect import Asked
 from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.features import Eyes, square
+from perception.surrogate.features import square
 from perception.surrogate.model import FEW, KINDS, SQUARE, WHOLE, Parameters
-from perception.surrogate.plan import Job, scene_model
+from perception.surrogate.plan import Job
+from perception.surrogate.together import towns_of
 from perception.types import Boxes
 from scenarios.schema import Perception
 
@@ -38,8 +39,7 @@ def level(
     parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
     """The parameters with residuals so long that every group's AP is the detector's; as they are where a group has no runs."""
-    scenes = {k: scene_model(seed, "fit", k) for k in dict.fromkeys(a.scene for a in asked)}
-    towns = {k: (scene, Eyes(scene)) for k, scene in scenes.items()}  # a part of a second each, and asked for often
+    towns = towns_of(asked, seed)
     config = Perception(score_threshold=threshold)
 
     def detector(of: Parameters, k: int, draw: int) -> SurrogateDetector:

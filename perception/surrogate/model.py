@@ -47,6 +47,8 @@ SHIPPED = Path(__file__).parent / "weights" / "surrogate.safetensors"
 
 SPREAD = (-3.5, 2.0)
 """Bounds of log deviations."""
+RATES = (-12.0, 8.0)
+"""Bounds of log rates of false alarms."""
 BAND = 64
 """Residuals that were predicted as vaguely: a box's is one of these, and the best luck draws the one that lay best."""
 SQUARE = 0.5
@@ -108,7 +110,7 @@ class Parameters:
     and the part of those whose boxes lie off to the same side for all.
     `residuals` [8, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
     first in each, and how vague (`vague`) predictions are from which on a band stands for them; pools as `kind_of`. `alarm_edges` [b + 1]: scores
-    between which alarms are counted; `alarm_pool` [2, b, p, 6] where and how large they
+    between which alarms are counted; `alarm_range` [2, covariates]: the least and the most that their network was fitted to; `alarm_pool` [2, b, p, 6] where and how large they
     were (`ALARM_COLUMNS`, ego's frame), of drones turned anyhow and of square ones; `mirages` [4]: the part of the alarms that are of things which others may take for cars
     as well, the chance that a drone does, and how far it puts them off, as deviations (m, rad); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
     above each, and how many boxes of nothing there are.
@@ -118,6 +120,7 @@ class Parameters:
     alike: Singles
     residuals: Singles
     alarm_edges: Singles
+    alarm_range: Singles
     alarm_pool: Singles
     mirages: Singles
     boxes: Singles
@@ -169,7 +172,10 @@ class Parameters:
 
     def alarm_rates(self, covariates: Singles) -> Singles:
         """Expected alarms of each job in each band of scores, [m, b]."""
-        return np.asarray(np.exp(self.nets["alarms"](covariates)))
+        x = np.clip(covariates, *self.alarm_range)  # the network knows nothing of what lies beyond
+        late, moving, gone = (ALARM_COVARIATES.index(name) for name in ("late", "moving", "gone"))
+        x[:, gone] = x[:, late] * x[:, moving]
+        return np.asarray(np.exp(np.clip(self.nets["alarms"](x), *RATES)))
 
 
 def _of_two(out: Singles, luck: Singles) -> Singles:
@@ -214,7 +220,7 @@ def save(path: Path, parameters: Parameters) -> None:
     """Write them as safetensors with the card in the metadata, under a temporary name first."""
     tensors: dict[str, Singles] = {
         name: getattr(parameters, name)
-        for name in ("alike", "residuals", "alarm_edges", "alarm_pool", "mirages", "boxes")
+        for name in ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "mirages", "boxes")
     }
     for name, net in parameters.nets.items():
         for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
@@ -275,6 +281,7 @@ def load(path: Path) -> Parameters:
         take("alike", 4),
         take("residuals", KINDS, None, 6),
         take("alarm_edges", BANDS + 1),
+        take("alarm_range", 2, len(ALARM_COVARIATES)),
         take("alarm_pool", 2, BANDS, None, len(ALARM_COLUMNS)),
         take("mirages", 4),
         take("boxes", 3, None),

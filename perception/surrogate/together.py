@@ -37,6 +37,12 @@ MOST = 0.95
 REPEATS = 2
 
 
+def towns_of(asked: Sequence[Asked], seed: int) -> dict[int, tuple[SceneModel, Eyes]]:
+    """The fitted scenes by their index, with who looks at them: a part of a second each, and asked for often."""
+    scenes = {k: scene_model(seed, "fit", k) for k in dict.fromkeys(a.scene for a in asked)}
+    return {k: (scene, Eyes(scene)) for k, scene in scenes.items()}
+
+
 def hang_together(
     parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
@@ -46,8 +52,7 @@ def hang_together(
     Averaged ones tell how far errors of place do: of a part of 0 … 0.5 of the cars they have one sign for all. Each changes the other's gain a
     little, so the factor is looked for again.
     """
-    scenes = {k: scene_model(seed, "fit", k) for k in dict.fromkeys(a.scene for a in asked)}
-    towns = {k: (scene, Eyes(scene)) for k, scene in scenes.items()}  # a part of a second each, and asked for often
+    towns = towns_of(asked, seed)
     wanted = {rule: _gain(parameters, asked, towns, threshold, rule, own=True) for rule in ("nms", "average")}
     steps = 2 * len(FACTORS) + len(PARTS)
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
 from perception.scene import SceneModel
-from perception.surrogate.exchange import ALARM_COVARIATES, ALARM_RANGES, FUSED_COVARIATES, Exchange, covariates, pair
+from perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
 from perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
 from perception.surrogate.fit import BANDS as QUANTILES
 from perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
@@ -100,7 +100,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, parameters: Parameters) -> None
     save(tmp_path / "again.safetensors", parameters)
     again = load(tmp_path / "again.safetensors")
     assert again.card == parameters.card
-    for name in ("alike", "residuals", "alarm_edges", "alarm_pool", "mirages", "boxes"):
+    for name in ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "mirages", "boxes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(parameters, name))
     x = RNG.normal(size=(7, len(LOOK_COVARIATES))).astype(np.float32)
     np.testing.assert_array_equal(again.nets["look"](x), parameters.nets["look"](x))
@@ -310,9 +310,16 @@ def test_rates_of_false_alarms_are_found_where_they_bend() -> None:
         np.testing.assert_allclose(found, rate[at].mean(axis=0), rtol=0.15)
 
 
+def test_false_alarms_beyond_what_was_fitted_are_those_at_its_edge(parameters: Parameters) -> None:
+    """Lower suns, larger fleets and older maps than any that a calibration draws."""
+    ends = parameters.alarm_range
+    beyond = ends + np.array([[-10.0], [10.0]], np.float32)
+    np.testing.assert_array_equal(parameters.alarm_rates(beyond), parameters.alarm_rates(ends))
+    assert parameters.alarm_rates(ends).sum(axis=1).max() < 300
+
+
 def test_as_many_bands_are_counted_as_a_moment_has_draws_for() -> None:
     assert len(QUANTILES) == BANDS == NETS["alarms"][1]
-    assert len(ALARM_RANGES) == len(ALARM_COVARIATES)
 
 
 def test_scores_are_found_as_they_are_spread_above_the_floor_below_which_they_are_not_told() -> None:
