@@ -28,9 +28,9 @@ from perception.errors import InputError
 from perception.fusion.base import takes_part
 from perception.fusion.registry import FUSIONS
 from perception.geometry import CELLS, FULL, in_square
+from perception.inference import folded
 from perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
 from perception.memory import keep_freed
-from perception.model import folded
 from perception.render import VIEWS_SHAPE, Renderer
 from perception.scene import SceneModel
 from perception.town import Bytes

@@ -6,13 +6,11 @@ where they leave the encoder, shared or not, as that is what the radio carries.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from perception.bev import ground_points
 from perception.fusion.registry import FUSIONS
@@ -45,37 +43,58 @@ def conv(c_in: int, c_out: int, kernel: int = 3, stride: int = 1, dilation: int 
     )
 
 
+class Residual(nn.Sequential):
+    """What its layers make of a map, added to the map."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = x + super().forward(x)  # type: ignore[no-untyped-call]
+        return out
+
+
 def _up(c_in: int, c_out: int) -> nn.Sequential:
     return nn.Sequential(
         nn.ConvTranspose2d(c_in, c_out, 2, 2, bias=False), nn.BatchNorm2d(c_out), nn.ReLU(inplace=True)
     )
 
 
+class Stem(nn.Sequential):
+    """Bird's-eye image uint8 [n, 4, 256, 256] → [n, 24, 128, 128]: its first layer sees colours, what was seen, and where."""
+
+    place: Tensor
+    """[1, 3, 256, 256]: x forward, y left and range of each pixel, in half extents."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__(*conv(7, 24, 5, 2))
+        ground = ground_points(config.geometry).permute(2, 0, 1) / config.half_extent_m
+        self.register_buffer("place", torch.cat([ground, ground.norm(dim=0, keepdim=True)])[None], persistent=False)
+
+    def forward(self, image: Tensor) -> Tensor:
+        where = self.place.expand(len(image), -1, -1, -1)
+        out: Tensor = super().forward(torch.cat([colours(image), where], dim=1))  # type: ignore[no-untyped-call]
+        return out
+
+
+def colours(image: Tensor) -> Tensor:
+    """uint8 [n, 4, h, w] as float32: R, G and B about 0, 0 where nothing was seen, and 1 where something was."""
+    seen = image[:, 3:].float() / 255.0
+    return torch.cat([(image[:, :3].float() / 255.0 - 0.42) * 4.0 * seen, seen], dim=1)
+
+
 class Encoder(nn.Module):
     """Bird's-eye image uint8 [n, 4, 256, 256] → features [n, 80, 64, 64], float32 that is exact in float16."""
 
-    place: Tensor
-
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        ground = ground_points(config.geometry).permute(2, 0, 1) / config.half_extent_m
-        self.register_buffer("place", torch.cat([ground, ground.norm(dim=0, keepdim=True)])[None], persistent=False)
-        self.stem = conv(7, 24, 5, 2)
+        self.stem = Stem(config)
         self.down = nn.Sequential(conv(24, 40), conv(40, CHANNELS, 3, 2))
-        last = conv(CHANNELS, CHANNELS)
-        if config.exchange == "signed":
-            last = nn.Sequential(last[0], last[1])  # without its ReLU what is added may be negative, and so may the sum
-        self.body = nn.ModuleList([conv(CHANNELS, CHANNELS, dilation=2), last])
+        # signed: without its ReLU what is added may be negative, and so may the sum
+        last = list(conv(CHANNELS, CHANNELS))[: 2 if config.exchange == "signed" else 3]
+        self.body = nn.Sequential(Residual(*conv(CHANNELS, CHANNELS, dilation=2)), Residual(*last))
 
     def forward(self, image: Tensor) -> Tensor:
-        seen = image[:, 3:].float() / 255.0
-        rgb = (image[:, :3].float() / 255.0 - 0.42) * 4.0 * seen
-        x = torch.cat([rgb, seen, self.place.expand(len(image), -1, -1, -1)], dim=1)
-        x = self.down(self.stem(x))
-        for layer in self.body:
-            x = x + layer(x)
-        rounded: Tensor = x + (x.half().float() - x).detach()  # straight through backward
-        return rounded
+        x = self.body(self.down(self.stem(image)))
+        rounded: Tensor = x + (x.half().float() - x).detach() if torch.is_grad_enabled() else x.half().float()
+        return rounded  # straight through backward
 
 
 class Head(nn.Module):
@@ -85,15 +104,14 @@ class Head(nn.Module):
         super().__init__()
         self.trunk = DeepTrunk() if config.decoder == "deep" else ShallowTrunk()
         self.up = _up(CHANNELS, 40)
-        self.fine = conv(40, 40)
+        self.fine = Residual(*conv(40, 40))
         self.out = nn.Conv2d(40, 7, 1)
         with torch.no_grad():
             self.out.bias.zero_()  # type: ignore[union-attr]
             self.out.bias[0] = -4.0  # type: ignore[index]
 
     def forward(self, fused: Tensor) -> Tensor:
-        x = self.up(self.trunk(fused))
-        out: Tensor = self.out(x + self.fine(x))
+        out: Tensor = self.out(self.fine(self.up(self.trunk(fused))))
         return out
 
 
@@ -102,10 +120,10 @@ class ShallowTrunk(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.join = conv(CHANNELS, CHANNELS)
+        self.join = Residual(*conv(CHANNELS, CHANNELS))
 
     def forward(self, fused: Tensor) -> Tensor:
-        return fused + self.join(fused)  # type: ignore[no-any-return]
+        return self.join(fused)  # type: ignore[no-any-return]
 
 
 class DeepTrunk(nn.Module):
@@ -144,15 +162,3 @@ class CarNet(nn.Module):
         self.fusion = FUSIONS[config.fusion]()
         self.head = Head(config)
         nn.Module.to(self, memory_format=torch.channels_last)  # type: ignore[call-overload]  # a third faster on a CPU
-
-
-def folded(net: CarNet) -> CarNet:
-    """A copy for inference, its batch norms folded into the layers before them (a seventh faster, equal to rounding)."""
-    net = copy.deepcopy(net).eval()
-    for layer in list(net.modules()):
-        if isinstance(layer, nn.Sequential) and len(layer) > 1 and isinstance(layer[1], nn.BatchNorm2d):
-            before: Any = layer[0]
-            layer[0] = fuse_conv_bn_eval(before, layer[1], transpose=isinstance(before, nn.ConvTranspose2d))
-            layer[1] = nn.Identity()
-    net.fusion.fold()
-    return net

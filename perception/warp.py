@@ -36,13 +36,20 @@ def support(ego_pose: Tensor, peer_pose: Tensor, cell_m: float) -> Support:
     row, column = cd * x - sd * y + tx, sd * x + cd * y + ty
     half = CELLS - 0.5
     inside = (row >= -0.5) & (row <= half) & (column >= -0.5) & (column <= half)
-    cells, weights = [], []
-    for i in (row.floor(), row.floor() + 1):
-        for j in (column.floor(), column.floor() + 1):
-            there = (i >= 0) & (i < CELLS) & (j >= 0) & (j < CELLS)
-            cells.append((i.clamp(0, CELLS - 1) * CELLS + j.clamp(0, CELLS - 1)).long())
-            weights.append((1 - (row - i).abs()) * (1 - (column - j).abs()) * there)
+    down, across = _beside(row), _beside(column)
+    cells = [i * CELLS + j for i, _ in down for j, _ in across]
+    weights = [part * share for _, part in down for _, share in across]
     return Support(torch.stack(cells, dim=-1), torch.stack(weights, dim=-1), inside)
+
+
+def _beside(at: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """The two cells about each place on an axis, kept on the grid, and what each counts: 0 off the grid."""
+    low = at.floor()
+    out = []
+    for cell in (low, low + 1):
+        on = cell.clamp(0, CELLS - 1)
+        out.append((on.long(), (1 - (at - cell).abs()) * (cell == on)))
+    return out
 
 
 def arriving(under: Support, sent: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,8 @@ from perception.decode import decode
 from perception.detector import ground_truth
 from perception.fusion.base import takes_part
 from perception.harness.statistics import Difference, compare
-from perception.model import CarNet, folded
+from perception.inference import folded
+from perception.model import CarNet
 from perception.render import Renderer
 from perception.scene import SceneModel
 from perception.types import Boxes, Capture

@@ -21,8 +21,9 @@ from perception.harness.evaluate import evaluate
 from perception.harness.instrument import CarNetInstrument
 from perception.harness.selection import link_bytes
 from perception.harness.statistics import Difference, compare
+from perception.inference import folded
 from perception.joining import NMS_IOU, Pose, Rule, Told, joined, sendable
-from perception.model import CarNet, folded
+from perception.model import CarNet
 from perception.types import Boxes
 
 TAU = 0.1

@@ -17,7 +17,8 @@ from perception.fusion.base import PerCell
 from perception.geometry import CELLS, Geometry
 from perception.harness.condition import CellsBy
 from perception.harness.contract import Exchange, FleetFrames, Floats
-from perception.model import CarNet, folded
+from perception.inference import folded
+from perception.model import CarNet
 from perception.warp import Support, arriving, rows, support
 
 CPU = torch.device("cpu")

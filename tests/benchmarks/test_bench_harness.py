@@ -20,7 +20,8 @@ from perception.geometry import FULL
 from perception.harness import selection
 from perception.harness.evaluate import Settings, match_all
 from perception.harness.statistics import rank, resamples
-from perception.model import CarNet, folded
+from perception.inference import folded
+from perception.model import CarNet
 from perception.overlap import corners, iou_pairs
 from perception.types import Boxes
 from perception.warp import warp

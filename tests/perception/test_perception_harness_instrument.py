@@ -20,7 +20,8 @@ from perception.harness.condition import FULL_SHARING, SINGLE, Condition
 from perception.harness.contract import Exchange
 from perception.harness.evaluate import evaluate
 from perception.harness.instrument import CarNetInstrument, fingerprint
-from perception.model import CarNet, ModelConfig, folded
+from perception.inference import folded
+from perception.model import CarNet, ModelConfig
 from perception.warp import warp
 
 
