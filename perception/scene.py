@@ -28,6 +28,8 @@ class SceneModel:
         if not (bounds[0] <= bounds[2] and bounds[1] <= bounds[3]):
             raise ValueError(f"bounds are {bounds}, must be (x_min, y_min, x_max, y_max)")
         self.config = config
+        self.made_of = config, target, bounds
+        """Scenes that are made of the same are the same."""
         self.town = Town(config)
         self.rect = (bounds[0] - MARGIN_M, bounds[1] - MARGIN_M, bounds[2] + MARGIN_M, bounds[3] + MARGIN_M)
         self._parked_pose, self._parked_size, self._parked_colour = parked(self.town, self.rect)

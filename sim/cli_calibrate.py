@@ -36,6 +36,7 @@ def calibrate(
     made: Annotated[Path | None, typer.Option(help="Take this calibration and make none; with --fly.")] = None,
     policies: Annotated[str, typer.Option(help="Comma-separated: under which.")] = "silence,all-4,boxes",
     rate_hz: Annotated[float, typer.Option(help="How often those sorties are scored.", min=0.05, max=10)] = 0.5,
+    towns: Annotated[int, typer.Option(help="In how many towns each of them is flown.", min=1, max=1000)] = 1,
 ) -> None:
     """Fit the surrogate to the torch detector's own runs and judge it on held-out scenes; goes on where it was cut off."""
     from perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
@@ -56,8 +57,9 @@ def calibrate(
         _tell(verdict, out_file)
     if fly is not None:
         with user_errors(), stages() as progress:
-            flown = list(flights(fly, made or out_file, weights, rate_hz, chosen, progress))
-        for table in _in_flight(flown, f"AP in points, {fly} at {rate_hz:g} Hz"):
+            flown = list(flights(fly, made or out_file, weights, rate_hz, chosen, progress, towns))
+        in_towns = f", {towns} towns each" if towns > 1 else ""
+        for table in _in_flight(flown, f"AP in points, {fly} at {rate_hz:g} Hz{in_towns}"):
             out.print(table)
 
 

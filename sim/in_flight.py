@@ -5,23 +5,26 @@ A sortie is flown by the surrogate, and again with the same traffic and the torc
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from perception.ap import average_precision
+from perception.ap import Matched, average_precision
 from perception.detectors import Constructor, Detector
 from perception.scene import SceneModel
 from scenarios.contexts import Context, Contexts
 from scenarios.load import load, load_contexts
-from scenarios.schema import Perception
+from scenarios.schema import Perception, Scenario
 from sim.contexts import paired_interval, scenario_of
 from sim.outcome import both_matched
 from sim.sortie import run_sortie
 
 POLICIES = ("silence", "all-4", "boxes")
+TOWNS_APART = 1000
+"""Between the seeds of one context's towns: sets number their contexts' towns on from one another."""
 REGIONS = {"full_scene": "everywhere", "mission": "in the mission's disc"}
 
 
@@ -51,8 +54,14 @@ def flights(
     rate_hz: float,
     policies: Sequence[str] = POLICIES,
     progress: Callable[[str, int, int], None] | None = None,
+    towns: int = 1,
 ) -> Iterator[Level]:
     """Fly a scenario, or every context of a set with its first seed, under some policies.
+
+    Args:
+        towns: each is flown in so many: its own, and others of its kind, whose seeds, and the sortie's, count on from
+            its own. A context's AP is that of all their fusions together: a mission's disc holds a handful of cars, and
+            twenty discs say little.
 
     Raises:
         ScenarioError, PolicyError: what cannot be flown, before anything is.
@@ -60,33 +69,57 @@ def flights(
     contexts = load_contexts(name)
     if contexts is None:
         contexts = Contexts(base=name, seeds=(load(name).seed,), contexts=(Context(name="sortie", rho=1.0),))
-        planned = [(p, contexts.contexts[0], load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]
+        planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
     else:
-        planned = [(p, c, scenario_of(contexts, c, p)) for c in contexts.contexts for p in policies]
+        planned = [[(p, scenario_of(contexts, c, p)) for p in policies] for c in contexts.contexts]
     both = torch_answers(calibration, weights), _surrogate(calibration)
-    for k, (policy, context, scenario) in enumerate(planned):
-        if progress is not None:
-            progress(f"{name} by both detectors", k, len(planned))
-        perception = scenario.perception.model_copy(update={"detector": "surrogate", "sample_rate_hz": rate_hz})
-        scenario = scenario.model_copy(update={"perception": perception})
-        found = [both_matched(run_sortie(scenario, None, contexts.seeds[0], detector_of=make)) for make in both]
-        for region in REGIONS:
-            theirs, ours = (average_precision(list(f[region].values())) for f in found)
-            if not np.isnan(theirs):  # there is such a region, and there are cars in it
-                yield Level(policy, context.name, region, theirs, ours)
+    count, flown = len(planned) * len(policies) * towns, 0
+    for context, todo in zip(contexts.contexts, planned, strict=True):
+        matched: dict[tuple[str, str], tuple[list[Matched], list[Matched]]] = {}
+        for town, (policy, scenario) in itertools.product(range(towns), todo):
+            if progress is not None:
+                progress(f"{name} by both detectors", flown, count)
+            there = _in_town(scenario, town, rate_hz)
+            found = [both_matched(run_sortie(there, None, contexts.seeds[0] + town, detector_of=make)) for make in both]
+            flown += 1
+            for region in REGIONS:
+                theirs, ours = matched.setdefault((policy, region), ([], []))
+                theirs += found[0][region].values()
+                ours += found[1][region].values()
+        for (policy, region), (theirs, ours) in matched.items():
+            torch = average_precision(theirs)
+            if not np.isnan(torch):  # there is such a region, and there are cars in it
+                yield Level(policy, context.name, region, torch, average_precision(ours))
     if progress is not None:
-        progress(f"{name} by both detectors", len(planned), len(planned))
+        progress(f"{name} by both detectors", count, count)
+
+
+def _in_town(scenario: Scenario, town: int, rate_hz: float) -> Scenario:
+    """The scenario scored at a rate, in the town of its kind whose seed lies so far on."""
+    scene = scenario.perception.scene.model_copy(update={"seed": scenario.perception.scene.seed + TOWNS_APART * town})
+    perception = scenario.perception.model_copy(
+        update={"detector": "surrogate", "sample_rate_hz": rate_hz, "scene": scene}
+    )
+    return scenario.model_copy(update={"perception": perception})
 
 
 def torch_answers(calibration: Path | None = None, weights: Path | None = None) -> Constructor:
     """What makes a sortie's detector so that its traffic is the surrogate's and its boxes are the torch detector's, which is
-    asked at scored moments alone. None takes what is shipped."""
+    asked at scored moments alone. None takes what is shipped.
+
+    Sorties that are made one after the other in one scene, under several policies, share the torch detector, its scenery
+    and what it has encoded.
+    """
     from perception.detector import TorchDetector  # here: torch takes a second to import
 
     ours = _surrogate(calibration)
+    last: list[tuple[object, Detector]] = []
 
     def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-        return Asked(TorchDetector(scene, config, seed, weights), ours(scene, config, seed, replication))
+        asked = scene.made_of, config, seed
+        if not last or last[0][0] != asked:
+            last[:] = [(asked, TorchDetector(scene, config, seed, weights))]
+        return Asked(last[0][1], ours(scene, config, seed, replication))
 
     return make
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from sim_examples import BASE
 
+from perception.ap import average_precision
+from perception.scene import SceneModel
 from perception.surrogate.model import SHIPPED
 from scenarios.load import load, load_contexts
 from scenarios.schema import Scenario
-from sim.in_flight import Level, flights, means
-from sim.outcome import accuracy
+from sim.in_flight import Level, flights, means, torch_answers
+from sim.outcome import accuracy, both_matched
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
@@ -72,3 +75,46 @@ def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytes
     assert flown[2:4] == [("all-4", contexts.contexts[0].rho, contexts.seeds[0])] * 2
     assert {v.context for v in found} == {c.name for c in contexts.contexts}
     assert all(v.torch == v.surrogate for v in found)
+
+
+def test_a_context_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Both are the surrogate here; each town is another, and a context's AP is that of all their fusions."""
+    (path := tmp_path / "example.yaml").write_text(BASE)
+    flown: list[tuple[int, int, str]] = []
+    records: list[SortieRecord] = []
+
+    def fly(scenario: Scenario, policy: None, seed: int, *, detector_of: object) -> SortieRecord:
+        flown.append((scenario.perception.scene.seed, seed, scenario.policy.name))
+        records.append(run_sortie(scenario, policy, seed))
+        return records[-1]
+
+    monkeypatch.setattr("sim.in_flight.run_sortie", fly)
+    told: list[tuple[str, int, int]] = []
+    found = list(flights(str(path), SHIPPED, None, 0.5, ["silence", "all-4"], lambda *at: told.append(at), towns=3))
+    scenario = load(path)
+    town, seed = scenario.perception.scene.seed, scenario.seed
+    assert flown[::2] == [(town + 1000 * k, seed + k, p) for k in range(3) for p in ("silence", "all-4")]
+    assert told[0][1:] == (0, 6)
+    assert told[-1][1:] == (6, 6)
+    assert [k for _, k, _ in told] == list(range(7))
+    for v in found:
+        theirs = [m for r in records[::2] if r.policy == v.policy for m in both_matched(r)[v.region].values()]  # type: ignore[literal-required]
+        assert v.torch == v.surrogate == average_precision(theirs)
+    assert {v.policy for v in found} == {"silence", "all-4"}
+
+
+def test_sorties_in_one_scene_share_the_torch_detector(tmp_path: Path) -> None:
+    (path := tmp_path / "example.yaml").write_text(BASE)
+    scenario, bounds = load(path), (-50.0, -50.0, 50.0, 50.0)
+    make = torch_answers()
+
+    def asked(seed: int = 1, brightness: float = 1.0, east_m: float = 50.0) -> Any:
+        config = scenario.perception.scene.model_copy(update={"brightness": brightness})
+        scene = SceneModel(config, scenario.mission.target, (*bounds[:2], east_m, bounds[3]))
+        return make(scene, scenario.perception, seed, 0)
+
+    first = asked()
+    assert asked().detect.__self__ is first.detect.__self__
+    assert asked(seed=2).detect.__self__ is not first.detect.__self__
+    for other in (asked(brightness=0.5), asked(east_m=80.0), asked()):
+        assert other.detect.__self__ is not first.detect.__self__
