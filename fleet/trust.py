@@ -113,13 +113,14 @@ def judge(
     after = dict(standings)
     for peer, claim in known.items():
         standing = before[peer]
-        others = [rate for i, rate in fell_per_s.items() if i != peer]
-        others_fell = median(others) * standing.seconds if others else 0.0
-        doubt = peer != ego and (
-            (math.isfinite(form.blur_m) and coverage_doubt(claim, seen_per_metre, form.blur_m))
-            or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
-            or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell, form.soc_step)
-        )
+        doubt = ""
+        if peer != ego:
+            others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.seconds
+            doubt = (
+                (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
+                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
+                or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell, form.soc_step)
+            )
         strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
         least_soc = min(standing.least_soc, claim.battery_soc)
         after[peer] = Standing(strikes, doubt or standing.reason, standing.seconds, standing.first_soc, least_soc)

@@ -21,6 +21,7 @@ from perception.fusion.base import takes_part
 from perception.fusion.registry import FUSIONS
 from perception.scene import SceneModel
 from perception.types import Share
+from perception.winograd import WinogradReLU
 from scenarios.schema import Perception, Scene
 
 ROI = (10.0, 20.0, 32.0)
@@ -86,4 +87,28 @@ def test_one_ego_of_five_by_method(benchmark: Any, method: str, sent: float) -> 
     part = takes_part(arrived, torch.ones_like(arrived), torch.ones(1, 4), "masked")
     with torch.inference_mode():
         assert benchmark(fusion, agents, part, torch.ones(1, 5)).shape == (1, 80, 64, 64)
+    torch.set_num_threads(threads)
+
+
+LAYERS = {
+    "80 → 80 at 64": (80, 80, 64, 1),
+    "80 → 80 at 64, dilated": (80, 80, 64, 2),
+    "40 → 40 at 128": (40, 40, 128, 1),
+}
+
+
+@pytest.mark.parametrize("way", ["winograd", "plain"])
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_convolution_and_its_relu(benchmark: Any, layer: str, way: str) -> None:
+    """The layers that the detector spends its time in, both ways, in one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    c, o, side, dilation = LAYERS[layer]
+    benchmark.group = f"convolution, {layer}"
+    conv = torch.nn.Conv2d(c, o, 3, padding=dilation, dilation=dilation)
+    conv.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.randn(1, c, side, side).relu().contiguous(memory_format=torch.channels_last)
+    do = WinogradReLU(conv) if way == "winograd" else torch.nn.Sequential(conv, torch.nn.ReLU(inplace=True))
+    with torch.inference_mode():
+        assert benchmark(do, x).shape == (1, o, side, side)
     torch.set_num_threads(threads)
