@@ -410,7 +410,7 @@ class Perception(Section):
     )
     precision: Literal["float32", "bfloat16"] = Field(
         "float32",
-        description="What the torch detector's encoder and head reckon in; bfloat16 is twice as fast on processors that have it, far slower on others.",
+        description="What the torch detector's encoder and head reckon in; bfloat16 may be faster on processors with AMX, is as fast on those with AVX-512 BF16 alone, and far slower on others.",
     )
     sample_rate_hz: float = Field(
         2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
