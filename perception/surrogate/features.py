@@ -134,15 +134,19 @@ class Traffic:
             moving = np.flatnonzero(here[first:]) + first
             if not len(moving):
                 continue
-            around = np.concatenate([np.arange(first), moving])
-            x, y = (at[None, around, k] - at[moving, None, k] for k in (0, 1))
-            far = x * x + y * y
-            far[np.arange(len(moving)), first + np.arange(len(moving))] = np.inf
-            to[moving] = at[around[far.argmin(axis=1)]] - at[moving]
-            to[moving[far.min(axis=1) == np.inf]] = np.inf
-            passing, far = far[:, :first].argmin(axis=0), far[:, :first].min(axis=0)
-            closer = np.flatnonzero(far < to[:first, 0] ** 2 + to[:first, 1] ** 2)
-            to[closer] = at[moving[passing[closer]]] - at[closer]
+            around, rows = np.concatenate([np.arange(first), moving]), np.arange(len(moving))
+            (x, y), (to_x, to_y) = at[moving].T, at[around].T
+            far, aside = to_x - x[:, None], to_y - y[:, None]
+            far *= far
+            aside *= aside
+            far += aside
+            far[rows, first + rows] = np.inf
+            nearest = far.argmin(axis=1)
+            to[moving] = at[around[nearest]] - at[moving]
+            to[moving[far[rows, nearest] == np.inf]] = np.inf
+            passing = far[:, :first]
+            closer = np.flatnonzero(passing.min(axis=0) < to[:first, 0] ** 2 + to[:first, 1] ** 2)
+            to[closer] = at[moving[passing[:, closer].argmin(axis=0)]] - at[closer]
         out[out[..., 0] ** 2 + out[..., 1] ** 2 > NEXT_M**2] = np.inf
         return out
 
