@@ -144,6 +144,22 @@ def perfect(cars: np.ndarray) -> torch.Tensor:
     return out
 
 
+@pytest.mark.parametrize("threshold", [0.0, 0.05, 0.5])
+def test_peaks_are_the_maxima_of_their_neighbourhood(threshold: float) -> None:
+    """By its definition over the whole map: at the border, where neighbours tie, and in plateaus."""
+    out = torch.randn(7, 128, 128, generator=torch.Generator().manual_seed(4))
+    out[0, 0, 0] = out[0, 127, 127] = out[0, 0, 127] = out[0, 127, 64] = 6.0
+    out[0, 40:43, 40:43] = 5.0
+    heat = out[:1].sigmoid()
+    peak = (heat == torch.nn.functional.max_pool2d(heat[None], 3, 1, 1)[0]) & (heat >= threshold)
+    found = decode(out, threshold, limit=10_000)
+    assert len(found) == int(peak.sum()) > 20
+    assert torch.equal(found[:, 5], heat[peak].sort(descending=True).values)
+    row, column = peak[0].nonzero().T[:, heat[peak].argsort(descending=True, stable=True)]
+    assert torch.allclose(found[:, 0], (row + 0.5 + out[1][row, column]) * 1.6 - 102.4, atol=1e-4)
+    assert torch.allclose(found[:, 1], (column + 0.5 + out[2][row, column]) * 1.6 - 102.4, atol=1e-4)
+
+
 def test_decoding_inverts_the_targets() -> None:
     cars = np.array([(10.3, -20.1, 4.4, 1.8, 0.3), (-99.0, 60.0, 5.5, 2.0, 1.5), (50.0, 50.0, 4.0, 1.7, -0.8)])
     found = decode(perfect(cars), 0.5).numpy()

@@ -175,3 +175,14 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
         if before <= u <= before * (1 + band) * (1 - 1e-12):
             assert v == before
     assert read([u for u in values for _ in range(3)], band=band)[::3] == seen
+
+
+def test_an_answer_is_kept_for_who_asks_the_same_alone() -> None:
+    """Each receiver has its own history, and each sortie its own band; a drone's broadcast is one object for all."""
+    poor, fair, rich = (HEARD._replace(peer_goodput_mbps=(mbps, 0.0)) for mbps in (10.0, 20.0, 24.0))
+    other = rich._replace(agent_id=2)
+    asked = [(poor, rich, BAND), (fair, rich, BAND), (fair, rich, 0.1), (fair, other, 0.1), (poor, rich, BAND)]
+    read = [believed(*a).peer_goodput_mbps[0] for a in asked]
+    assert read == pytest.approx([24 / 1.25, 20.0, 24 / 1.1, 24 / 1.1, 24 / 1.25])
+    assert believed(poor, rich, BAND) is believed(poor, rich, BAND)
+    assert believed(poor, other, BAND).agent_id == 2
