@@ -19,7 +19,7 @@ def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int 
     """
     heat = out[0].sigmoid()
     hot = (heat >= threshold).flatten().nonzero().squeeze(1)
-    # the neighbours of those alone: a maximum over the whole map takes ten times as long
+    # the neighbours of those alone: a maximum over the whole map takes twice as long as all the rest
     padded, wide = F.pad(heat, (1, 1, 1, 1), value=-1.0).flatten(), HEAD_PX + 2
     around = torch.tensor([i * wide + j for i in range(3) for j in range(3)], device=out.device)
     corner = hot // HEAD_PX * wide + hot % HEAD_PX

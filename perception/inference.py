@@ -1,7 +1,7 @@
 """The network as it is flown: the same answers to rounding, in less than half the time on a CPU.
 
-Batch norms go into the layers before them, 3 × 3 convolutions are done by Winograd's filtering (`winograd.py`), what the
-first layer makes of where a pixel lies is worked out once, and the last layer's weights are packed ahead.
+Batch norms go into the layers before them, 3 × 3 convolutions are done by Winograd's filtering (`winograd.py`), and what
+the first layer makes of where a pixel lies is worked out once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from perception.compiled import compiled
-from perception.model import CarNet, Residual, Stem, colours
+from perception.model import COLOUR_GAIN, COLOUR_MEAN, CarNet, Residual, Stem, colours
 from perception.winograd import WinogradReLU, suits
 
 
@@ -68,20 +68,20 @@ def _coloured(image: Tensor) -> Tensor:
         return colours(image)
     n, channels, rows, columns = image.shape
     out = torch.empty(n, rows, columns, channels)
-    _colour(image.numpy(), out.numpy())
+    _colour(image.numpy(), np.float32(COLOUR_MEAN), np.float32(COLOUR_GAIN), out.numpy())
     return out.permute(0, 3, 1, 2)
 
 
-_FULL, _MEAN, _GAIN = np.float32(255.0), np.float32(0.42), np.float32(4.0)
+_FULL = np.float32(255.0)
 
 
 @compiled
-def _colour(image: Any, out: Any) -> None:
+def _colour(image: Any, mean: Any, gain: Any, out: Any) -> None:
     """uint8 [n, 4, h, w] into float32 [n, h, w, 4], rounded as `model.colours` rounds."""
     for i in range(image.shape[0]):
         for y in range(image.shape[2]):
             for x in range(image.shape[3]):
                 seen = np.float32(image[i, 3, y, x]) / _FULL
                 for k in range(3):
-                    out[i, y, x, k] = (np.float32(image[i, k, y, x]) / _FULL - _MEAN) * _GAIN * seen
+                    out[i, y, x, k] = (np.float32(image[i, k, y, x]) / _FULL - mean) * gain * seen
                 out[i, y, x, 3] = seen

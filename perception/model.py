@@ -16,6 +16,9 @@ from perception.bev import ground_points
 from perception.fusion.registry import FUSIONS
 from perception.geometry import CHANNELS, Geometry
 
+COLOUR_MEAN, COLOUR_GAIN = 0.42, 4.0
+"""What brings colours, 0 … 1, about 0 and to a spread of about 1; the weights were learned so."""
+
 
 @dataclass(frozen=True, slots=True)
 class ModelConfig:
@@ -77,7 +80,7 @@ class Stem(nn.Sequential):
 def colours(image: Tensor) -> Tensor:
     """uint8 [n, 4, h, w] as float32: R, G and B about 0, 0 where nothing was seen, and 1 where something was."""
     seen = image[:, 3:].float() / 255.0
-    return torch.cat([(image[:, :3].float() / 255.0 - 0.42) * 4.0 * seen, seen], dim=1)
+    return torch.cat([(image[:, :3].float() / 255.0 - COLOUR_MEAN) * COLOUR_GAIN * seen, seen], dim=1)
 
 
 class Encoder(nn.Module):

@@ -32,13 +32,12 @@ _ZERO, _TWO, _FOUR, _FIVE, _EIGHT = (np.float32(v) for v in (0.0, 2.0, 4.0, 5.0,
 
 
 def suits(conv: nn.Module) -> bool:
-    """Whether a layer is a convolution that can be done so: 3 × 3, stride 1, as much padding as dilation, zeros, one group."""
+    """Whether a layer is a convolution that can be done so: 3 × 3, stride 1, as much padding as dilation both ways, zeros, one group."""
     return (
         isinstance(conv, nn.Conv2d)
         and conv.kernel_size == (3, 3)
         and conv.stride == (1, 1)
-        and conv.padding == conv.dilation
-        and conv.dilation in ((1, 1), (2, 2))
+        and conv.padding == conv.dilation == conv.dilation[::-1]
         and conv.padding_mode == "zeros"
         and conv.groups == 1
         and conv.bias is not None

@@ -142,11 +142,10 @@ class Directive(NamedTuple):
     """Why, in words; for the record, not on the wire, no part of equality."""
 
     def __eq__(self, other: object) -> bool:
-        # of one reason as a rule: then no parts are taken
-        return isinstance(other, Directive) and (tuple.__eq__(self, other) or self[:-1] == other[:-1])
+        return isinstance(other, Directive) and self[:-1] == other[:-1]
 
     def __ne__(self, other: object) -> bool:
-        return not (isinstance(other, Directive) and (tuple.__eq__(self, other) or self[:-1] == other[:-1]))
+        return not (isinstance(other, Directive) and self[:-1] == other[:-1])
 
     def __hash__(self) -> int:
         return hash(self[:-1])

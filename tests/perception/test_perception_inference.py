@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from perception import winograd
-from perception.inference import folded
-from perception.model import CarNet, ModelConfig
+from perception.inference import _coloured, folded
+from perception.model import CarNet, ModelConfig, colours
 from perception.winograd import WinogradReLU, suits
 
 
@@ -35,7 +35,7 @@ def exact(conv: nn.Conv2d, x: Tensor) -> Tensor:
     c=st.sampled_from([1, 3, 8, 24, 40]),
     o=st.sampled_from([1, 5, 16, 40]),
     tiles=st.tuples(st.integers(1, 6), st.integers(1, 6)),
-    dilation=st.sampled_from([1, 2]),
+    dilation=st.sampled_from([1, 2, 3]),
     seed=st.integers(0, 2**16),
 )
 def test_winograd_is_the_convolution(n: int, c: int, o: int, tiles: tuple[int, int], dilation: int, seed: int) -> None:
@@ -114,7 +114,9 @@ def test_threads_say_the_same() -> None:
     [
         (nn.Conv2d(8, 8, 3, padding=1), True),
         (nn.Conv2d(8, 8, 3, padding=2, dilation=2), True),
-        (nn.Conv2d(8, 8, 3, padding=3, dilation=3), False),
+        (nn.Conv2d(8, 8, 3, padding=3, dilation=3), True),
+        (nn.Conv2d(8, 8, 3, padding=(1, 2), dilation=(1, 2)), False),
+        (nn.Conv2d(8, 8, 3, padding=1, dilation=2), False),
         (nn.Conv2d(8, 8, 3, padding=0), False),
         (nn.Conv2d(8, 8, 3, stride=2, padding=1), False),
         (nn.Conv2d(8, 8, 5, padding=2), False),
@@ -176,3 +178,8 @@ def test_half_digits_are_reckoned_too() -> None:
             half = quick.encoder(image)
     assert half.dtype == torch.float32
     assert float((whole - half).abs().mean()) < 0.05 * float(whole.abs().mean())
+
+
+def test_colours_are_the_same_to_the_bit_where_a_compiled_loop_reckons_them() -> None:
+    image = torch.randint(0, 256, (2, 4, 64, 48), dtype=torch.uint8)
+    assert torch.equal(_coloured(image), colours(image))

@@ -156,8 +156,10 @@ def test_peaks_are_the_maxima_of_their_neighbourhood(threshold: float) -> None:
     assert len(found) == int(peak.sum()) > 20
     assert torch.equal(found[:, 5], heat[peak].sort(descending=True).values)
     row, column = peak[0].nonzero().T[:, heat[peak].argsort(descending=True, stable=True)]
-    assert torch.allclose(found[:, 0], (row + 0.5 + out[1][row, column]) * 1.6 - 102.4, atol=1e-4)
-    assert torch.allclose(found[:, 1], (column + 0.5 + out[2][row, column]) * 1.6 - 102.4, atol=1e-4)
+    assert torch.allclose(found[:, 0], (row + 0.5 + out[1][row, column]) * FULL.head_m - FULL.half_extent_m, atol=1e-4)
+    assert torch.allclose(
+        found[:, 1], (column + 0.5 + out[2][row, column]) * FULL.head_m - FULL.half_extent_m, atol=1e-4
+    )
 
 
 def test_decoding_inverts_the_targets() -> None:
