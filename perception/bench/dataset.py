@@ -28,7 +28,7 @@ from perception.scene import SceneModel
 
 FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
-SIZES: dict[Split, tuple[int, int]] = {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (80, 1)}
+SIZES: dict[Split, tuple[int, int]] = {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (240, 1)}
 """Scenes and frames a scene. The test split has a scene for every frame, as UAV3D's mini-validation."""
 
 

@@ -196,5 +196,5 @@ def test_nothing_to_load_is_refused() -> None:
 
 
 def test_the_splits_have_their_sizes() -> None:
-    assert SIZES == {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (80, 1)}
+    assert SIZES == {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (240, 1)}
     assert [b.key() for b in (Benchmark(), Benchmark(3))] == ["76567db317f0", BENCH.key()]  # published weights name it
