@@ -130,10 +130,10 @@ def put_into(text: str, section: str, begin: str = BEGIN, end: str = END) -> str
 
 
 _RULE = """\
-**How verdicts are reached** (fixed before anything was measured; `perception/harness/verdict.py`). A difference is
+**How verdicts are reached** (`perception/harness/verdict.py`, which tells what was fixed when). A difference is
 significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
-or in neither; *opposite*: significant in both, with other signs; *not reproduced*: significant in one alone. The size
-is told apart: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
+or in neither, or not in the paper and here wholly within half a point of zero; *opposite*: significant in both, with
+other signs; *not reproduced*: significant in one alone. The size is told apart: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
 That *most* of the gain is kept asks for an interval above one half. Absolute APs are not comparable between benchmarks, as the paper says itself. Counted bytes have to round to the
 paper's print; times and rates have to lie within half an order of magnitude, or beyond it on the side that makes the
 claim stronger. Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of

@@ -54,6 +54,22 @@ def test_a_difference_is_judged_by_sign_and_significance(
     assert verdict.contrast(paper, ours) == expected
 
 
+@pytest.mark.parametrize(
+    ("ours", "expected"),
+    [
+        (m(0.25, 0.12, 0.38), R),  # significant, and of no weight
+        (m(-0.25, -0.49, -0.01), R),
+        (m(0.4, 0.3, 0.5), N),  # may be half a point
+        (m(-0.35, -0.6, -0.1), N),
+        (m(2.0, 1.8, 2.2), N),
+    ],
+)
+def test_where_the_paper_finds_none_a_difference_within_half_a_point_is_none(ours: Measured, expected: Verdict) -> None:
+    for paper in (NOTHING, Paper(significant=False)):
+        assert verdict.contrast(paper, ours).verdict == expected
+    assert verdict.contrast(UP, ours).verdict == (R if ours.value > 0 else O)
+
+
 @given(st.floats(-30, 30), st.floats(0.001, 10), st.floats(-30, 30), st.floats(0.001, 10))
 def test_signs_turned_on_both_sides_turn_nothing(a: float, wide_a: float, b: float, wide_b: float) -> None:
     def both(sign: int) -> Judgement:
