@@ -188,7 +188,7 @@ class Pilot:
         except Exception as error:
             what = f"raises {type(error).__name__}: {error}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
-        if not isinstance(answer, Sequence):
+        if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
             what = f"returns {type(answer).__name__}, must be a sequence of directives"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
         return answer

@@ -58,6 +58,9 @@ class Scorer:
         recorder: Recorder,
     ) -> None:
         self._env, self._scenario, self._detector = env, scenario, detector
+        # asked once: what a protocol asks of a class takes longer to find out than a fusion takes
+        self._many = detector if isinstance(detector, DetectsMany) else None
+        self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._agents, self._recorder = agents, recorder
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
@@ -85,10 +88,10 @@ class Scorer:
             if a.latest is not None
         ]
         self._waiting.append((now_s, jobs))
-        if isinstance(self._detector, DetectsAhead):
-            self._begun.append(self._detector.begin(jobs))
+        if self._ahead is not None:
+            self._begun.append(self._ahead.begin(jobs))
             self.flush(but=1)
-        elif not isinstance(self._detector, DetectsMany):
+        elif self._many is None:
             self.flush()
 
     def flush(self, but: int = 0) -> None:
@@ -102,9 +105,9 @@ class Scorer:
         rows, detector = self._recorder.rows, self._detector
         found: Iterable[Boxes]
         truths: Iterable[Boxes]
-        if isinstance(detector, DetectsMany):
-            found = detector.detect_many([jobs for _, jobs in waiting])
-            truths = detector.truth_many([t_s for t_s, _, _ in asked], [ego for _, ego, _ in asked])
+        if self._many is not None:
+            found = self._many.detect_many([jobs for _, jobs in waiting])
+            truths = self._many.truth_many([t_s for t_s, _, _ in asked], [ego for _, ego, _ in asked])
         else:
             ready = begun or [partial(detector.detect, jobs) for _, jobs in waiting]
             found = (boxes for wait in ready for boxes in wait())

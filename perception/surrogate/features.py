@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from perception.geometry import FULL
 from perception.scene import SceneModel
-from perception.surrogate.sight import HeightField, Kerbs
+from perception.surrogate.sight import HeightField, Kerbs, next_of
 from perception.town import Floats
 from perception.traffic import TARGET_COLOUR, TARGET_SIZE_M
 from perception.types import Capture
@@ -102,7 +101,7 @@ class Traffic:
         self.tone: Floats = np.einsum("nc,c->n", colour, _TONE)
         self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
         self.parked_xy: Floats = np.stack([parked.x_m, parked.y_m], 1)
-        self._next_parked = _next_of(self.parked_xy)
+        self._next_parked = next_of(self.parked_xy)
         self._yaw = np.concatenate([parked.yaw_rad, lanes.yaw_rad, np.zeros(extra)])
 
     def at(self, t_s: Floats, parked: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -149,13 +148,6 @@ class Traffic:
             to[closer] = at[moving[passing[:, closer].argmin(axis=0)]] - at[closer]
         out[out[..., 0] ** 2 + out[..., 1] ** 2 > NEXT_M**2] = np.inf
         return out
-
-
-def _next_of(xy: Floats) -> Floats:
-    """From every point to the one next to it [n, 2]; inf where there is none."""
-    if len(xy) < 2:
-        return np.full(xy.shape, np.inf)
-    return np.asarray(xy[cKDTree(xy).query(xy, k=2)[1][:, 1]] - xy)
 
 
 class Eyes:

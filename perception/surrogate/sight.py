@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from perception.scene import SceneModel
 from perception.town import Floats, shadow_m
@@ -73,28 +74,33 @@ class Kerbs:
         x0, y0, x1, y1 = scene.rect
         self.x0_m, self.y0_m = x0, y0
         self.columns, self.rows = int((x1 - x0) / RES_M) + 2, int((y1 - y0) / RES_M) + 2
-        cars = scene.parked_cars
-        near = np.zeros((self.rows, self.columns), np.float32)
+        cars = scene.parked_cars  # all inside
         reach = int(NEAR_M / RES_M)
         span = np.arange(-reach, reach + 1)
-        dy, dx = (d.ravel() for d in np.meshgrid(span, span, indexing="ij"))
-        column, row = (
-            ((cars.x_m - x0) / RES_M).astype(int)[:, None] + dx,
-            ((cars.y_m - y0) / RES_M).astype(int)[:, None] + dy,
-        )
-        value = np.broadcast_to(np.maximum(0.0, 1.0 - RES_M * np.hypot(dx, dy) / NEAR_M).astype(np.float32), row.shape)
-        inside = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
-        np.maximum.at(near, (row[inside], column[inside]), value[inside])
-        self._flat = near.ravel()
-        gap = np.hypot(cars.x_m[:, None] - cars.x_m, cars.y_m[:, None] - cars.y_m)
-        np.fill_diagonal(gap, NEAR_M)
-        self.parked = np.maximum(0.0, 1.0 - gap.min(axis=1, initial=NEAR_M) / NEAR_M).astype(np.float32)
+        about = np.maximum(0.0, 1.0 - RES_M * np.hypot(span[:, None], span) / NEAR_M).astype(np.float32)
+        near = np.zeros(
+            (self.rows + 2 * reach, self.columns + 2 * reach), np.float32
+        )  # with a rim for those at the edge
+        low, left = ((cars.y_m - y0) / RES_M).astype(int), ((cars.x_m - x0) / RES_M).astype(int)
+        for k, j in zip(low.tolist(), left.tolist(), strict=True):
+            window = near[k : k + len(span), j : j + len(span)]
+            np.maximum(window, about, out=window)
+        self._flat = near[reach:-reach, reach:-reach].ravel()
+        gap_m = np.hypot(*next_of(np.stack([cars.x_m, cars.y_m], axis=1)).T)
+        self.parked = np.maximum(0.0, 1.0 - gap_m / NEAR_M).astype(np.float32)
         """Each parked car's nearness to the next one."""
 
     def near(self, x_m: Floats, y_m: Floats) -> NDArray[np.float32]:
         """How near points [n] are to a parked car."""
         row, column = ((y_m - self.y0_m) / RES_M).astype(np.intp), ((x_m - self.x0_m) / RES_M).astype(np.intp)
         return self._flat.take(row * self.columns + column, mode="clip")
+
+
+def next_of(xy: Floats) -> Floats:
+    """From every point to the one next to it [n, 2]; inf where there is none."""
+    if len(xy) < 2:
+        return np.full(xy.shape, np.inf)
+    return np.asarray(xy[cKDTree(xy).query(xy, k=2)[1][:, 1]] - xy)
 
 
 def _plant(height: NDArray[np.float32], trees: Floats, x0_m: float, y0_m: float) -> None:
