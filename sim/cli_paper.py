@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from perception.harness import report
-from perception.harness.rows import INSTRUMENTS, Row
+from perception.harness.rows import INSTRUMENTS, Row, differ_by_chance
 from perception.harness.verdict import Verdict
 from sim.console import out, stages
 from sim.folders import RunError
@@ -150,10 +150,10 @@ def _differences(ours: Sequence[Row], theirs: Sequence[Row], where: Path) -> str
         for r in ours
         if judged.get((r.id, r.instrument), r.verdict) != r.verdict
     ]
-    both = sum((r.id, r.instrument) in judged for r in ours)
-    return "\n".join(
-        [f"{both - len(lines)} of {both} verdicts are those of {where}" + (", but:" if lines else ""), *lines]
-    )
+    both = [r for r in ours if (r.id, r.instrument) in judged]
+    chance = f"two tables of one truth differ in {differ_by_chance(both):.1f} on average"
+    first = f"{len(both) - len(lines)} of {len(both)} verdicts are those of {where} ({chance})"
+    return "\n".join([first + (", but:" if lines else ""), *lines])
 
 
 def _coloured(row: Row) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.special import ndtri
 
 from perception.harness.claims import CLAIMS, SECTIONS, Claim, conditions
 from perception.harness.condition import Unsent
@@ -19,6 +22,8 @@ from perception.harness.verdict import Measured
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
 """What a cell that was not sent counts as, and the column that shows it."""
+_NORMAL = ndtri([0.025, 0.975])
+_DRAWS = ndtri((np.arange(999) + 0.5) / 999)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +100,21 @@ def judge(
     rows += [_row(c, "", elsewhere.get(c.measure.name), None) for c in claims if isinstance(c.measure, Elsewhere)]
     place = {c.id: i for i, c in enumerate(claims)}
     return sorted(rows, key=lambda r: place[r.id])
+
+
+def differ_by_chance(rows: Iterable[Row], claims: Sequence[Claim] = CLAIMS) -> float:
+    """In how many verdicts two tables of the same truth would differ on average, each made on frames of its own: every
+    figure is taken to be normal about what it is here, as wide as its interval, which moves along."""
+    by_id = {c.id: c for c in claims}
+    expected = 0.0
+    for row in rows:
+        if row.value is None or row.low is None or row.high is None or row.id not in by_id:
+            continue
+        claim, wide = by_id[row.id], (row.high - row.low) / (_NORMAL[-1] - _NORMAL[0])
+        drawn = (Measured(row.value + d, row.low + d, row.high + d) for d in (wide * _DRAWS).tolist())
+        count = Counter(claim.rule(claim.paper, m).verdict for m in drawn)
+        expected += 1.0 - sum((n / len(_DRAWS)) ** 2 for n in count.values())
+    return expected
 
 
 def _row(claim: Claim, instrument: str, ours: Measured | None, q: float | None) -> Row:

@@ -16,6 +16,7 @@ from perception.harness import figures, report, rows
 from perception.harness.claims import CLAIMS, SECTIONS
 from perception.harness.rows import Row
 from perception.harness.scores import split
+from perception.harness.verdict import Measured
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,28 @@ def test_q_is_adjusted_over_the_differences_of_one_instrument(table: list[Row]) 
     by_hand = np.minimum(1.0, np.minimum.accumulate((p * m / np.arange(1, m + 1))[::-1])[::-1])
     assert sorted(r.q or 0.0 for r in tested) == pytest.approx(by_hand)
     assert all(r.q is None for r in table if r.p is None)
+
+
+def test_how_many_verdicts_differ_by_chance(table: list[Row]) -> None:
+    """Against drawing two tables of the same truth, again and again."""
+    gain, none = of(table, "gain"), of(table, "peers.worst-best")
+    sure = replace(gain, value=18.0, low=17.0, high=19.0)
+    edge = replace(gain, value=2.0, low=0.0, high=4.0)  # as often significant as not
+    nothing = replace(none, value=0.0, low=-2.0, high=2.0)
+    assert rows.differ_by_chance([sure]) == 0.0
+    assert rows.differ_by_chance([edge]) == pytest.approx(0.5, abs=0.01)
+    assert rows.differ_by_chance([nothing]) == pytest.approx(2 * 0.05 * 0.95, abs=0.003)
+    assert rows.differ_by_chance([sure, edge, nothing]) == pytest.approx(0.595, abs=0.01)
+    rng = np.random.default_rng(0)
+
+    def judged(row: Row) -> str:
+        claim = next(c for c in CLAIMS if c.id == row.id)
+        d = rng.normal(0.0, 2.0 / 1.96)
+        return str(claim.rule(claim.paper, Measured(row.value + d, row.low + d, row.high + d)).verdict)  # type: ignore[operator]
+
+    drawn = sum(judged(r) != judged(r) for r in (edge, nothing) for _ in range(4000)) / 4000
+    assert rows.differ_by_chance([edge, nothing]) == pytest.approx(drawn, abs=0.03)
+    assert rows.differ_by_chance([of(table, "full"), of(table, "plane.descriptor", "")]) == 0.0
 
 
 def test_rows_are_the_same_after_parquet(table: list[Row], tmp_path: Path) -> None:
