@@ -55,8 +55,10 @@ def link_graph(quality: ArrayLike, threshold: float) -> Any:
 def linked_drones(quality: ArrayLike, threshold: float) -> list[int]:
     """Drones with at least one usable link, in or out, ascending; arguments as for `link_graph`."""
     usable = np.asarray(quality, dtype=float) >= threshold
+    usable |= usable.T
     np.fill_diagonal(usable, False)
-    return [int(i) for i in np.flatnonzero(usable.any(axis=0) | usable.any(axis=1))]
+    linked: list[int] = np.flatnonzero(usable.any(axis=0)).tolist()
+    return linked
 
 
 def is_connected(graph: Any) -> bool:

@@ -108,7 +108,6 @@ def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     transmissions, payloads, captured_s = zip(*rows, strict=True)
     t = dict(zip(Transmission._fields, zip(*transmissions, strict=True), strict=True))
     p = dict(zip(Payload._fields, zip(*payloads, strict=True), strict=True))
-    t["status"] = tuple(status.value for status in t["status"])
     return [
         t["t_sent_s"], t["sender"], t["receiver"], t["kind"], captured_s, p["rho"], p["cells"], p["boxes"],
         p["index_bytes"], t["payload_bytes"], t["wire_bytes"], t["deadline_s"], t["t_start_s"], t["t_done_s"],

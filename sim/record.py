@@ -197,7 +197,7 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     """A decision's ages stand in one row."""
     t_s, drones, ages_s = zip(*rows, strict=True)
     counts = [len(ages) for ages in ages_s]
-    return [np.repeat(t_s, counts), np.repeat(drones, counts), np.fromiter(chain.from_iterable(ages_s), float)]
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), list(chain.from_iterable(ages_s))]
 
 
 class AgentNotes:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -163,7 +164,8 @@ class World:
         busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
         self._busy_at_s = (self.env.now, busy_s)
         flying = [a.drone for a in self.agents if a.airborne]
-        linked = linked_drones(self.air.snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
+        snr_db = self.air.snr_db
+        linked = linked_drones(snr_db if len(flying) == len(snr_db) else snr_db[np.ix_(flying, flying)], USABLE_SNR_DB)
         self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
         if self._scenario.radio.relay_max_hops > 1:
             self._write_topology(flying)
@@ -191,7 +193,12 @@ class World:
         n, m = len(self.agents), self.motion
         known = (m.position_m, m.orientation_xyzw, m.velocity_mps, m.body_rates_radps)
         flown = np.concatenate([states[list(frames)] for states in known], axis=-1).reshape(len(rows) * n, -1)
-        return [np.repeat(now_s, n), np.tile(range(n), len(rows)), *flown.T, *(np.concatenate(c) for c in changing)]
+        return [
+            np.repeat(now_s, n),
+            np.tile(range(n), len(rows)),
+            *flown.T,
+            *(list(chain.from_iterable(c)) for c in changing),
+        ]
 
     # --- what one drone knows of itself ----------------------------------------------------------
 
