@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
@@ -51,7 +50,6 @@ def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw
     return mask
 
 
-@lru_cache(maxsize=256)  # every link of a drone asks for the same disc from the same pose
 def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> int:
     """How many cells go: ⌊ρ·4096⌋, at most those in the ROI."""
     budget = math.floor(rho * CELLS + 1e-9)
