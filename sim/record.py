@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -116,7 +117,7 @@ class SortieRecord:
     wall: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
         """SHA-256 over version, policy, seed and every table's values; equal records have equal fingerprints."""
         digest = hashlib.sha256(f"{self.version}/{self.policy}/{self.seed}/{self.replication}".encode())

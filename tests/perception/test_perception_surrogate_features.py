@@ -7,6 +7,7 @@ import pytest
 
 from perception.scene import SceneModel
 from perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
+from perception.surrogate.sight import NEAR_M, RES_M, Kerbs, next_of
 from perception.types import Capture
 from scenarios.schema import Scene, Target
 
@@ -47,3 +48,27 @@ def test_a_car_that_is_alone_has_none_next_to_it() -> None:
     covariates = Eyes(scene).look(Fleet.of([capture(4.0)])).covariates
     assert len(covariates) == 1
     assert not covariates[:, [COLUMN[n] for n in ("next", "next_along", "next_across")]].any()
+
+
+def test_how_near_parked_cars_are_is_the_nearest_ones_on_the_raster_and_at_the_edge() -> None:
+    scene = SceneModel(Scene(parked_density=0.5, style="old_town"), None, (-60, -20, 60, 20))
+    kerbs, cars, (x0, y0, x1, y1) = Kerbs(scene), scene.parked_cars, scene.rect
+    rng = np.random.Generator(np.random.PCG64(2))
+    x, y = rng.uniform(x0, x1, 3000), rng.uniform(y0, y1, 3000)
+    x[:40], y[:40] = np.repeat((x0, x1), 20), rng.uniform(y0, y1, 40)
+
+    def pixel(at: np.ndarray, corner: float) -> np.ndarray:
+        return ((at - corner) / RES_M).astype(int)
+
+    away = np.hypot(pixel(x, x0)[:, None] - pixel(cars.x_m, x0), pixel(y, y0)[:, None] - pixel(cars.y_m, y0)) * RES_M
+    expected = np.maximum(0.0, 1.0 - away.min(axis=1) / NEAR_M)
+    assert 0.1 < (expected > 0).mean() < 0.9
+    np.testing.assert_allclose(kerbs.near(x, y), expected, atol=1e-6)
+    gap = np.hypot(cars.x_m[:, None] - cars.x_m, cars.y_m[:, None] - cars.y_m)
+    np.fill_diagonal(gap, np.inf)
+    np.testing.assert_allclose(kerbs.parked, np.maximum(0.0, 1.0 - gap.min(axis=1) / NEAR_M), atol=1e-6)
+
+
+def test_a_car_that_stands_alone_has_no_next_one() -> None:
+    assert np.isinf(next_of(np.array([[3.0, 4.0]]))).all()
+    assert next_of(np.zeros((0, 2))).shape == (0, 2)
