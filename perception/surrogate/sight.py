@@ -78,9 +78,8 @@ class Kerbs:
         reach = int(NEAR_M / RES_M)
         span = np.arange(-reach, reach + 1)
         about = np.maximum(0.0, 1.0 - RES_M * np.hypot(span[:, None], span) / NEAR_M).astype(np.float32)
-        near = np.zeros(
-            (self.rows + 2 * reach, self.columns + 2 * reach), np.float32
-        )  # with a rim for those at the edge
+        rim = 2 * reach  # for cars at the edge
+        near = np.zeros((self.rows + rim, self.columns + rim), np.float32)
         low, left = ((cars.y_m - y0) / RES_M).astype(int), ((cars.x_m - x0) / RES_M).astype(int)
         for k, j in zip(low.tolist(), left.tolist(), strict=True):
             window = near[k : k + len(span), j : j + len(span)]
