@@ -16,6 +16,7 @@ sortie begins with the same numbers as a shorter one.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -75,11 +76,10 @@ def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[
 
 def _lag(driven: Array, decay: float) -> Array:
     """y[t] = driven[t] + decay · y[t − 1]; scipy's lfilter does the same, but to import it takes half a second."""
-    lagged = np.empty_like(driven)
-    before = np.zeros_like(driven[0])
-    for t, step in enumerate(driven):
-        lagged[t] = before = decay * before + step
-    return lagged
+    lagged = driven.reshape(len(driven), -1).copy()
+    for before, after in pairwise(lagged):
+        after += decay * before
+    return lagged.reshape(driven.shape)
 
 
 def _lag_covariance(d: float) -> Array:

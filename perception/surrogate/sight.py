@@ -104,15 +104,15 @@ def next_of(xy: Floats) -> Floats:
 
 def _plant(height: NDArray[np.float32], trees: Floats, x0_m: float, y0_m: float) -> None:
     """Raise the field to the trees' domes (x, y, radius, height, tone), in place."""
-    reach = int(np.ceil(trees[:, 2].max(initial=0.0) / RES_M)) + 1
+    x, y, radius, top, _ = trees.T[..., None]
+    reach = int(np.ceil(radius.max(initial=0.0) / RES_M)) + 1
     span = np.arange(-reach, reach + 1)
-    dy, dx = (d.ravel() for d in np.meshgrid(span, span, indexing="ij"))
-    column = np.floor((trees[:, 0, None] - x0_m) / RES_M).astype(int) + dx
-    row = np.floor((trees[:, 1, None] - y0_m) / RES_M).astype(int) + dy
-    away = (x0_m + (column + 0.5) * RES_M - trees[:, 0, None]) ** 2 + (
-        y0_m + (row + 0.5) * RES_M - trees[:, 1, None]
-    ) ** 2
-    part = away / trees[:, 2, None] ** 2
-    inside = (part < 1.0) & (row >= 0) & (row < height.shape[0]) & (column >= 0) & (column < height.shape[1])
-    dome = (trees[:, 3, None] * (1.0 - 0.35 * part)).astype(np.float32)
-    np.maximum.at(height, (row[inside], column[inside]), dome[inside])
+    column, row = (np.floor((at - low) / RES_M).astype(int) + span for at, low in ((x, x0_m), (y, y0_m)))
+    across, along = ((low + (k + 0.5) * RES_M - at) ** 2 for k, at, low in ((column, x, x0_m), (row, y, y0_m)))
+    part = (across[:, None, :] + along[:, :, None]) / radius[..., None] ** 2
+    inside = part < 1.0
+    inside &= ((row >= 0) & (row < height.shape[0]))[:, :, None]
+    inside &= ((column >= 0) & (column < height.shape[1]))[:, None, :]
+    dome = (top[..., None] * (1.0 - 0.35 * part)).astype(np.float32)
+    pixel = (row * height.shape[1])[:, :, None] + column[:, None, :]
+    np.maximum.at(height.reshape(-1), pixel[inside], dome[inside])
