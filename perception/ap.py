@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.overlap import Floats, Ints, Kind, corners, iou_pairs, overlapping
+from perception.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
 from perception.types import Boxes
 
 __all__ = [  # the overlap's two main functions are had from here too
@@ -73,28 +73,41 @@ def best_first(score: Floats, image: Ints) -> Ints:
     return np.lexsort((-score, image))
 
 
-def suppressed(boxes: Floats, image: Ints, iou: float) -> Bools:
-    """Which boxes [n, 5] rotated non-maximum suppression leaves, best first: one that overlaps a kept one by more goes.
+def rivals(boxes: Floats, image: Ints) -> tuple[Ints, Ints, Floats]:
+    """Pairs (i, j) of boxes [n, 5] of one image that may overlap, i the better one, and their IoU; boxes best first."""
+    i, j = near_pairs(boxes, boxes, image, image)
+    better = i < j
+    i, j = i[better], j[better]
+    return i, j, iou_pairs(boxes[i], boxes[j])
 
-    Args:
-        boxes, image: in the order of `best_first`.
-        iou: the limit.
+
+def standing(count: int, i: Ints, j: Ints) -> Bools:
+    """Which of so many boxes non-maximum suppression leaves, of rivals that overlap by too much: j goes where i stays.
 
     In every round a box without a better rival that is still open is settled, kept; its open rivals go. The loop over
     boxes would say the same of both, and the best open box of an image is always settled, so the rounds end.
     """
-    keep = np.ones(len(boxes), bool)
-    i, j, value = overlapping(boxes, boxes, image, image)
-    clash = (value > iou) & (i < j)
-    i, j = i[clash], j[clash]
+    keep = np.ones(count, bool)
     while len(i):
-        beaten = np.zeros(len(boxes), bool)
+        beaten = np.zeros(count, bool)
         beaten[j] = True
         sure = ~beaten[i]
         keep[j[sure]] = False
         left = keep[i] & keep[j] & ~sure
         i, j = i[left], j[left]
     return keep
+
+
+def suppressed(boxes: Floats, image: Ints, iou: float) -> Bools:
+    """Which boxes [n, 5] rotated non-maximum suppression leaves, best first: one that overlaps a kept one by more goes.
+
+    Args:
+        boxes, image: in the order of `best_first`.
+        iou: the limit.
+    """
+    i, j, value = rivals(boxes, image)
+    clash = value > iou
+    return standing(len(boxes), i[clash], j[clash])
 
 
 def hits(count: int, i: Ints, j: Ints, value: Floats, match: Literal["remaining", "first"] = "remaining") -> Bools:

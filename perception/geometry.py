@@ -49,8 +49,9 @@ SMALL = Geometry(51.2)
 def in_square(
     xy_m: NDArray[np.floating], poses: ArrayLike, half_extent_m: float = FULL.half_extent_m
 ) -> NDArray[np.bool_]:
-    """Which places [n, 2] (ENU) lie in the squares of which poses [m, 3] (x, y, yaw): [n, m]."""
-    x, y, yaw = np.asarray(poses, np.float64).T
+    """Which places [n, 2] (ENU) lie in the squares of which poses [m, 3] (x, y, yaw): [n, m]; poses [n, 1, 3]: one for
+    each place, [n, 1]."""
+    x, y, yaw = np.moveaxis(np.asarray(poses, np.float64), -1, 0)
     dx, dy, c, s = xy_m[:, :1] - x, xy_m[:, 1:] - y, np.cos(yaw), np.sin(yaw)
     inside: NDArray[np.bool_] = (np.abs(c * dx + s * dy) < half_extent_m) & (np.abs(c * dy - s * dx) < half_extent_m)
     return inside

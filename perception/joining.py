@@ -10,15 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception import budget
-from perception.ap import suppressed
+from perception.ap import rivals, standing
 from perception.geometry import in_square
-from perception.overlap import overlapping
 from perception.types import Boxes, Share
 
 NMS_IOU = 0.15
@@ -61,35 +60,72 @@ def sendable(boxes: Boxes) -> Boxes:
     return boxes.take(boxes.score > SURE)
 
 
+class Heard(NamedTuple):
+    """What an ego has to join."""
+
+    pose: Pose
+    """Its own, by its belief."""
+    own: Boxes
+    """What it found, best first."""
+    fused: bool
+    """Whether the maps of others are in that."""
+    others: Sequence[Told]
+
+
 def joined(pose: Pose, own: Boxes, fused: bool, others: Sequence[Told], rule: Rule) -> Boxes:
-    """The ego's boxes and the others', in the world, best first, inside the ego's square: what lies outside is not asked of it.
+    """`joined_many` of one ego."""
+    return joined_many([Heard(pose, own, fused, others)], rule)[0]
+
+
+def joined_many(egos: Sequence[Heard], rule: Rule) -> list[Boxes]:
+    """Each ego's boxes and the others', in the world, best first, inside the ego's square: what lies outside is not asked of it.
 
     Args:
-        pose: the ego's, by its own belief.
-        own: what it found, with the maps of others in it or without (`fused`).
+        egos: who joins what; one that heard nothing keeps its own as they are.
         rule: `nms`: of boxes that overlap by more than `NMS_IOU` the best stays, and a drone's say only counts as zero or not.
             `average`: those boxes' mean place, size and heading, by say times score, at the mean score of all who looked there.
     """
-    if not others:
-        return own
-    all_told = [Told(own, OWN_SAY if fused else 1.0, pose), *(o for o in others if o.say > 0.0)]
-    boxes = Boxes.join([t.boxes for t in all_told])
-    of = np.repeat(np.arange(len(all_told)), [len(t.boxes) for t in all_told])
-    here = in_square(boxes.xy_m, [pose])[:, 0]
-    boxes, of = boxes.take(here), of[here]
-    rank = boxes.score if rule == "nms" else boxes.score * np.array([t.say for t in all_told])[of]
-    order = np.argsort(-rank, kind="stable")
-    boxes, of = boxes.take(order), of[order]
-    table, one = boxes.table(), np.zeros(len(order), np.int64)
-    kept = suppressed(table, one, NMS_IOU)
-    if rule == "nms" or not len(order):
-        return boxes.take(kept)
+    out = [ego.own for ego in egos]
+    asked = [k for k, ego in enumerate(egos) if ego.others]
+    if not asked:
+        return out
+    told_to = [
+        [Told(e.own, OWN_SAY if e.fused else 1.0, e.pose), *(o for o in e.others if o.say > 0.0)]
+        for e in (egos[k] for k in asked)
+    ]
+    every = [t for several in told_to for t in several]
+    boxes, teller = (
+        Boxes.join([t.boxes for t in every]),
+        np.repeat(np.arange(len(every)), [len(t.boxes) for t in every]),
+    )
+    first = np.cumsum([0, *map(len, told_to)])  # of each ego's tellers
+    ego = np.repeat(np.arange(len(asked)), np.diff(first))[teller]
+    here = in_square(boxes.xy_m, np.array([egos[k].pose for k in asked])[ego][:, None])[:, 0]
+    boxes, teller, ego = boxes.take(here), teller[here], ego[here]
+    rank = boxes.score if rule == "nms" else boxes.score * np.array([t.say for t in every])[teller]
+    order = np.lexsort((-rank, ego))
+    boxes, teller, ego = boxes.take(order), teller[order], ego[order]
+    i, j, iou = rivals(boxes.table(), ego)
+    i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]
+    kept = standing(len(ego), i, j)
+    ends = np.searchsorted(ego, np.arange(len(asked) + 1))
+    if rule == "nms":
+        boxes, ends = boxes.take(kept), np.concatenate([[0], np.cumsum(kept)])[ends]
+        for k, a, b in zip(asked, ends, ends[1:], strict=False):
+            out[k] = boxes.take(slice(a, b))
+        return out
     # a box that goes belongs to the best of those that stay and overlap it
-    group = np.where(kept, np.arange(len(order)), len(order))
-    i, j, iou = overlapping(table, table, one, one)
-    over = (iou > NMS_IOU) & (i < j) & kept[i] & ~kept[j]
+    group = np.where(kept, np.arange(len(ego)), len(ego))
+    over = kept[i] & ~kept[j]
     np.minimum.at(group, j[over], i[over])
-    return _averaged(boxes, of, (np.cumsum(kept) - 1)[group], all_told)
+    group = (np.cumsum(kept) - 1)[group]
+    for n, (k, a, b) in enumerate(zip(asked, ends, ends[1:], strict=False)):
+        some = slice(a, b)
+        if a < b:
+            out[k] = _averaged(boxes.take(some), teller[some] - first[n], group[some] - group[a], told_to[n])
+        else:
+            out[k] = Boxes.empty()
+    return out
 
 
 def _averaged(boxes: Boxes, of: NDArray[np.intp], group: NDArray[np.intp], all_told: Sequence[Told]) -> Boxes:

@@ -68,8 +68,8 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.score)
 
-    def take(self, which: NDArray[Any]) -> Boxes:
-        """The boxes at the given indices or under the given mask, in that order."""
+    def take(self, which: NDArray[Any] | slice) -> Boxes:
+        """The boxes at the given indices, under the given mask or in the given slice, in that order."""
         return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which])
 
     def inside(self, disc: tuple[float, float, float] | None) -> Boxes:

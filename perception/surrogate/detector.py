@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from perception.geometry import FULL
-from perception.joining import joined, told
+from perception.joining import Heard, joined_many, told
 from perception.scene import SceneModel
 from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
 from perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
@@ -38,7 +38,7 @@ class Found:
 
     def __iter__(self) -> Iterator[Boxes]:
         for a, b in zip(self.first[:-1].tolist(), self.first[1:].tolist(), strict=True):
-            yield self.boxes.take(slice(a, b))  # type: ignore[arg-type]
+            yield self.boxes.take(slice(a, b))
 
 
 class SurrogateDetector:
@@ -93,6 +93,10 @@ class SurrogateDetector:
         self._eyes = eyes or Eyes(scene)
         self._luck = Luck(seed, replication, town, self._eyes.traffic.count, parameters.alike)
         self._mirages = Mirages(town)
+        threshold, found, alarms = parameters.boxes
+        at = max(config.score_threshold, float(threshold[0]))
+        self._found, self._alarms_alone = (float(np.interp(at, threshold, y)) for y in (found, alarms))
+        """Of a drone alone: the part of the cars that it finds, and how many boxes of nothing."""
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own look and what it was sent, ENU, best first."""
@@ -124,12 +128,10 @@ class SurrogateDetector:
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
-        threshold, found, alarms = self.parameters.boxes
         x, y, radius = (*capture.position_m[:2], 2 * FULL.half_extent_m / np.sqrt(np.pi)) if roi is None else roi
-        at = max(self._config.score_threshold, float(threshold[0]))
         cars = self._scene.cars_near(capture.t_s, x, y, min(radius, FULL.half_extent_m * 1.13))
         part = min(1.0, np.pi * radius**2 / (2 * FULL.half_extent_m) ** 2)
-        return round(cars * float(np.interp(at, threshold, found)) + part * float(np.interp(at, threshold, alarms)))
+        return round(cars * self._found + part * self._alarms_alone)
 
     def camera_views(self, capture: Capture) -> NDArray[np.uint8]:
         """There are none.
@@ -163,10 +165,11 @@ class SurrogateDetector:
         boxes = list(found)
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
         fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
-        out = []
+        heard = []
         for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False):
             others = [told(s, alone[s.capture]) for s in shares if s.representation in LATE and s.weight > 0.0]
-            out.append(joined(ego.est_pose, own, f, others, self._config.join))
+            heard.append(Heard(ego.est_pose, own, f, others))
+        out = joined_many(heard, self._config.join)
         return Found(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(

@@ -11,7 +11,7 @@ from perception_examples import cross
 
 from perception.ap import suppress
 from perception.detector import TorchDetector
-from perception.joining import NMS_IOU, OWN_SAY, Rule, Told, joined, told
+from perception.joining import NMS_IOU, OWN_SAY, Heard, Rule, Told, joined, joined_many, told
 from perception.overlap import iou_pairs
 from perception.scene import SceneModel
 from perception.surrogate.detector import SurrogateDetector
@@ -148,3 +148,35 @@ def test_detectors_join_as_the_scenario_says(make: type[TorchDetector]) -> None:
         want = joined(fleet[0].est_pose, own, False, others, rule)
         np.testing.assert_array_equal(out.table(), want.table())
         np.testing.assert_array_equal(out.score, want.score)
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_many_egos_at_once_are_each_as_alone(rule: Rule) -> None:
+    """Egos in one place or far from one another, with nothing to join, with mute peers, with all boxes out of reach."""
+    rng = np.random.Generator(np.random.PCG64(3))
+
+    def some(count: int, about: tuple[float, float]) -> Boxes:
+        xy = np.array(about) + rng.uniform(-130.0, 130.0, (count, 2)).round()
+        each = np.concatenate([xy, np.tile((4.5, 1.9), (count, 1)), rng.uniform(-3, 3, (count, 1))], axis=1)
+        score = np.sort(rng.uniform(0.1, 1.0, count).round(1))[::-1]  # many are alike
+        return Boxes(*(v.astype(np.float32) for v in (each[:, :2], each[:, 2:4], each[:, 4], score)))
+
+    egos = []
+    for k in range(12):
+        pose = (400.0 * (k % 3), 0.0, 0.5 * k)
+        others = [
+            Told(some(40 * (k % 4), pose[:2]), 0.25 * (j % 3), pose, (*pose[:2], 60.0) if j == 1 else None, j == 2)
+            for j in range(k % 5)
+        ]
+        egos.append(Heard(pose, some(60, pose[:2]), k % 2 == 0, others))
+    egos.append(Heard((5000.0, 0.0, 0.0), some(5, (0.0, 0.0)), False, egos[3].others))
+    together = joined_many(egos, rule)
+    assert len(together) == len(egos)
+    for many, ego in zip(together, egos, strict=True):
+        alone = joined(*ego, rule)
+        for field in ("xy_m", "size_m", "yaw_rad", "score"):
+            assert getattr(many, field).tobytes() == getattr(alone, field).tobytes()
+    assert together[0] is egos[0].own
+    assert len(together[-1]) == 0
+    assert len({len(b) for b in together}) > 4
+    assert joined_many([], rule) == []
