@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception import budget
-from perception.ap import rivals, standing
+from perception.ap import best_first, rivals, standing
 from perception.geometry import in_square
 from perception.types import Boxes, Share
 
@@ -94,16 +94,14 @@ def joined_many(egos: Sequence[Heard], rule: Rule) -> list[Boxes]:
         for e in (egos[k] for k in asked)
     ]
     every = [t for several in told_to for t in several]
-    boxes, teller = (
-        Boxes.join([t.boxes for t in every]),
-        np.repeat(np.arange(len(every)), [len(t.boxes) for t in every]),
-    )
+    boxes = Boxes.join([t.boxes for t in every])
+    teller = np.repeat(np.arange(len(every)), [len(t.boxes) for t in every])
     first = np.cumsum([0, *map(len, told_to)])  # of each ego's tellers
     ego = np.repeat(np.arange(len(asked)), np.diff(first))[teller]
     here = in_square(boxes.xy_m, np.array([egos[k].pose for k in asked])[ego][:, None])[:, 0]
     boxes, teller, ego = boxes.take(here), teller[here], ego[here]
     rank = boxes.score if rule == "nms" else boxes.score * np.array([t.say for t in every])[teller]
-    order = np.lexsort((-rank, ego))
+    order = best_first(rank, ego)
     boxes, teller, ego = boxes.take(order), teller[order], ego[order]
     i, j, iou = rivals(boxes.table(), ego)
     i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]

@@ -27,7 +27,9 @@ COLOURS = {Verdict.REPRODUCED: "green", Verdict.NOT_REPRODUCED: "yellow", Verdic
 
 def paper(
     context: typer.Context,
-    frames: Annotated[int, typer.Option(help="Frames of the test split, each of a scene of its own.", min=2)] = 240,
+    frames: Annotated[
+        int | None, typer.Option(help="Only so many frames of the test split, each of a scene of its own.", min=2)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     weights: Annotated[Path | None, typer.Option(help="A weights file; left out, the shipped one.")] = None,
     unsent: Annotated[

@@ -42,7 +42,8 @@ class Job:
 
     weights: Path
     asked: Asked
-    frames: int = 80
+    frames: int | None = None
+    """None: all of the test split."""
     seed: int = 0
     """The benchmark's."""
     workers: int = 1

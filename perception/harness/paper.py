@@ -42,14 +42,17 @@ def measure(
     return Found(found, asked)
 
 
-def bench_frames(seed: int, count: int, root: Path, progress: Callable[[int, int], None] | None = None) -> Frames:
-    """The first `count` frames of the benchmark's test split, each of a scene of its own; made where they are missing.
+def bench_frames(
+    seed: int, count: int | None, root: Path, progress: Callable[[int, int], None] | None = None
+) -> Frames:
+    """The first `count` frames (None: all) of the benchmark's test split, each of a scene of its own; made where they are
+    missing.
 
     Raises:
         ValueError: more frames than the split has.
     """
     scenes, per_scene = SIZES["test"]
-    if not 1 <= count <= scenes * per_scene:
+    if count is not None and not 1 <= count <= scenes * per_scene:
         raise ValueError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
     return load_frames(make_split(Benchmark(seed), "test", root, scenes=count, progress=progress))
 

@@ -9,11 +9,12 @@ import pytest
 from paper_examples import ELSEWHERE, FACTS, MadeInstrument, made_frames
 
 from perception.ap import average_precision
+from perception.bench.dataset import SIZES
 from perception.harness import report, rows
 from perception.harness.condition import FULL_SHARING, SINGLE, Condition
 from perception.harness.found import Asked, Found
 from perception.harness.measures import under
-from perception.harness.paper import measure
+from perception.harness.paper import bench_frames, measure
 from perception.harness.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
 
 N = 6
@@ -119,3 +120,13 @@ def test_what_cannot_be_asked_is_named(field: dict[str, object], message: str) -
 
 def test_conditions_are_put_under_the_instrument() -> None:
     assert under(Condition(0.1), "masked", "norm") == Condition(0.1, unsent="masked", cells_by="norm")
+
+
+def test_frames_left_out_are_the_whole_test_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SIZES, "test", (2, 1))
+    first = bench_frames(0, 1, tmp_path)
+    both = bench_frames(0, None, tmp_path)
+    assert (len(first), len(both)) == (1, 2)
+    np.testing.assert_array_equal(both.images[0], first.images[0])
+    with pytest.raises(ValueError, match=r"frames is 3, must be 1 to the test split's 2"):
+        bench_frames(0, 3, tmp_path)
