@@ -13,7 +13,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from perception.detectors import make_detector
-from policies.adaptive import ARMS, LEARNED
+from policies.adaptive import ARMS
 from policies.registry import resolve
 from scenarios.contexts import Contexts
 from sim.console import bars, out
@@ -95,8 +95,8 @@ def learn(
         typer.Option("--by-torch", help="The torch detector scores what the surrogate flies; half an hour a core."),
     ] = False,
     out_file: Annotated[
-        Path, typer.Option("--out", help="Where the fit is kept; left out, the policy's own.")
-    ] = LEARNED,
+        Path, typer.Option("--out", help="Where the fit is kept; policies/learned.json is the one that flies.")
+    ] = Path("runs/learned.json"),
 ) -> None:
     """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""
     from sim.learn import BUDGETS, fly_lessons, gains, save, thresholds

@@ -48,7 +48,7 @@ def study_train(
 def study_run(
     work: WorkOption = Path("runs/study"),
     bench_dir: BenchOption = Path("runs/bench"),
-    frames: Annotated[int, typer.Option(help="Frames of the test split.", min=2, max=80)] = 80,
+    frames: Annotated[int, typer.Option(help="So many frames of the test split, its first.", min=2)] = 80,
     workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
 ) -> None:
     """Measure every network that has weights, and write the rows."""

@@ -35,6 +35,10 @@ def page() -> str:
         "",
         "Made by `python -m sim.reference`; do not edit.",
         "",
+        "A run's folder holds `outcome.json`, the record's tables as Parquet, `scenario.yaml` (what was flown, every default "
+        "written out), `record.json` (totals and wall clock) and `sortie.rrd` (the recording for Rerun; `sortie view` makes "
+        "one where there is none).",
+        "",
         "## outcome.json",
         "",
         "A dot leads into an object, `*` stands for each of its keys, `[]` for each entry of a list. Bounds of `expect:` in "

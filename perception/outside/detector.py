@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from perception import budget
 from perception.ap import suppress
+from perception.errors import InputError
 from perception.geometry import CELLS, CHANNELS, FULL, in_square
 from perception.joining import NMS_IOU, Told, joined, sendable, told
 from perception.outside.exchange import Sent, fused, load_fusion, reaching
@@ -73,9 +74,9 @@ class RecordedDetector:
         """There are none.
 
         Raises:
-            ValueError: always.
+            InputError: always.
         """
-        raise ValueError("a recording holds no images: fly with perception.detector = torch to see camera views")
+        raise InputError("a recording holds no images: fly with perception.detector = torch to see camera views")
 
     # --- one ego ---------------------------------------------------------------------------------
 

@@ -47,6 +47,8 @@ class Row:
     value: float
     low: float
     high: float
+    frames: int
+    """Of the test split, from its first on."""
 
 
 def optimal_f1(units: Sequence[Matched], taus: NDArray[np.float64]) -> F1:
@@ -83,7 +85,8 @@ def rows_of(measured: Measured, variant: Variant, seed: int, density: str, found
                 head = (variant.name, seed, density, unsent, cells_by, str(name), tau)
 
                 def add(quantity: str, rho: float, of: Figures, unit: float = 1.0) -> None:
-                    out.append(Row(*head, quantity, rho, *(unit * v for v in of)))  # noqa: B023 (called at once)
+                    value, low, high = (unit * v for v in of)
+                    out.append(Row(*head, quantity, rho, value, low, high, len(found.scene)))  # noqa: B023 (called at once)
 
                 add("gain", np.nan, _figures(Contrast((FULL_SHARING,), (SINGLE,)).measure(scores)))
                 add("level", 0.0, _figures(Level(SINGLE).measure(scores)), POINTS)  # levels come as 0 … 1

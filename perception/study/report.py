@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from perception.bench.dataset import SIZES
 from perception.study.measure import MODEL_TAU, Row
 from perception.study.plan import Plan
 
@@ -64,7 +65,7 @@ def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] =
     missing = [v.job(s) for v, s in plan.jobs() if (v.name, s) not in found.networks()]
     lines = ["# Why the flip exists: an experiment", "", "## The question", "", *_quoted(plan.paper), ""]
     lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
-    lines += ["## The answer", "", *answers(plan, found), ""]
+    lines += ["## The answer", "", *answers(plan, found), f"- {on_frames(rows)}", ""]
     for name, caption in figures:
         lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
     first, seed = plan.variants[0], plan.variants[0].seeds[0]
@@ -110,9 +111,16 @@ def thresholds(plan: Plan, found: Found) -> str:
 def short(plan: Plan, rows: Sequence[Row], link: str) -> str:
     """The README's section between its markers: three sentences."""
     sentences = answers(plan, Found(rows))[:3]
-    return "\n".join(
-        [BEGIN, "", *(s.removeprefix("- ") for s in sentences), f"The whole study: [{link}]({link}).", "", END]
-    )
+    whole = f"{on_frames(rows)} The whole study: [{link}]({link})."
+    return "\n".join([BEGIN, "", *(s.removeprefix("- ") for s in sentences), whole, "", END])
+
+
+def on_frames(rows: Sequence[Row]) -> str:
+    """A sentence: how many frames of the test split all this stands on."""
+    scenes, per_scene = SIZES["test"]
+    of = scenes * per_scene
+    measured = [f"all {of}" if n >= of else f"the first {n} of the {of}" for n in sorted({row.frames for row in rows})]
+    return f"Measured on {_and(measured)} frames of the test split."
 
 
 def answers(plan: Plan, found: Found) -> list[str]:

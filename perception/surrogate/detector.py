@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from perception.errors import InputError
 from perception.geometry import FULL
 from perception.joining import Heard, joined_many, told
 from perception.scene import SceneModel
@@ -52,7 +53,7 @@ class SurrogateDetector:
         weights: a calibration's file; None takes the shipped one.
 
     Raises:
-        ValueError: a calibration that is missing or broken, or of another fusion than `perception.fusion`.
+        InputError: a calibration that is missing or broken, or of another fusion than `perception.fusion`.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class SurrogateDetector:
     ) -> None:
         fitted = str(parameters.card["fusion"])
         if config.fusion not in (fitted, "none"):
-            raise ValueError(
+            raise InputError(
                 f"{name}: calibrated for fusion {fitted!r}, perception.fusion is {config.fusion!r}, must be that or 'none'"
             )
         self.parameters, self.calibration = parameters, parameters.id
@@ -137,9 +138,9 @@ class SurrogateDetector:
         """There are none.
 
         Raises:
-            ValueError: always.
+            InputError: always.
         """
-        raise ValueError("the surrogate renders nothing: fly with perception.detector = torch to see camera views")
+        raise InputError("the surrogate renders nothing: fly with perception.detector = torch to see camera views")
 
     # --- one batch ---------------------------------------------------------------------------------
 

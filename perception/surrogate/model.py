@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
+from perception.errors import InputError
 from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from perception.surrogate.features import LOOK_COVARIATES, beside
 from perception.surrogate.luck import BANDS
@@ -237,40 +238,40 @@ def load(path: Path) -> Parameters:
     """Parameters from a file.
 
     Raises:
-        ValueError: naming the file, and what is missing, of another shape, or not finite.
+        InputError: naming the file, and what is missing, of another shape, or not finite.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: no such calibration; `sortie calibrate` makes one")
+        raise InputError(f"{path}: no such calibration; `sortie calibrate` makes one")
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except SafetensorError as error:
-        raise ValueError(f"{path}: no safetensors file: {error}") from error
+        raise InputError(f"{path}: no safetensors file: {error}") from error
     if "surrogate" not in metadata:
-        raise ValueError(f"{path}: holds no calibration; `sortie calibrate` makes one")
+        raise InputError(f"{path}: holds no calibration; `sortie calibrate` makes one")
     try:
         card = json.loads(metadata["surrogate"])
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: its card is no JSON: {error}") from error
+        raise InputError(f"{path}: its card is no JSON: {error}") from error
     if card.get("format") != FORMAT:
-        raise ValueError(f"{path}: format is {card.get('format')}, must be {FORMAT}; calibrate again")
+        raise InputError(f"{path}: format is {card.get('format')}, must be {FORMAT}; calibrate again")
     for name in ("id", "fusion"):
         if not isinstance(card.get(name), str):
-            raise ValueError(f"{path}: card.{name} is {card.get(name)!r}, must be text")
+            raise InputError(f"{path}: card.{name} is {card.get(name)!r}, must be text")
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
-            raise ValueError(f"{path}: tensor {name} holds values that are not finite")
+            raise InputError(f"{path}: tensor {name} holds values that are not finite")
 
     def take(name: str, *shape: int | None) -> Singles:
         if name not in tensors:
-            raise ValueError(f"{path}: tensor {name} is missing")
+            raise InputError(f"{path}: tensor {name} is missing")
         found = tensors[name]
         if found.ndim != len(shape) or any(
             want not in (None, have) for want, have in zip(shape, found.shape, strict=True)
         ):
             wanted = ", ".join("any" if v is None else str(v) for v in shape)
-            raise ValueError(f"{path}: tensor {name} has shape {list(found.shape)}, must be [{wanted}]")
+            raise InputError(f"{path}: tensor {name} has shape {list(found.shape)}, must be [{wanted}]")
         return np.asarray(found, np.float32)
 
     return Parameters(

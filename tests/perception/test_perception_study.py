@@ -13,11 +13,11 @@ import pytest
 from perception.ap import Matched
 from perception.study.measure import Row, from_table, optimal_f1, threshold, to_table
 from perception.study.plan import PLAN, read_plan
-from perception.study.report import Found, View, answers, flips, report, sign
+from perception.study.report import Found, View, answers, flips, on_frames, report, sign
 from perception.study.run import SHIPPED, train_job, weights_of
 
 BUDGETS = (0.02, 0.05, 0.1, 0.25)
-ONE = Row("full", 0, "default", "zero", "confidence", "model", 0.1, "contrast", 0.02, 1.0, 0.5, 1.5)
+ONE = Row("full", 0, "default", "zero", "confidence", "model", 0.1, "contrast", 0.02, 1.0, 0.5, 1.5, 80)
 
 
 def rows_with(contrasts: tuple[float, float, float, float], half_width: float = 1.0, **changes: object) -> list[Row]:
@@ -31,6 +31,13 @@ def rows_with(contrasts: tuple[float, float, float, float], half_width: float = 
     out.append(replace(base, quantity="starved", rho=0.01, value=-3.0, low=-4.0, high=-2.0))
     out.append(replace(base, quantity="oracle", rho=math.nan, value=0.4, low=0.1, high=0.9))
     return out
+
+
+def test_a_study_says_on_how_many_frames_it_stands() -> None:
+    assert on_frames([ONE, ONE]) == "Measured on the first 80 of the 240 frames of the test split."
+    whole = replace(ONE, frames=240)
+    assert on_frames([whole]) == "Measured on all 240 frames of the test split."
+    assert on_frames([whole, ONE]) == "Measured on the first 80 of the 240 and all 240 frames of the test split."
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
+from perception.surrogate.model import SHIPPED as CALIBRATION
 from sim import rundir
 from sim.cli import app, main
 from sim.expect import check
@@ -260,3 +261,20 @@ def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
     done = sortie("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")
     assert done.returncode == 2
     assert done.stderr.strip() == f"error: {missing}: no such weights file; `sortie train` makes one"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "told"),
+    [
+        ("weights", "none.safetensors", "none.safetensors: no such calibration; `sortie calibrate` makes one"),
+        (
+            "fusion",
+            "late",
+            f"{CALIBRATION}: calibrated for fusion 'disconet', perception.fusion is 'late', must be that or 'none'",
+        ),
+    ],
+)
+def test_what_the_surrogate_cannot_do_is_one_line(field: str, value: str, told: str) -> None:
+    asked = ("--set", "perception.detector=surrogate", "--set", f"perception.{field}={value}", "--set", "duration_s=1")
+    done = sortie("fly", "track_target", *asked)
+    assert (done.returncode, done.stderr.strip()) == (2, f"error: {told}")
