@@ -150,7 +150,10 @@ class Agent:
         self.lies: dict[int, Callable[[Descriptor], Descriptor]] = {}
         """What it says against the truth; scenario events put them here."""
         self.sensed = False  # whether perception ran in the current frame
+        self.here: Capture | None = None
+        """Its body in this frame, whether perception runs or rests."""
         self.latest: Capture | None = None
+        """The newest look whose features are computed."""
         self.held: dict[int, Received] = {}
         self.inbox = Inbox()
         self._rules = rules
@@ -225,6 +228,7 @@ class Agent:
 
     def _tick(self, frame: int) -> None:
         sensed = self._senses.sense(frame)
+        self.here = sensed.capture
         self._hold(self._publish(sensed, due=frame % self._rules.publish_every == 0))
         if self._rules.trust and frame % self._judged_every == 0:
             self._judge()
@@ -232,8 +236,7 @@ class Agent:
         duty = self.gate.duty_percent
         self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
         if self.sensed:
-            self.latest = capture = sensed.capture
-            self.env.timeout(self._rules.compute_delay_s, capture).callbacks.append(self._send)
+            self.env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 
@@ -316,6 +319,7 @@ class Agent:
             link = links.get(peer)
             if link is None:
                 link = links[peer] = _Link(me, peer)
+                self.gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             changed = asked is not link.asked and asked != link.asked
             if changed or age_s > fresh_s or link.state.asking_since_s is not None:
@@ -341,7 +345,7 @@ class Agent:
         """The capture's features are there: hand each link that is due what its directive allows."""
         if not self.airborne:
             return
-        capture = cast(Capture, computed.value)
+        self.latest = capture = cast(Capture, computed.value)
         if self.handshake_bytes:
             self._shake_hands(capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)

@@ -95,6 +95,8 @@ class FleetBatteries:
         self.voltage_v = [float(open_circuit_cell_v(s)) * k for s, k in zip(self.soc, self.cells, strict=True)]
         self.current_a = [0.0] * n
         self.landed = [soc <= config.landing_soc for soc in self.soc]
+        self.why_landed = [self._charge(i) if down else "" for i, down in enumerate(self.landed)]
+        """In words, for whom the pack brought down."""
         self._kept = [1.0] * n  # of what a trace says, after faults
 
     def step(
@@ -142,7 +144,7 @@ class FleetBatteries:
             power = rotor + avionics + compute + radio
             current = current_a(power, ocv - lag, resistance)
             if current is None:
-                self.land(i)
+                self.land(i, f"the pack cannot give {power:.0f} W")
                 continue
             ohmic = current * current * resistance + current * lag
             spent = (power + ohmic) * dt_s
@@ -164,7 +166,9 @@ class FleetBatteries:
             at = left[i] / full * STEPS
             k = int(at)
             soc[i] = SOC_TABLE[k] + (at - k) * (SOC_TABLE[k + 1] - SOC_TABLE[k])
-            if soc[i] <= landing_soc or voltage < cutoff_cell_v * cells:
+            if voltage < cutoff_cell_v * cells and soc[i] > landing_soc:
+                self.land(i, f"{voltage / cells:.2f} V a cell, cut off below {cutoff_cell_v:g} V")
+            elif soc[i] <= landing_soc:
                 self.land(i)
 
     def fault(self, drone: int, lost_fraction: float) -> None:
@@ -195,12 +199,16 @@ class FleetBatteries:
         self.cells[drone] -= 1
         self._read_off(drone)
 
-    def land(self, drone: int) -> None:
-        """Take a drone out of the air, for good; its pack is at rest."""
+    def land(self, drone: int, why: str = "") -> None:
+        """Take a drone out of the air, for good; its pack is at rest. `why` is left out where its charge says it."""
         self.landed[drone] = True
+        self.why_landed[drone] = why or self._charge(drone)
         self.current_a[drone] = 0.0
         self._polarised_v[drone] = 0.0
         self._read_off(drone)
+
+    def _charge(self, drone: int) -> str:
+        return f"charge {self.soc[drone]:.1%}"
 
     def _lose(self, drone: int, fraction: float) -> None:
         lost = self.energy_left_j[drone] * fraction

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import simpy
@@ -38,8 +38,26 @@ def as_share(received: Received, trust: float = 1.0) -> Share:
     return Share(received.capture, name, payload.rho, disc, weight, received.missing)
 
 
-Moment = tuple[float, list[tuple[Capture, list[Share]]]]
-"""When, and each ego with what it holds."""
+Job = tuple[Capture, list[Share]]
+"""An ego's look, and what it holds of its peers."""
+
+
+class Ego(NamedTuple):
+    """One drone at one moment that is scored."""
+
+    here: Capture
+    """Where it is."""
+    job: Job | None
+    """What it fuses; None where its own look is too old for that, so that it sees nothing."""
+
+
+Moment = tuple[float, list[Ego]]
+"""When, and every ego."""
+
+
+def jobs_of(moment: Moment) -> list[Job]:
+    """What the detector is asked of a moment."""
+    return [ego.job for ego in moment[1] if ego.job is not None]
 
 
 class Scorer:
@@ -80,16 +98,13 @@ class Scorer:
 
     def _score(self) -> None:
         now_s = self._env.now
-        egos = [a for a in self._agents if a.airborne and a.latest is not None]
-        held = [self._fresh(a, now_s) for a in egos]
-        jobs = [
-            (a.latest, [as_share(r, a.trust_in(r.capture.drone)) for r in received])
-            for a, received in zip(egos, held, strict=True)
-            if a.latest is not None
-        ]
-        self._waiting.append((now_s, jobs))
+        moment: Moment = now_s, []
+        for agent in self._agents:
+            if agent.airborne and agent.here is not None and agent.latest is not None:
+                moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
+        self._waiting.append(moment)
         if self._ahead is not None:
-            self._begun.append(self._ahead.begin(jobs))
+            self._begun.append(self._ahead.begin(jobs_of(moment)))
             self.flush(but=1)
         elif self._many is None:
             self.flush()
@@ -99,33 +114,40 @@ class Scorer:
         n = len(self._waiting) - but
         waiting, self._waiting = self._waiting[:n], self._waiting[n:]
         begun, self._begun = self._begun[:n], self._begun[n:]
-        asked = [(t_s, ego, shares) for t_s, jobs in waiting for ego, shares in jobs]
+        asked = [(t_s, ego) for t_s, egos in waiting for ego in egos]
         if not asked:
             return
         rows, detector = self._recorder.rows, self._detector
         found: Iterable[Boxes]
         truths: Iterable[Boxes]
         if self._many is not None:
-            found = self._many.detect_many([jobs for _, jobs in waiting])
-            truths = self._many.truth_many([t_s for t_s, _, _ in asked], [ego for _, ego, _ in asked])
+            found = self._many.detect_many([jobs_of(moment) for moment in waiting])
+            truths = self._many.truth_many([t_s for t_s, _ in asked], [ego.here for _, ego in asked])
         else:
-            ready = begun or [partial(detector.detect, jobs) for _, jobs in waiting]
+            ready = begun or [partial(detector.detect, jobs_of(moment)) for moment in waiting]
             found = (boxes for wait in ready for boxes in wait())
-            truths = (detector.truth(t_s, ego) for t_s, ego, _ in asked)
-        for (now_s, ego, shares), boxes, truth in zip(asked, found, truths, strict=True):
-            rows["detections"].append((now_s, ego.drone, boxes))
-            rows["truths"].append((now_s, ego.drone, truth))
+            truths = (detector.truth(t_s, ego.here) for t_s, ego in asked)
+        each = iter(found)
+        for (now_s, ego), truth in zip(asked, truths, strict=True):
+            boxes, shares = (Boxes.empty(), []) if ego.job is None else (next(each), ego.job[1])
+            drone = ego.here.drone
+            rows["detections"].append((now_s, drone, boxes))
+            rows["truths"].append((now_s, drone, truth))
             rows["fusions"].append(
                 (
-                    now_s, ego.drone, [s.capture.drone for s in shares], [s.representation for s in shares],
+                    now_s, drone, [s.capture.drone for s in shares], [s.representation for s in shares],
                     [now_s - s.capture.t_s for s in shares], [s.weight for s in shares], len(boxes), len(truth),
                 )
             )  # fmt: skip
 
-    def _fresh(self, agent: Agent, now_s: float) -> list[Received]:
-        """What the agent holds that is young enough, by ascending peer."""
-        limit_s = self._scenario.perception.max_age_s + 1e-9
-        return [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
+    def _job(self, agent: Agent, look: Capture, now_s: float) -> Job | None:
+        """The agent's look and what it holds, by ascending peer, of what is young enough; None where it rested too long."""
+        config = self._scenario.perception
+        limit_s = config.max_age_s + 1e-9
+        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # what a look takes anyhow
+            return None
+        held = [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
+        return look, [as_share(r, agent.trust_in(r.capture.drone)) for r in held]
 
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:

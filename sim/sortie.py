@@ -39,8 +39,9 @@ from sim.world import World, route_bounds
 
 VERSION = version("sortie-sim")
 KEY_ID = 1
-PHASE_SHARE = 0.1
-"""Drones act within the first tenth of a frame, each at its own moment: clocks disciplined, not locked."""
+PHASE_SHARE, PHASE_S = 0.1, 0.01
+"""Drones act within the first tenth of a frame, and within its first 10 ms, each at its own moment: clocks disciplined,
+not locked."""
 
 
 class Observer(Protocol):
@@ -157,7 +158,7 @@ def run_sortie(
             modem=ether.modem(i),
             log=notes,
             sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
-            phase_s=PHASE_SHARE * scenario.frame_s * stream(seed, replication, i, "phase").random(),
+            phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
             handshake_bytes=flight_plan.first.handshake_bytes,
         )
         for i in range(n)

@@ -82,6 +82,7 @@ class World:
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
         self._frame = 0
+        self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
         self.airtime_share = [0.0] * n
         self.now = plan.at(0.0)
         """The mission in this frame: the ground station's cue comes with the frame."""
@@ -135,10 +136,11 @@ class World:
         """Take drones whose battery gave out off the plane and the air."""
         for agent, landed in zip(self.agents, self.batteries.landed, strict=True):
             if landed and agent.airborne:
-                self.remove(agent.drone, "landed", f"charge {self.batteries.soc[agent.drone]:.1%}")
+                self.remove(agent.drone, "landed", self.batteries.why_landed[agent.drone])
 
     def remove(self, drone: int, kind: str, text: str) -> None:
-        """A drone leaves the sortie: it is silent from now on and draws nothing."""
+        """A drone leaves the sortie: it is silent from now on, draws nothing, and stays where it is."""
+        self._down_since.setdefault(drone, int(self.env.now / self._scenario.frame_s + 1e-6))
         self.agents[drone].stop()
         self.air.silence(drone)
         self.batteries.land(drone)
@@ -191,8 +193,13 @@ class World:
         """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
         now_s, frames, *changing = zip(*rows, strict=True)
         n, m = len(self.agents), self.motion
-        known = (m.position_m, m.orientation_xyzw, m.velocity_mps, m.body_rates_radps)
-        flown = np.concatenate([states[list(frames)] for states in known], axis=-1).reshape(len(rows) * n, -1)
+        at = np.tile(np.array(frames)[:, None], n)
+        for drone, since in self._down_since.items():
+            at[:, drone] = np.minimum(at[:, drone], since)
+        of, still = np.arange(n), (at < np.array(frames)[:, None])[..., None]
+        pose = (m.position_m[at, of], m.orientation_xyzw[at, of])
+        moving = [np.where(still, 0.0, states[at, of]) for states in (m.velocity_mps, m.body_rates_radps)]
+        flown = np.concatenate([*pose, *moving], axis=-1).reshape(len(rows) * n, -1)
         return [
             np.repeat(now_s, n),
             np.tile(range(n), len(rows)),

@@ -230,7 +230,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.sample_rate_hz": ("5", ()),
     "perception.fusion_delay_s": ("0.2", ()),
     "perception.max_age_s": ("0.05", ()),
-    "perception.motion_compensation": ("false", ("perception.compute_delay_s=0.12",)),
+    "perception.motion_compensation": ("false", ("perception.fusion_delay_s=0.042",)),
     "perception.score_threshold": ("0.5", ()),
     "perception.cells_by": ("norm", ()),
     "perception.join": ("average", ("policy.name=boxes",)),
