@@ -21,7 +21,7 @@ from fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from fleet.gate import Gate, Payload, make_payload
 from fleet.senses import Sensed
 from fleet.staleness import LinkHealth, cap_by_age, health
-from fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge
+from fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
 from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from perception.types import Capture
 from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
@@ -213,7 +213,9 @@ class Agent:
         if self._rules.trust:
             took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
             self._arrivals.setdefault(peer, []).append(
-                Arrival(0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps)
+                Arrival(
+                    0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
+                )
             )
         if self.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
             self.held[peer] = received
@@ -292,8 +294,12 @@ class Agent:
         """Hold what peers claimed in the last second against what is known otherwise."""
         now_s, before = self.env.now, self._standings
         heard = {i: self._claims[i] for i in self._known if now_s - self._heard_at_s[i] <= self._fresh_s}
-        self._standings = after = judge(before, self.drone, heard, self._arrivals, self._rules.form)
-        self._arrivals = {}
+        arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
+        for i, came in self._arrivals.items():
+            told_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
+            arrivals[i], later = could_tell(came, told_s)
+            self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
+        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form)
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
         for peer in heard:
             if after[peer].trust != before.get(peer, UNJUDGED).trust:

@@ -42,6 +42,8 @@ JUMP = 0.05
 """A fall by so much within a second is a fault, or a lie that begins; either way the charge is watched anew."""
 RISE = 0.03
 """Charge that may come back: estimators of real drones correct themselves by a few percent."""
+PERCENT = 0.01
+"""Estimators that tell charge in whole percents let it fall in steps: so much of a fall may go unseen."""
 FALL, FALL_SHARE = 0.005, 0.1
 """When the fleet's charge fell by so much in the median, who fell by less than this share of it is doubted: even a
 battery of ten times the others' capacity falls that far."""
@@ -58,6 +60,8 @@ class Arrival(NamedTuple):
     """From its capture, compute delay taken off, to its last byte."""
     phy_mbps: float
     """The data rate of its frames, as its receiver's radio knows it; infinite where it does not."""
+    t_done_s: float = -math.inf
+    """When its last byte came."""
 
     @property
     def mbps(self) -> float:
@@ -76,6 +80,8 @@ class Standing(NamedTuple):
     first_soc: float = 0.0
     """Its charge when it was first judged."""
     least_soc: float = 1.0
+    fine: bool = False
+    """Whether it ever told its charge more finely than in whole percents."""
 
     @property
     def trust(self) -> float:
@@ -119,20 +125,27 @@ def judge(
             doubt = (
                 (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
                 or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
-                or battery_doubt(claim.battery_soc, standing.least_soc, standing.first_soc, others_fell, form.soc_step)
+                or battery_doubt(
+                    claim.battery_soc,
+                    standing.least_soc,
+                    standing.first_soc,
+                    others_fell,
+                    max(3 * form.soc_step, 0.0 if standing.fine else PERCENT),
+                )
             )
         strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
         least_soc = min(standing.least_soc, claim.battery_soc)
-        after[peer] = Standing(strikes, doubt or standing.reason, standing.seconds, standing.first_soc, least_soc)
+        after[peer] = standing._replace(strikes=strikes, reason=doubt or standing.reason, least_soc=least_soc)
     return after
 
 
 def _aged(standing: Standing, soc: float) -> Standing:
     """The standing a second later; who is judged for the first time, or fell at once, begins with its charge."""
-    strikes, reason, seconds, first_soc, least_soc = standing
+    strikes, reason, seconds, first_soc, least_soc, fine = standing
+    fine = fine or abs(soc / PERCENT - round(soc / PERCENT)) > 1e-4
     if seconds == 0 or soc < least_soc - JUMP:
-        return Standing(strikes, reason, 1, soc, soc)
-    return Standing(strikes, reason, seconds + 1, first_soc, least_soc)
+        return Standing(strikes, reason, 1, soc, soc, fine)
+    return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine)
 
 
 def discounted(d: Descriptor) -> Descriptor:
@@ -187,7 +200,7 @@ def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival]) -> str:
 
 
 def battery_doubt(
-    claimed_soc: float, least_soc: float, first_soc: float, others_fell: float, soc_step: float = 0.0
+    claimed_soc: float, least_soc: float, first_soc: float, others_fell: float, unseen: float = 0.0
 ) -> str:
     """What a charge says against the past and the fleet's; empty where it may be so.
 
@@ -195,14 +208,19 @@ def battery_doubt(
         claimed_soc: the claim.
         least_soc, first_soc: the least that it claimed before, and the first.
         others_fell: by how much the fleet's charge fell since the first, in the median.
-        soc_step: the least difference that shows.
+        unseen: how far it may fall before that shows in a claim.
     """
     if claimed_soc > least_soc + RISE:
         return f"battery: {claimed_soc:.0%} after {least_soc:.0%}"
     fell = first_soc - claimed_soc
-    if others_fell >= FALL + 3 * soc_step and fell < FALL_SHARE * others_fell:
+    if others_fell >= FALL + unseen and fell < FALL_SHARE * others_fell:
         return f"battery: fell by {fell:.1%} while the fleet's fell by {others_fell:.1%}"
     return ""
+
+
+def could_tell(arrivals: Sequence[Arrival], told_s: float) -> tuple[list[Arrival], list[Arrival]]:
+    """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next."""
+    return [a for a in arrivals if a.t_done_s <= told_s], [a for a in arrivals if a.t_done_s > told_s]
 
 
 def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:

@@ -418,7 +418,12 @@ class Perception(Section):
     )
     compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
     fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
-    max_age_s: float = Field(0.5, gt=0, le=60, description="Received payloads older than this are not fused; a drone that rested longer sees nothing.")
+    max_age_s: float = Field(
+        0.5,
+        gt=0,
+        le=60,
+        description="Received payloads older than this are not fused; a drone that rested longer sees nothing.",
+    )
     motion_compensation: bool = Field(
         True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
     )

@@ -27,7 +27,8 @@ class Ether:
     def __init__(
         self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None, rates_mbps: Sequence[float]
     ) -> None:
-        """Args: `keys` by key id, None where descriptors go unauthenticated; `rates_mbps` of the channel by MCS."""
+        """Args: `keys` by key id, None where descriptors go unauthenticated; `rates_mbps` of the channel by MCS, none where
+        links are traced: then what a frame's rate is told is not what it came at."""
         self._rates_mbps = rates_mbps
         self.agents: Sequence[Agent] = ()
         self.air = air

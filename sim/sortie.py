@@ -119,7 +119,8 @@ def run_sortie(
     plan = MissionPlan(scenario.mission)
     world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
     keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
-    ether = Ether(air, recorder, keys=keys, rates_mbps=STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz])
+    rates_mbps = STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz] if air_of.trace is None else ()
+    ether = Ether(air, recorder, keys=keys, rates_mbps=rates_mbps)
     detector = detector_of(scene, config, seed, replication)
 
     def count_boxes(capture: Capture, roi: Disc | None) -> int:

@@ -15,6 +15,7 @@ from fleet.trust import (
     Arrival,
     Standing,
     battery_doubt,
+    could_tell,
     coverage_doubt,
     discounted,
     goodput_doubt,
@@ -143,6 +144,27 @@ def test_battery_against_the_past_and_the_fleet() -> None:
     assert battery_doubt(0.95, 0.95, 0.95, 0.004) == "", "too early to say"
     assert battery_doubt(0.95, 0.95, 0.95, 0.02) == "battery: fell by 0.0% while the fleet's fell by 2.0%"
     assert battery_doubt(0.945, 0.945, 0.95, 0.02) == "", "a battery four times as large"
+
+
+def test_a_charge_in_whole_percents_is_no_lie() -> None:
+    """As a real drone's telemetry has it: a step every 25 s. One that never falls is found all the same, a percent later."""
+    standings: dict[int, Standing] = {}
+    trust: list[tuple[float, ...]] = []
+    for second in range(150):
+        known = {i: honest(i, 20.0 * i, soc=0.9 - 0.0004 * second) for i in range(5)}
+        for i, soc in ((1, round(known[1].battery_soc, 2)), (2, 0.9)):
+            known[i] = known[i]._replace(battery_soc=soc)
+        standings = judge(standings, 0, known, {})
+        trust.append(tuple(s.trust for s in standings.values()))
+    assert {t[:2] + t[3:] for t in trust} == {(1.0, 1.0, 1.0, 1.0)}
+    assert trust[37][2] == 1.0
+    assert trust[60][2] == 0.0
+
+
+def test_a_claim_answers_for_what_came_before_it() -> None:
+    came = [Arrival(160_000, 0.02, 600.0, t_done_s) for t_done_s in (1.0, 2.0, 3.0)]
+    assert could_tell(came, 2.0) == (came[:2], came[2:])
+    assert could_tell(came, 0.5) == ([], came)
 
 
 def test_a_fault_is_no_lie() -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
 from scenarios.load import load
+from sim.named import policy_overrides
 from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
@@ -82,3 +87,35 @@ def test_honest_fleets_doubt_nobody_and_fly_as_without_trust(policy: str) -> Non
     )
     assert outcome(trusting)["distrusted_by"] == {}
     assert trusting.fingerprint == without.fingerprint
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 1, 2, 5])
+def test_honest_fleets_doubt_nobody_at_any_rate_of_the_plane(rate_hz: float) -> None:
+    """A claim that is a second old says nothing of what came since."""
+    asked = ["perception.detector=none", "duration_s=20", f"context.rate_hz={rate_hz}", "fleet.drones=4"]
+    for seed in (1, 2, 3):
+        record = run_sortie(load("track_target", [*asked, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        assert record.tables["transmissions"].num_rows > 50
+        assert outcome(record)["distrusted_by"] == {}
+
+
+def test_honest_traces_are_not_doubted(tmp_path: Path) -> None:
+    """A charge in whole percents, and links that carry more than the channel's own frames could."""
+    drones, links = tmp_path / "drones.csv", tmp_path / "links.csv"
+    drones.write_text(
+        "t_s,drone,soc\n"
+        + "".join(f"{25 * k},1,{0.9 - k / 100:.2f}\n{25 * k + 24.9},1,{0.9 - k / 100:.2f}\n" for k in range(3))
+    )
+    links.write_text("t_s,sender,receiver,goodput_mbps\n0,0,1,2000\n0,1,0,2000\n")
+    asked = [
+        "perception.detector=none",
+        "duration_s=60",
+        "fleet.drones=4",
+        f"fleet.trace={drones}",
+        f"radio.trace={links}",
+    ]
+    record = run_sortie(load("track_target", asked))
+    told = record.tables["descriptors"].filter(pc.equal(record.tables["descriptors"]["drone"], 1))
+    assert set(np.round(told["soc"].to_numpy(), 4)) == {0.9, 0.89, 0.88}
+    assert max(map(max, told["goodput_mbps"].to_pylist())) > 900  # half more than the channel's fastest frames
+    assert outcome(record)["distrusted_by"] == {}

@@ -80,7 +80,9 @@ def test_a_drone_that_rests_sees_nothing_and_is_judged_where_it_is() -> None:
 
 def test_a_link_that_waits_for_its_dwell_keeps_perception_awake() -> None:
     """A drone's duty is the highest of its links', those whose first directive is not yet in force among them."""
-    record = run_sortie(example(*SEEING, "perception.sample_rate_hz=10", "policy.dwell_s=2", "duration_s=1"), one_link_asks)
+    record = run_sortie(
+        example(*SEEING, "perception.sample_rate_hz=10", "policy.dwell_s=2", "duration_s=1"), one_link_asks
+    )
     seen = of(record, "fusions", 0)
     assert len(set(seen["t_s"])) == 10
     compute_j = {r["energy_j"] for r in record.tables["energy"].to_pylist() if r["cause"] == "compute"}
@@ -89,7 +91,9 @@ def test_a_link_that_waits_for_its_dwell_keeps_perception_awake() -> None:
 
 
 def test_who_leaves_the_air_stays_where_that_was() -> None:
-    events = "events=[{kind: drone_lost, at_s: 2.05, drone: 1}, {kind: battery_fault, at_s: 3, drone: 2, lost_fraction: 1}]"
+    events = (
+        "events=[{kind: drone_lost, at_s: 2.05, drone: 1}, {kind: battery_fault, at_s: 3, drone: 2, lost_fraction: 1}]"
+    )
     lost, faulty, flying = (of(run_sortie(example(*FAST[2:], events)), "states", drone) for drone in (1, 2, 0))
     for states, since_s in ((lost, 2.0), (faulty, 3.0)):
         down = states["t_s"] > since_s + 1e-6
