@@ -124,15 +124,18 @@ class Pilot:
         self.drone, self.policy, self._wish = drone, plan.first, wish
         self._look = viewpoint_of(plan.first.decide)
         self.agent: Agent | None = None
-        self._by_phase = {_PHASES[c.phase]: then for c, then in plan.changes if c.phase is not None}
+        changes = enumerate(plan.changes)
+        self._by_phase = {_PHASES[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
+        self._place = -1  # in the list of changes, of the last one since the last decision
         self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
         self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
         self._phase: TaskPhase | None = None
         self._shown: FleetView | None = None
         self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
 
-    def take_over(self, policy: Named, why: str) -> None:
-        """From the next decision on, `policy` decides."""
+    def take_over(self, policy: Named, why: str, place: int) -> None:
+        """From the next decision on, `policy` decides; `place` is the change's in the scenario's list."""
+        self._place = place
         if policy.name != self.policy.name:
             self._audit.took_over(self.drone, self.policy.name, policy.name, why)
             self.policy, self._look = policy, viewpoint_of(policy.decide)
@@ -149,6 +152,7 @@ class Pilot:
         """The agent's policy: the present policy's directives, put right where there is a shield."""
         if self._by_phase:
             self._follow_phase(view)
+        self._place = -1
         decisions = self._audit.decisions
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
         if self._look is not None and self._wish is not None:
@@ -165,9 +169,9 @@ class Pilot:
         me = view.me
         if me is not None and me.task_phase != self._phase:
             self._phase = me.task_phase
-            policy = self._by_phase.get(me.task_phase)
-            if policy is not None:
-                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}")
+            place, policy = self._by_phase.get(me.task_phase, (-1, self.policy))
+            if place > self._place:  # else a later one of the list came with the phase
+                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}", place)
 
     def _looked(self, view: FleetView) -> Reposition | None:
         """Where the policy asks to look from."""
@@ -224,21 +228,25 @@ class Pilot:
 
 
 def schedule_policies(env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent]) -> None:
-    """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant."""
+    """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
+    two changes at one instant the later in the list comes last."""
     for pilot, agent in zip(pilots, agents, strict=True):
         pilot.agent = agent
-    for change, policy in plan.changes:
+    due: list[tuple[float, int, Callable[[], None]]] = []
+    for place, (change, policy) in enumerate(plan.changes):
         if change.at_s is not None:
-            at(env, change.at_s, partial(_take_over, pilots, policy, f"time {change.at_s:g} s"))
-    for at_s, word, drones in plan.commands:
-        told = [p for p in pilots if not drones or p.drone in drones]
-        for change, policy in plan.changes:
+            act = partial(_take_over, pilots, policy, f"time {change.at_s:g} s", place)
+            due.append((change.at_s, place, act))
+        for at_s, word, drones in plan.commands:
             if change.command == word:
-                at(env, at_s, partial(_take_over, told, policy, f"command {word!r}"))
+                told = [p for p in pilots if not drones or p.drone in drones]
+                due.append((at_s, place, partial(_take_over, told, policy, f"command {word!r}", place)))
+    for at_s, _, act in sorted(due, key=lambda entry: entry[:2]):
+        at(env, at_s, act)
     for at_s, drone, view in plan.replays:
         at(env, at_s, partial(pilots[drone].show, view))
 
 
-def _take_over(pilots: Sequence[Pilot], policy: Named, why: str) -> None:
+def _take_over(pilots: Sequence[Pilot], policy: Named, why: str, place: int) -> None:
     for pilot in pilots:
-        pilot.take_over(policy, why)
+        pilot.take_over(policy, why, place)

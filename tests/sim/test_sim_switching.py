@@ -72,6 +72,28 @@ def test_no_frame_is_lost_or_sent_twice_at_a_change() -> None:
         assert list(frames) == list(range(frames[0], last + 1)), f"a frame of {link} was lost"
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("phase: track, name: boxes", "at_s: 3, name: silence"),
+        ("at_s: 3, name: boxes", "phase: track, name: silence"),
+        ("command: go, name: boxes", "at_s: 3, name: silence"),
+        ("at_s: 3, name: boxes", "command: go, name: silence"),
+        ("phase: track, name: boxes", "command: go, name: silence"),
+    ],
+)
+def test_of_two_changes_at_once_the_later_in_the_list_stays(first: str, second: str) -> None:
+    """The example's phase changes at 3 s, too."""
+    both = f"policy.changes=[{{{first}}}, {{{second}}}]"
+    go = ["policy.commands=[{at_s: 3, command: go}]"] if "go" in both else []
+    record = run_sortie(example(both, *go))
+    decided = {row["policy"] for row in rows(record, "directives") if row["t_s"] > 3.5}
+    assert decided <= {"silence"}
+    assert "silence" in outcome(record)["policies"]["decisions"]
+    by_hand = run_sortie(example("policy.changes=[{at_s: 3, name: silence}]"))
+    assert outcome(record)["policies"]["decisions"]["silence"] == outcome(by_hand)["policies"]["decisions"]["silence"]
+
+
 def test_a_change_by_phase_is_each_drones_own_and_in_the_audit() -> None:
     record = run_sortie(example("policy.changes=[{phase: track, name: best-2, params: {rho: 0.1}}]"))
     told = rows(record, "events", kind="policy")
