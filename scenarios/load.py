@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from scenarios.contexts import Contexts
 from scenarios.explain import explain
+from scenarios.files import found_beside
 from scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, child, nearest, plain, problems
 from scenarios.schema import Scenario
 
@@ -44,13 +45,15 @@ def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     """Read a scenario from a file, or from the library by its bare name.
 
     Args:
-        path_or_name: a path, or the name of a library file such as `track_target`.
+        path_or_name: a path, or the name of a library file such as `track_target`. Files that it names are looked for
+            from here, then from where it lies.
         overrides: `key.path=value` as after `--set`; list entries by index, the value as YAML.
 
     Raises:
         ScenarioError: one line that says which file, line and field, what is wrong and the bound.
     """
-    return loads(*read(path_or_name), overrides)
+    text, source = read(path_or_name)
+    return found_beside(loads(text, source, overrides), Path(source).parent)
 
 
 def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> Scenario:

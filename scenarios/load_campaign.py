@@ -23,6 +23,7 @@ from scenarios.campaign import (
     Triangular,
     Uniform,
 )
+from scenarios.files import found_beside
 from scenarios.load import campaigns, library, load, read, tree, validated
 from scenarios.nodes import Node, ScenarioError, assign, plain
 from scenarios.schema import Scenario
@@ -37,6 +38,8 @@ class Study:
     """With `set` put in, and without its own expectations."""
     columns: dict[str, tuple[Any, ...]]
     """By varied field: the values of a file's column."""
+    folder: Path
+    """Where it lies: files that its policies are in are looked for there too."""
 
 
 def load_campaign(path_or_name: str | Path) -> Study:
@@ -56,7 +59,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
     resolved = as_node(base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}, source)
     for name, node in written.items():
         resolved = assign(resolved, name.split("."), _relined(node))
-    base = validated(resolved, Scenario)
+    base = found_beside(validated(resolved, Scenario), here)
     columns: dict[str, tuple[Any, ...]] = {}
     varied = _section(root, "vary")
     for name, spread in campaign.vary.items():
@@ -68,7 +71,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
         for value in _extremes(spread, columns.get(name, ())):
             node = as_node(value, varied[name].source, varied[name].line)
             validated(assign(resolved, name.split("."), node), Scenario)
-    return Study(campaign, base, columns)
+    return Study(campaign, base, columns, here)
 
 
 def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

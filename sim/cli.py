@@ -317,8 +317,15 @@ def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) ->
 def _load(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario:
     """The scenario with `--set` and the policy put in; another policy than its own starts from its own defaults."""
     overrides = list(set_ or [])
-    flown = load(scenario, overrides)
-    return flown if policy is None else load(scenario, overrides + policy_overrides(policy, flown.policy.name))
+    own = load(scenario, overrides)
+    if policy is None:
+        return own
+    flown = load(scenario, overrides + policy_overrides(policy, own.policy.name))
+    if own.policy.changes and not flown.policy.changes:
+        err.print(
+            f"{policy} flies to the end: the changes and commands of {own.name} are its own policy's", soft_wrap=True
+        )
+    return flown
 
 
 def _with_own_fusion(scenario: Scenario) -> Scenario:

@@ -74,6 +74,8 @@ def run(
         report(folder)
     else:
         out.print(f"kept in [bold]{folder}[/bold]")
+    if done.failed:
+        raise typer.Exit(1)
 
 
 @app.command("report")

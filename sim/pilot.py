@@ -235,8 +235,7 @@ def schedule_policies(env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot
     due: list[tuple[float, int, Callable[[], None]]] = []
     for place, (change, policy) in enumerate(plan.changes):
         if change.at_s is not None:
-            act = partial(_take_over, pilots, policy, f"time {change.at_s:g} s", place)
-            due.append((change.at_s, place, act))
+            due.append((change.at_s, place, partial(_take_over, pilots, policy, f"time {change.at_s:g} s", place)))
         for at_s, word, drones in plan.commands:
             if change.command == word:
                 told = [p for p in pilots if not drones or p.drone in drones]

@@ -26,7 +26,7 @@ class Progress:
     """Runs whose rows are on disk, those of earlier drivers too."""
     of: int
     failed: int
-    """Of those that this driver got."""
+    """Of those."""
     flown: int
     """By this driver."""
     seconds: float
@@ -66,7 +66,7 @@ def run_campaign(
 def _drive(plan: Plan, store: Store, engine: Engine, progress: Callable[[Progress], None]) -> Progress:
     stop = Stop(plan)
     frontier = 0
-    begin_s, flown, failed = time.perf_counter(), 0, 0
+    begin_s, flown = time.perf_counter(), 0
 
     def enough() -> bool:
         """Look at finished parts in their order, so that it is the same whoever finished first."""
@@ -79,7 +79,7 @@ def _drive(plan: Plan, store: Store, engine: Engine, progress: Callable[[Progres
         return False
 
     def state(of: int) -> Progress:
-        return Progress(min(store.finished, of), of, failed, flown, time.perf_counter() - begin_s)
+        return Progress(min(store.finished, of), of, store.failed, flown, time.perf_counter() - begin_s)
 
     def tasks() -> Iterator[Task]:
         for run in store.missing():
@@ -91,7 +91,6 @@ def _drive(plan: Plan, store: Store, engine: Engine, progress: Callable[[Progres
     for results in engine.results(plan.code, tasks()):
         store.add(results)
         flown += len(results)
-        failed += sum(r.status == "failed" for r in results)
         if enough():
             return state(store.runs_of(frontier - 1).stop)
         progress(state(plan.runs))

@@ -20,10 +20,12 @@ import numpy as np
 from perception.surrogate.model import SHIPPED
 from policies.registry import resolve
 from scenarios.campaign import Campaign
+from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
 from scenarios.load import loads
 from scenarios.load_campaign import Study, as_node
 from scenarios.nodes import assign, plain
 from scenarios.schema import Scenario
+from scenarios.traces import located
 from sim.campaign.code import code_version, file_digest
 from sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
 from sim.campaign.work import number, task_key
@@ -163,42 +165,52 @@ def make_plan(study: Study) -> Plan:
         RunError: a metric that no outcome has, or a file that cannot be read.
     """
     campaign, base = study.campaign, study.base
-    sections = base.model_dump(mode="json", exclude_none=True)
-    for name in sections["perception"].keys() & {"weights", "recording"}:  # a worker may stand elsewhere
-        sections["perception"][name] = str(Path(sections["perception"][name]).resolve())
-    policies = [(label or base.policy.name, _policy(label, base)) for label in campaign.policies]
+
+    def place(name: str) -> str:
+        """From anywhere: a worker may stand elsewhere."""
+        return str(located(Path(placed(name, study.folder))).resolve())
+
+    sections = with_files(base.model_dump(mode="json", exclude_none=True), place)
+    policies = [
+        (label or base.policy.name, with_files({"policy": _policy(label, base, study.folder)}, place)["policy"])
+        for label in campaign.policies
+    ]
+    asked, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
+    named = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
+    for field in sorted(campaign.vary.keys() & set(FIELDS)):
+        room, _, key = field.partition(".")
+        holder, within = (columns, field) if field in columns else (asked["vary"][field], "values")
+        varied = [with_files({room: {key: name}}, place) for name in holder[within]]
+        holder[within] = [section[room][key] for section in varied]
+        named += varied
     _check_metrics(campaign, base)
     return Plan(
         {
             "format": FORMAT,
-            "campaign": campaign.model_dump(mode="json"),
+            "campaign": asked,
             "base": sections,
-            "columns": {name: list(values) for name, values in study.columns.items()},
+            "columns": columns,
             "policies": [[label, section] for label, section in policies],
-            "files": _files(base, [section["name"] for _, section in policies]),
+            "files": _files(base, [file for some in named for file in named_files(some)]),
             "code": code_version(),
         }
     )
 
 
-def _policy(label: str, base: Scenario) -> dict[str, Any]:
-    """A policy's name and parameters, checked; a file's path made absolute, for workers elsewhere."""
+def _policy(label: str, base: Scenario, folder: Path) -> dict[str, Any]:
+    """What a policy's runs have in the scenario's section: another than the base's own flies to the end."""
     if label:
         text = json.dumps(base.model_dump(mode="json", exclude_none=True))
-        base = loads(text, label, policy_overrides(label, base.policy.name))
+        base = found_beside(loads(text, label, policy_overrides(label, base.policy.name)), folder)
     resolve(base.policy.name, base.policy.params)
-    path, colon, function = base.policy.name.rpartition(":")
-    name = f"{Path(path).resolve()}:{function}" if colon else base.policy.name
-    return {"name": name, "params": dict(base.policy.params)}
+    section = base.policy.model_dump(mode="json", exclude_none=True)
+    return {name: section[name] for name in ("name", "params", "changes", "commands")}
 
 
-def _files(base: Scenario, policies: list[str]) -> dict[str, str]:
+def _files(base: Scenario, named: list[str]) -> dict[str, str]:
     """Digests of the files that runs read beside the code, by path."""
-    paths = [Path(name.rpartition(":")[0]) for name in policies if ":" in name]
+    paths = [Path(name) for name in named]
     config = base.perception
-    paths += [Path(p).resolve() for p in (config.weights, config.recording) if p is not None]
-    if config.recorded_fusion is not None:
-        paths.append(Path(config.recorded_fusion.rpartition(":")[0]))
     if config.detector == "surrogate" and config.weights is None:
         paths.append(SHIPPED)
     if config.detector == "torch" and config.weights is None:

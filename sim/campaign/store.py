@@ -105,6 +105,7 @@ class Store:
             write_text(folder / MANIFEST, text)
         self._left = {shard: len(self.runs_of(shard)) for shard in range(self.shards)}
         self._known: dict[int, set[int]] = {}
+        self._failed: dict[int, int] = {}
         self._recover()
 
     # --- parts and what is in them -----------------------------------------------------------------
@@ -127,6 +128,11 @@ class Store:
     def finished(self) -> int:
         """Runs whose rows are on disk."""
         return self.plan.runs - sum(self._left.values())
+
+    @property
+    def failed(self) -> int:
+        """Of those, the ones that failed."""
+        return sum(self._failed.values())
 
     def missing(self, shards: Iterable[int] | None = None) -> Iterator[int]:
         """Runs that have no row yet, in order."""
@@ -153,6 +159,7 @@ class Store:
             for shard, rows in by_shard.items():
                 self._append(shard, rows)
                 self._left[shard] -= len(rows)
+                self._failed[shard] = self._failed.get(shard, 0) + sum(row.status == "failed" for row in rows)
                 if self.is_done(shard):
                     self._write_part(shard)
                     complete.append(shard)
@@ -175,6 +182,7 @@ class Store:
         """Forget what was flown beyond a part: the campaign has stopped there."""
         for beyond in range(shard + 1, self.shards):
             self._close_journal(beyond)
+            self._failed.pop(beyond, None)
             for path in (self._journal(beyond), self.part(beyond)):
                 path.unlink(missing_ok=True)
 
@@ -239,8 +247,10 @@ class Store:
         for path in (self.folder / RUNS).glob(".part-*.partial"):
             path.unlink()
         for shard in range(self.shards):
-            if self.part(shard).is_file() and self._whole(shard):
+            statuses = self._statuses(shard) if self.part(shard).is_file() else None
+            if statuses is not None:
                 self._left[shard] = 0
+                self._failed[shard] = statuses.count("failed")
                 self._journal(shard).unlink(missing_ok=True)
         for path in sorted((self.folder / JOURNAL).glob("*.jsonl")):
             shard = int(path.stem)
@@ -251,15 +261,19 @@ class Store:
                 path.write_bytes(b"".join(map(_line, right.values())))
             self._known[shard] = set(right)
             self._left[shard] -= len(right)
+            self._failed[shard] = sum(r.status == "failed" for r in right.values())
             if self._left[shard] == 0:
                 self._write_part(shard)
 
-    def _whole(self, shard: int) -> bool:
+    def _statuses(self, shard: int) -> list[str] | None:
+        """How the runs of a part ended; None where it is no part of this campaign, or broken."""
         try:
-            meta = pq.read_schema(self.part(shard)).metadata or {}
+            table = pq.read_table(self.part(shard), columns=["status"])
         except (OSError, pa.ArrowInvalid):
-            return False
-        return meta.get(b"sortie.campaign") == self.plan.digest.encode()
+            return None
+        if (table.schema.metadata or {}).get(b"sortie.campaign") != self.plan.digest.encode():
+            return None
+        return [str(status) for status in table["status"].to_pylist()]
 
 
 def check_same(folder: Path, plan: Plan) -> None:

@@ -209,6 +209,10 @@ def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, command)
     assert "the record is the campaign's" in result.stdout
     assert (out / "outcome.json").is_file()
+    told = CliRunner().invoke(app, ["campaign", str(tmp_path / "small_ones.yaml"), "--out", str(folder), "--no-report"])
+    assert (told.exit_code, f"{done.failed} failed" in told.stdout) == (1, True), (
+        "nothing is flown; what failed is told"
+    )
 
 
 def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -> None:

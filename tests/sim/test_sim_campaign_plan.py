@@ -207,3 +207,34 @@ def test_a_scenario_is_no_campaign_and_the_library_tells_them_apart() -> None:
     with pytest.raises(ScenarioError, match="is a scenario, a campaign begins with `campaign: its_name`"):
         load_campaign("track_target")
     assert load_campaign("link_battery").campaign.campaign == "link_battery"
+
+
+def test_every_file_that_runs_read_is_in_the_key(tmp_path: Path) -> None:
+    """Traces, weights, policies, and files that are varied, wherever they lie: beside the base, or the campaign."""
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.csv").write_text("t_s,drone,soc\n0,0,0.5\n")
+    (tmp_path / "mine.py").write_text("def decide(view):\n    return []\n")
+    base = BASE + "radio: {trace: c.csv}\n"
+    (tmp_path / "c.csv").write_text("t_s,sender,receiver,loss\n0,0,1,0.5\n")
+    vary = "fleet.trace: {kind: grid, values: [a.csv, b.csv]}"
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
+    text = text.replace("worked", "'mine.py:decide'")
+    before = plan(tmp_path, text, base)
+    assert set(before.spec["files"]) == {str(tmp_path / f) for f in ("a.csv", "b.csv", "c.csv", "mine.py")}
+    sections = json.loads(before.task(0))["scenario"]
+    assert sections["radio"]["trace"] == str(tmp_path / "c.csv")
+    assert sections["fleet"]["trace"] == str(tmp_path / "a.csv")
+    assert sections["policy"]["name"] == f"{tmp_path / 'mine.py'}:decide"
+    for name in ("a.csv", "c.csv", "mine.py"):
+        (tmp_path / name).write_text((tmp_path / name).read_text() + "\n")
+        after = plan(tmp_path, text, base)
+        assert after.key(0) != before.key(0), name
+        before = after
+
+
+def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> None:
+    """As in `sortie compare`: the base's changes and commands are its own policy's."""
+    base = BASE + "policy: {name: worked, changes: [{at_s: 0.2, name: silence}]}\n"
+    own, other = (json.loads(plan(tmp_path, base=base).task(run))["scenario"]["policy"] for run in (0, 1))
+    assert (own["name"], [change["name"] for change in own["changes"]]) == ("worked", ["silence"])
+    assert (other["name"], other["changes"]) == ("best-2", [])

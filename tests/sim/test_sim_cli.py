@@ -256,6 +256,17 @@ def test_profile_tells_the_rooms_apart(scenario: Path, tmp_path: Path) -> None:
     assert all(room in done.stdout for room in ("sim", "fleet", "radio", "policies"))
 
 
+def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: Path) -> None:
+    scenario.write_text(BASE.replace("dwell_s: 0.3", "dwell_s: 0.3, changes: [{at_s: 0.5, name: silence}]"))
+    asked = ("fly", str(scenario), "--set", "duration_s=1", "--no-recording", "--out", str(tmp_path / "run"))
+    other = CliRunner().invoke(app, [*asked, "--policy", "boxes"])
+    assert "boxes flies to the end: the changes and commands of example are its own policy's" in other.stderr
+    assert rundir.load(tmp_path / "run").totals["policy_changes"] == 0
+    own = CliRunner().invoke(app, [*asked, "--policy", "worked"])
+    assert "flies to the end" not in own.stderr
+    assert rundir.load(tmp_path / "run").totals["policy_changes"] == 5
+
+
 def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
     missing = tmp_path / "none.safetensors"
     done = sortie("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")

@@ -1,0 +1,80 @@
+"""Files that a scenario names: where they are looked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
+from scenarios.load import load, loads
+
+TEXT = """
+name: own
+fleet: {trace: drones.csv}
+radio: {trace: links/l.csv}
+policy:
+  name: mine.py:decide
+  changes: [{at_s: 1, name: "other.py:decide"}, {at_s: 2, name: silence}]
+perception: {detector: recorded, recording: seen.zarr, recorded_fusion: "fuse.py:fuse"}
+"""
+FILES = ["drones.csv", "links/l.csv", "seen.zarr", "fuse.py", "mine.py", "other.py"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scenario with its files beside it; `seen.zarr` is a folder."""
+    for name in FILES:
+        path = tmp_path / name
+        if path.suffix == ".zarr":
+            path.mkdir()
+        else:
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+    (tmp_path / "own.yaml").write_text(TEXT)
+    return tmp_path
+
+
+def test_every_field_that_names_a_file_is_known() -> None:
+    assert sorted(named_files(loads(TEXT).model_dump(mode="json", exclude_none=True))) == sorted(FILES)
+    told = json.dumps(with_files(loads(TEXT).model_dump(mode="json", exclude_none=True), lambda name: f"here/{name}"))
+    assert all(f'"here/{name}' in told for name in FILES)
+    assert '"here/mine.py:decide"' in told
+    assert '"silence"' in told
+
+
+def test_files_beside_a_scenario_are_found_from_anywhere(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    own = load(folder / "own.yaml")
+    assert own.fleet.trace == str(folder / "drones.csv")
+    assert own.radio.trace == str(folder / "links/l.csv")
+    assert own.policy.name == f"{folder / 'mine.py'}:decide"
+    assert [change.name for change in own.policy.changes] == [f"{folder / 'other.py'}:decide", "silence"]
+    assert own.perception.recording == str(folder / "seen.zarr")
+    assert own.perception.recorded_fusion == f"{folder / 'fuse.py'}:fuse"
+    assert load(folder / "own.yaml", ["fleet.trace=none.csv"]).fleet.trace == "none.csv"
+
+
+def test_what_is_here_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    assert load(folder / "own.yaml") == loads(TEXT)
+    monkeypatch.chdir(folder.parent)
+    (folder.parent / "drones.csv").touch()
+    assert load(folder / "own.yaml").fleet.trace == "drones.csv"
+    (folder.parent / "drones.csv").unlink()
+
+
+def test_a_shipped_trace_is_one_that_is_here(tmp_path: Path) -> None:
+    (tmp_path / "paper_120s").mkdir()
+    (tmp_path / "paper_120s/links.csv").touch()
+    assert placed("paper_120s/links.csv", tmp_path) == "paper_120s/links.csv"
+    assert load("paper_context").radio.trace is not None
+
+
+def test_a_scenario_without_files_is_left_alone(tmp_path: Path) -> None:
+    plain = loads("name: plain")
+    assert found_beside(plain, tmp_path) is plain
+    assert len(FIELDS) == len(set(FIELDS))
