@@ -49,7 +49,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             **_accuracy(both),
             "detector": scenario.perception.detector,
             "calibration": record.calibration,
-            "sample_rate_hz": scenario.perception.sample_rate_hz,
+            "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
         },
         "bytes": {

@@ -10,6 +10,7 @@ import pytest
 from sim_examples import example
 
 from policies.contract import Directive, FleetView, Representation
+from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
@@ -45,6 +46,7 @@ def test_a_slow_plane_is_scored_on_the_present_look(rate_hz: float) -> None:
     record = run_sortie(example(*SEEING, f"context.rate_hz={rate_hz}", "policy.name=silence", "policy.params={}"))
     scored = round(6 * min(rate_hz, 1.0)) * 5
     assert record.tables["fusions"].num_rows == scored
+    assert outcome(record)["ap50"]["sample_rate_hz"] == min(rate_hz, 1.0)
     here = record.tables["states"].filter(pc.equal(record.tables["states"]["t_s"], 0.0))
     truth = record.tables["truths"].filter(pc.less(record.tables["truths"]["t_s"], 0.1))
     away_m = np.abs(truth["x_m"].to_numpy() - np.repeat(here["x_m"].to_numpy(), np.bincount(truth["drone"].to_numpy())))
