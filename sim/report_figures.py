@@ -146,7 +146,8 @@ def _accuracy(axes: Axes, record: SortieRecord) -> None:
         if points:
             axes.plot(*np.array(points).T, color=ink, label=label, linewidth=1.6)
     axes.set_ylim(0.0, 1.0)
-    axes.legend(loc="upper left", ncols=2)
+    if axes.get_lines():
+        axes.legend(loc="upper left", ncols=2)
 
 
 def _traffic(axes: Axes, record: SortieRecord) -> None:
@@ -172,7 +173,7 @@ def _goodput(axes: Axes, record: SortieRecord) -> None:
     if _drones(record) < 2:
         return
     drone, t_s = table["drone"].to_numpy(), _column(table, "t_s")
-    links = table["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(len(t_s), -1)
+    links = table["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(len(t_s), _drones(record) - 1)
     known = links > 0
     mean = np.where(known.any(axis=1), links.sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
     for i in range(_drones(record)):

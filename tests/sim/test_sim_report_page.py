@@ -120,6 +120,27 @@ def test_a_run_in_which_nothing_was_sent_has_a_page() -> None:
     assert "Nobody ever sent anything, and nothing happened to the fleet." in read.text
 
 
+ALL_LOST = "events=[{kind: drone_lost, at_s: 0, drone: 0}, {kind: drone_lost, at_s: 0, drone: 1}]"
+
+
+@pytest.mark.parametrize(
+    ("policy", "sets", "empty"),
+    [
+        ("worked", ("fleet.drones=2", ALL_LOST), ("descriptors", "transmissions", "directives", "fusions", "ages")),
+        ("worked", ("duration_s=0.05",), ("transmissions", "fusions")),
+        ("worked", ("fleet.drones=1",), ("transmissions", "directives")),
+        ("silence", (), ("transmissions",)),
+    ],
+    ids=["no descriptors", "no fusions", "one drone", "no transmissions"],
+)
+def test_a_table_without_rows_leaves_every_figure_whole(
+    policy: str, sets: tuple[str, ...], empty: tuple[str, ...]
+) -> None:
+    record = run_sortie(example("duration_s=2", "perception.detector=surrogate", *sets), policy)
+    assert [name for name in empty if record.tables[name].num_rows] == []
+    assert Page(page(record)).count["svg"] == 7
+
+
 def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
     rundir.save(record, tmp_path / "run")
     said = CliRunner().invoke(app, ["report", str(tmp_path / "run")])
