@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sim.campaign.rows import Rows, judged
+from sim.campaign.rows import Rows
 from sim.campaign.statistics import estimate
 
 MAX_METRICS, MAX_FIELDS = 6, 6
 COST = ("bytes.data_sent", "bytes.data_delivered", "data_rate_mbps", "energy_j.total")
 
 
-def costs(metrics: tuple[str, ...]) -> list[str]:
+def with_values(rows: Rows) -> list[str]:
+    """The campaign's metrics that some run has a value of; of the others nothing can be drawn or said."""
+    return [m for m in rows.plan.campaign.metrics if not np.isnan(rows.values(m)).all()]
+
+
+def costs(metrics: Sequence[str]) -> list[str]:
     """The metrics that accuracy is set against: bytes, and energy."""
     return [m for m in COST if m in metrics]
 
 
 def on_front(x: list[float], y: list[float]) -> list[bool]:
-    """Which points are Pareto-optimal: no other costs as little and sees as much, and one of both strictly."""
+    """Which points are Pareto-optimal: no other costs as little and sees as much, and one of both strictly.
+
+    A point that lacks a value is not: it stands nowhere.
+    """
     return [
-        not any(
+        not (math.isnan(x[i]) or math.isnan(y[i]))
+        and not any(
             (a <= x[i] and b >= y[i] and (a < x[i] or b > y[i]))
             for j, (a, b) in enumerate(zip(x, y, strict=True))
             if j != i
@@ -33,9 +44,9 @@ def on_front(x: list[float], y: list[float]) -> list[bool]:
 
 def draw_varied(rows: Rows, path: Path) -> bool:
     """Metrics (rows) over varied fields (columns), a line a policy, whiskers 95 %; whether there is anything to draw."""
-    metrics = list(rows.plan.campaign.metrics[:MAX_METRICS])
+    metrics = with_values(rows)[:MAX_METRICS]
     fields = [f for f in rows.plan.campaign.vary if rows.bins(f)][:MAX_FIELDS]
-    if not fields:
+    if not metrics or not fields:
         return False
     figure, axes = _axes(len(metrics), len(fields))
     for r, metric in enumerate(metrics):
@@ -67,8 +78,8 @@ def draw_varied(rows: Rows, path: Path) -> bool:
 
 def draw_pareto(rows: Rows, path: Path) -> bool:
     """Accuracy against each cost, a point a policy with both intervals; whether there is anything to draw."""
-    accuracies = [m for m in judged(rows.plan.campaign.metrics) if m.startswith("ap50.")]
-    prices = costs(rows.plan.campaign.metrics)
+    metrics = with_values(rows)
+    accuracies, prices = [m for m in metrics if m.startswith("ap50.")], costs(metrics)
     if not accuracies or not prices:
         return False
     figure, axes = _axes(len(accuracies), len(prices))

@@ -6,10 +6,8 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from sim.campaign.contexts import contexts, rule, winner
-from sim.campaign.figures import costs, draw_pareto, draw_varied, on_front
+from sim.campaign.figures import costs, draw_pareto, draw_varied, on_front, with_values
 from sim.campaign.rows import Rows, figure, judged, read_rows
 from sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sim.campaign.statistics import Estimate, estimate, paired
@@ -72,10 +70,13 @@ def _by_policy(rows: Rows) -> Iterator[str]:
     for metric in rows.plan.campaign.metrics:
         means = rows.by_unit(metric)
         yield _row(metric, *(_interval(estimate(means[:, p])) for p in range(len(labels))))
+    valued = with_values(rows)
+    if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
+        yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
     if len(labels) > 1:
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
         yield _header("metric", *labels[1:])
-        for metric in rows.plan.campaign.metrics:
+        for metric in valued:
             found = [paired(*rows.pair(metric, 0, p)) for p in range(1, len(labels))]
             yield _row(
                 metric,
@@ -87,12 +88,13 @@ def _by_policy(rows: Rows) -> Iterator[str]:
 
 
 def _varied(rows: Rows, drawn: bool) -> Iterator[str]:
-    if not rows.plan.campaign.vary:
+    metrics = judged(with_values(rows))
+    if not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## By varied field\n"
     if drawn:
         yield f"![metrics over varied fields]({VARIED})\n"
-    for metric in judged(rows.plan.campaign.metrics):
+    for metric in metrics:
         yield _header(metric, "part", *rows.plan.policies)
         for field in rows.plan.campaign.vary:
             for label, _, mask in rows.bins(field):
@@ -102,7 +104,7 @@ def _varied(rows: Rows, drawn: bool) -> Iterator[str]:
 
 
 def _pareto(rows: Rows, drawn: bool) -> Iterator[str]:
-    metrics = rows.plan.campaign.metrics
+    metrics = with_values(rows)
     accuracies, prices = [m for m in metrics if m.startswith("ap50.")], costs(metrics)
     if not accuracies or not prices:
         return
@@ -111,8 +113,7 @@ def _pareto(rows: Rows, drawn: bool) -> Iterator[str]:
         yield f"![accuracy against cost]({PARETO})\n"
     for accuracy in accuracies:
         for price in prices:
-            x = np.nanmean(rows.by_unit(price), axis=0).tolist()
-            y = np.nanmean(rows.by_unit(accuracy), axis=0).tolist()
+            x, y = ([estimate(c).mean for c in rows.by_unit(m).T] for m in (price, accuracy))
             front = [label for label, on in zip(rows.plan.policies, on_front(x, y), strict=True) if on]
             yield f"- {accuracy} against {price}: no policy is better in both than {', '.join(front)}"
 
@@ -140,12 +141,11 @@ def _sensitivity(rows: Rows) -> Iterator[str]:
 
 
 def _winners(rows: Rows) -> Iterator[str]:
-    if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary:
+    metrics = judged(with_values(rows))
+    if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## Where the winner changes\n"
-    for metric in judged(rows.plan.campaign.metrics):
-        if np.isnan(rows.by_unit(metric)).all():
-            continue
+    for metric in metrics:
         best, other = winner(rows, metric), contexts(rows, metric)
         yield f"\n**{metric}**: {best} has the best mean over everything."
         if not other:

@@ -150,6 +150,7 @@ def test_a_failed_run_takes_its_whole_block_with_it(tmp_path: Path) -> None:
 def test_the_front_holds_whom_nobody_beats() -> None:
     assert on_front([1, 2, 3, 3], [1, 3, 3, 2]) == [True, True, False, False]
     assert on_front([1, 1], [2, 2]) == [True, True]
+    assert on_front([1, math.nan, 3], [1, 5, math.nan]) == [True, False, False], "without a value it stands nowhere"
 
 
 class Failing(Pretended):
@@ -191,6 +192,38 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     with pytest.raises(RunError, match=r"--run 48: .* has runs 0 … 47"):
         find_row(folder, 48)
     assert pq.read_table(folder / "runs").num_rows == 48
+
+
+def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: Path) -> None:
+    """Warnings are errors here: no mean of nothing is taken, in words or in figures."""
+    from sim.campaign.figures import draw_pareto, draw_varied, with_values
+    from sim.campaign.report import _lines
+
+    metrics = "metrics: [ap50.mission, ap50.full_scene, bytes.data_sent]"
+    text = TWO.replace("metrics: [bytes.data_sent, energy_j.total]", metrics)
+    rows = rows_of(tmp_path, text, lambda fields, p: 1.0 + p)
+    seen = rows.table.append_column("ap50.full_scene", pa.array([0.5] * rows.table.num_rows))
+    none = pa.array([None] * rows.table.num_rows, pa.float64())
+    rows = Rows(rows.plan, seen.append_column("ap50.mission", none), rows.unit, rows.policy)
+    assert with_values(rows) == ["ap50.full_scene", "bytes.data_sent"]
+    told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert [line for line in told if "ap50.mission" in line] == [
+        "| ap50.mission | – | – |",
+        "\nNo run has a value of ap50.mission: left out of what follows.",
+    ]
+    assert "- ap50.full_scene against bytes.data_sent: no policy is better in both than worked" in told
+    pytest.importorskip("matplotlib")
+    assert draw_varied(rows, tmp_path / "varied.png")
+    assert draw_pareto(rows, tmp_path / "pareto.png")
+
+    nothing = rows.table
+    for metric in rows.plan.campaign.metrics:
+        nothing = nothing.set_column(nothing.schema.get_field_index(metric), metric, none)
+    rows = Rows(rows.plan, nothing, rows.unit, rows.policy)
+    told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert [line.split("\n")[1] for line in told if line.startswith("\n## ")] == ["## Metrics by policy", "## The rows"]
+    assert not draw_varied(rows, tmp_path / "none.png")
+    assert not draw_pareto(rows, tmp_path / "none.png")
 
 
 def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
