@@ -4,8 +4,9 @@
     observations, infos = env.reset(seed=1)
     observations, rewards, terminations, truncations, infos = env.step({"drone_0": env.action_space("drone_0").sample(), …})
 
-A step is one simulated second: each drone's action stands for its directives until the next. All that stands between
-a policy and the gate (checks, staleness, damping) stands there too. The sortie runs in a thread of its own that takes
+A step is as many whole frames as come nearest to one simulated second, and never none: exactly a second where
+`context.rate_hz` is a whole number, 1.33 s at 1.5 Hz, 2 s at 0.5 Hz; the last step ends with the sortie. Each drone's
+action stands for its directives until the next. All that stands between a policy and the gate (checks, staleness, damping) stands there too. The sortie runs in a thread of its own that takes
 turns with the caller, so that the same seed and actions give the same record.
 """
 
@@ -53,7 +54,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     | agents | `drone_0` …; one that lands or is lost terminates, at the scenario's end all are truncated |
     | observation | float32 [N, 24]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
     | action | for each other drone by ascending id: rung, budget, rate, region (`CHOICES`) |
-    | reward | AP@0.5 of the drone's own fusions in the second (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
+    | reward | AP@0.5 of the drone's own fusions in the step (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
     """
 
     metadata = {"name": "sortie_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - the library's own way
@@ -103,12 +104,16 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Obs], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Fly one second under these actions; one that is missing stays as it was."""
+        """Fly one step under these actions; one that is missing stays as it was.
+
+        Raises:
+            ValueError: no such agent, or an action outside its space; nothing has been flown, the step may be tried again.
+        """
         flight = self._flight
         if flight is None or not self.agents:
             return {}, {}, {}, {}, {}
-        for agent, action in actions.items():
-            flight.actions[int(agent.removeprefix("drone_"))] = np.asarray(action).reshape(-1, len(CHOICES))
+        taken = {agent: self._checked(agent, action) for agent, action in actions.items()}
+        flight.actions |= {int(agent.removeprefix("drone_")): action for agent, action in taken.items()}
         flight.advance()
         flying = self.agents
         rewards = {a: flight.reward(int(a.removeprefix("drone_"))) for a in flying}
@@ -126,6 +131,24 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
 
     def render(self) -> None:
         """Nothing: `sortie fly --live` draws."""
+
+    def _checked(self, agent: str, action: Any) -> np.ndarray[Any, Any]:
+        """The action by link [N - 1, choices], a copy: the sortie's thread would wrap a −1 around and cut a 0.5 off."""
+        if agent not in self._spaces:
+            raise ValueError(f"actions: {agent!r}, must be of {self.possible_agents[0]} … {self.possible_agents[-1]}")
+        space = self.action_space(agent)
+        try:
+            given = np.array(action)
+        except (TypeError, ValueError):  # rows of several lengths
+            given = np.array(None)
+        if not space.contains(given):
+            said = f"{given.tolist() if given.shape else action!r}"
+            most = ", ".join(str(n - 1) for n in CHOICES)
+            raise ValueError(
+                f"{agent}: action {said}, must be {space.shape[0]} whole numbers: "
+                f"for each other drone {len(CHOICES)} of at least 0 and at most {most}"
+            )
+        return given.reshape(-1, len(CHOICES))
 
     def _observe(self, agent: str) -> Obs:
         assert self._flight is not None  # noqa: S101
@@ -159,7 +182,7 @@ def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
 
 
 class _Flight:
-    """A sortie in its own thread; `advance` lets it fly to the next second. Policy and observer of that sortie."""
+    """A sortie in its own thread; `advance` lets it fly one step (the sortie's "second"). Policy and observer of that sortie."""
 
     def __init__(self, scenario: Scenario, seed: int | None, replication: int) -> None:
         self.actions: dict[int, np.ndarray[Any, Any]] = {}
@@ -176,7 +199,9 @@ class _Flight:
         self._started = False
 
     def advance(self) -> None:
-        """Let the sortie fly until its next second or its end; what went wrong there is raised here."""
+        """Let the sortie fly until its next second or its end; what went wrong there is raised here, each time."""
+        if self._error is not None:
+            raise self._error
         if self.done:
             return
         if self._started:

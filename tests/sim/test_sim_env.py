@@ -87,6 +87,91 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     e.close()
 
 
+GOOD = [FEATURES, SMALL, FAST, 0] * 2
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        [-1, *GOOD[1:]],
+        [3, *GOOD[1:]],
+        [*GOOD[:-1], 2],
+        [0.5, *GOOD[1:]],
+        np.array(GOOD, float),
+        GOOD[:4],
+        [GOOD[:4], GOOD[4:]],
+        [GOOD[:4], [0]],
+        [],
+        7,
+        None,
+        "boxes",
+        [2**70, *GOOD[1:]],
+    ],
+    ids=lambda a: str(a)[:30],
+)
+def test_an_action_outside_its_space_flies_nothing_and_the_step_may_be_tried_again(action: object) -> None:
+    """The other drone's good action of the refused step is not taken up either."""
+    e, untouched = env(), env()
+    for each in (e, untouched):
+        each.reset(seed=3)
+        each.step({"drone_1": np.zeros(8, int)})
+    with pytest.raises(ValueError, match=r"^drone_0: action .*, must be 8 whole numbers: .* 0 and at most 2, 3, 2, 1$"):
+        e.step({"drone_1": np.array(GOOD), "drone_0": action})
+    for steps in range(1, 4):
+        tried, other = (each.step({"drone_0": GOOD}) for each in (e, untouched))
+        assert tried[1:] == other[1:], steps
+        assert all(np.array_equal(tried[0][a], other[0][a]) for a in other[0])
+    assert not e.agents
+
+
+@pytest.mark.parametrize("agent", ["drone_3", "", 0])
+def test_an_action_of_nobody_is_refused(agent: object) -> None:
+    e = env()
+    e.reset()
+    with pytest.raises(ValueError, match=rf"^actions: {agent!r}, must be of drone_0 … drone_2$"):
+        e.step({agent: GOOD})  # type: ignore[dict-item]
+    e.close()
+
+
+def test_a_standing_action_is_the_environments_own() -> None:
+    """Else a learner that fills one array anew each time changes actions that it did not give."""
+    flown = []
+    for overwrite in (False, True):
+        e, action = env(), np.zeros(8, int)
+        e.reset(seed=3)
+        e.step({"drone_0": action})
+        if overwrite:
+            action[:] = GOOD
+        flown.append([e.step({})[1]["drone_0"] for _ in range(3)])
+    assert flown[0] == flown[1]
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "frames", "steps"), [(10.0, 10, 4), (3.0, 3, 4), (1.5, 2, 3), (2.5, 2, 5), (0.5, 1, 2)]
+)
+def test_a_step_is_the_whole_frames_nearest_to_a_second(rate_hz: float, frames: int, steps: int) -> None:
+    e = env(*SHORT, f"context.rate_hz={rate_hz}")
+    e.reset(seed=3)
+    flown = []
+    while e.agents:
+        e.step({})
+        assert e._flight is not None
+        flown.append(e._flight._new["states"].num_rows // 3)
+    assert (len(flown), set(flown[:-1])) == (steps, {frames})
+
+
+def test_what_went_wrong_in_the_sortie_is_said_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("planted")
+
+    monkeypatch.setattr("sim.env.run_sortie", broken)
+    e = env()
+    for fly in (e.reset, lambda: e.step({})):
+        with pytest.raises(RuntimeError, match="planted"):
+            fly()
+    e.close()
+
+
 def test_spaces_and_a_lone_drone() -> None:
     e = env()
     assert e.action_space("drone_0") is e.action_space("drone_0")
