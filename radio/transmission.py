@@ -32,7 +32,7 @@ class Transmission(NamedTuple):
     | payload_bytes | what was handed over |
     | wire_bytes | bytes of the 802.11 frames put on the air, MAC retries not counted, repairs counted |
     | t_sent_s, deadline_s | when it was written and by when it must be through, on the clock |
-    | t_start_s | when it first came to be served; NaN if never |
+    | t_start_s | when it first came to be served, on its first hop; NaN if never |
     | t_done_s | when its fate was settled; NaN while in flight |
     | reason | '' if delivered or in flight; else why it, or its rest, did not come: fragment_lost, no_link, sender_gone, receiver_gone (lost); deadline_queued, deadline_in_service, replaced (expired) |
     | fragments, fragments_lost | DDS fragments, and how often one was lost in all passes |

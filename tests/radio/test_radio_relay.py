@@ -118,6 +118,32 @@ def test_a_lost_relay_is_left(tmp_path: Path) -> None:
     assert {(r.hops, r.status) for r in flight.rows if r.t_sent_s > 1.15} == {(1, Status.DELIVERED)}
 
 
+def test_what_dies_in_a_relay_s_queue_was_served_on_its_first_hop(tmp_path: Path) -> None:
+    """1 is busy for 160 ms with a payload of its own; one that expires in the queue of its own sender starts never."""
+    flight = Hover(traced(tmp_path, relay_max_hops=2), LINE_M).fly(0.1)
+    begin_s = flight.env.now
+    flight.send(1, 2, 2_000_000, kind="own", deadline_s=1.0)
+    flight.send(0, 2, 20_000)
+    flight.send(1, 2, 20_000, kind="late")
+    flight.env.run(until=1.0)
+    late, relayed, _ = sorted(flight.rows, key=lambda r: (r.t_done_s, r.hops))
+    for row, hops in ((relayed, 2), (late, 1)):
+        assert (row.hops, row.status, row.reason) == (hops, Status.EXPIRED, "deadline_queued")
+    assert relayed.t_start_s == begin_s
+    assert relayed.airtime_s > 0.0
+    assert np.isnan(late.t_start_s)
+    assert late.airtime_s == 0.0
+
+
+def test_no_row_of_a_flight_over_relays_has_airtime_and_was_never_served() -> None:
+    line_m = np.array([[150.0 * i, 0.0, 60.0] for i in range(5)])
+    flight = Hover(Radio(relay_max_hops=4, tx_power_dbm=10.0), line_m)
+    flight.fly(5.0, lambda frame: [flight.send(i, j, 60_000) for i in range(5) for j in range(5) if i != j])
+    rows = flight.rows + flight.air.finish()
+    assert sum(r.hops > 1 and r.reason == "deadline_queued" for r in rows) > 50
+    assert [r for r in rows if np.isnan(r.t_start_s) and r.airtime_s > 0.0] == []
+
+
 def test_pieces_lost_on_one_hop_are_not_sent_on_the_next(tmp_path: Path) -> None:
     links = trace(tmp_path, "0,0,1,,0.3,100", "0,1,2,,0.3,100", "0,0,2,,,0")
     flight = Hover(Radio(trace=links, retry_limit=0, relay_max_hops=2), LINE_M)

@@ -80,7 +80,9 @@ def test_whatever_is_flown(knobs: dict[str, Any], asked: tuple[Representation, f
         charge[row["drone"]] = row["soc"]
     for row in record.tables["transmissions"].to_pylist():
         assert row["captured_s"] <= row["t_sent_s"]
-        if not math.isnan(row["t_start_s"]):
+        if math.isnan(row["t_start_s"]):
+            assert row["airtime_s"] == 0.0
+        else:
             assert row["t_sent_s"] <= row["t_start_s"]
         if not math.isnan(row["t_done_s"]):
             assert row["t_sent_s"] <= row["t_done_s"] < scenario.duration_s
