@@ -7,6 +7,7 @@ Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -670,11 +671,23 @@ class Scenario(Section):
                     raise _inconsistent(("events", i, end), f"{who}", f"below fleet.drones = {n}")
             if isinstance(event, LinkDrop) and event.peer == event.drone:
                 raise _inconsistent(("events", i, "peer"), f"{event.peer}", "another drone than drone")
-            if event.at_s >= self.duration_s:
-                raise _inconsistent(("events", i, "at_s"), f"{event.at_s:g}", f"below duration_s = {self.duration_s:g}")
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
                 raise _inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
+        # What is done at an instant must have its instant. Phases and expected decisions may lie beyond the end: missions
+        # are flown shortened, and an expectation of a time that was not flown fails.
+        policy = self.policy
+        instants: dict[tuple[str, ...], Sequence[_Event | PolicyChange | PolicyCommand | ViewReplay]] = {
+            ("events",): self.events,
+            ("policy", "changes"): policy.changes,
+            ("policy", "commands"): policy.commands,
+            ("policy", "replays"): policy.replays,
+        }
+        for where, each in instants.items():
+            for i, one in enumerate(each):
+                if one.at_s is not None and one.at_s >= self.duration_s:
+                    bound = f"below duration_s = {self.duration_s:g}"
+                    raise _inconsistent((*where, i, "at_s"), f"{one.at_s:g}", bound)
         for i, command in enumerate(self.policy.commands):
             for k, who in enumerate(command.drones):
                 if who >= n:

@@ -83,6 +83,20 @@ def test_tolerances(expectation: str, holds: bool) -> None:
     assert [v.holds for v in check(scenario, record, {"m": 5.0})] == [holds]
 
 
+def test_of_a_time_that_was_not_flown_nothing_is_held_to_be_so() -> None:
+    """Missions may be flown shortened: the phase at 3 s is not in the outcome, and no bound on it holds for want of it."""
+    late = "{metric: phases.1.data_rate_mbps, at_most: 1.0e9}"
+    decided = "expect_decisions=[{drone: 0, from_s: 3, until_s: 4}]"
+    scenario = example("duration_s=2", f"expect=[{late}]", decided)
+    record = run_sortie(scenario)
+    result = outcome(record)
+    assert [p["phase"] for p in result["phases"]] == ["search"]
+    assert [(v.holds, v.got) for v in check(scenario, record, result)] == [
+        (False, "phases.1.data_rate_mbps: phases has no '1', it has 0 … 0"),
+        (False, "no decision"),
+    ]
+
+
 def test_a_failure_tells_why_and_how_to_see_it(tmp_path: Path) -> None:
     path = tmp_path / "short one.yaml"
     path.write_text(SHORT + EXPECT)
