@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.campaign.rows import Rows, sign
 from sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
@@ -36,12 +37,12 @@ class Rule:
     below: str
     above: str
     gain: Estimate
-    """Over the best fixed policy, on units that had no part in finding the rule."""
+    """Over the best fixed policy, unit by unit, on units that had no part in finding the rule."""
 
 
 def winner(rows: Rows, metric: str) -> str:
-    """The policy with the best mean."""
-    return rows.plan.policies[int(np.nanargmax(sign(metric) * np.nanmean(rows.by_unit(metric), axis=0)))]
+    """The policy with the best mean; of a metric that has a `sign`."""
+    return rows.plan.policies[_first(sign(metric) * rows.by_unit(metric))]
 
 
 def contexts(rows: Rows, metric: str) -> list[Context]:
@@ -55,25 +56,32 @@ def contexts(rows: Rows, metric: str) -> list[Context]:
         means = sign(metric) * rows.by_unit(metric, mask)
         if not len(means):
             continue
-        here = int(np.nanargmax(np.nanmean(means, axis=0)))
+        here = _first(means)
         if here != best:
             gain = estimate(means[:, here] - means[:, best], level)
             found.append(Context(field, label, policies[here], gain))
     return found
 
 
+def _first(means: Floats) -> int:
+    """Which column has the highest mean; one without any value has none."""
+    sums, counts = np.nansum(means, axis=0), (~np.isnan(means)).sum(axis=0)
+    return int(np.argmax(np.where(counts > 0, sums / np.maximum(counts, 1), -math.inf)))
+
+
 def rule(rows: Rows, metric: str) -> Rule | None:
-    """The best one-threshold rule, found on every second cell and judged on the others, and the other way round.
+    """The best one-threshold rule, found on every second unit and judged on the others, and the other way round.
 
     Returns:
-        The rule found on all cells, with the gain that rules found on one half had on the other; None where no field
-        has enough distinct numbers or there is one policy.
+        The rule found on all units, with the gain that rules found on one half had on the other; None where no field
+        has enough distinct numbers, there is one policy, or there are fewer than four units.
     """
-    cells, x, y = _cells(rows, metric)
-    if len(rows.plan.policies) < 2 or not x or len(cells) < 8:
+    unit, x, y = _cells(rows, metric)
+    number = np.unique(unit, return_inverse=True)[1] if len(unit) else unit
+    if len(rows.plan.policies) < 2 or not x or len(unit) < 8 or number.max() < 3:
         return None
-    even = np.arange(len(cells)) % 2 == 0
-    gains = []
+    even = number % 2 == 0
+    gains: list[float] = []
     for learn, judge in ((even, ~even), (~even, even)):
         found = _best({k: v[learn] for k, v in x.items()}, y[learn])
         if found is None:
@@ -81,7 +89,8 @@ def rule(rows: Rows, metric: str) -> Rule | None:
         field, threshold, below, above = found
         fixed = int(np.argmax(y[learn].mean(axis=0)))
         chosen = np.where(x[field][judge] < threshold, y[judge][:, below], y[judge][:, above])
-        gains.append(chosen - y[judge][:, fixed])
+        gain, of = chosen - y[judge][:, fixed], number[judge]
+        gains += [float(gain[of == k].mean()) for k in np.unique(of)]
     whole = _best(x, y)
     if whole is None:
         return None
@@ -89,13 +98,13 @@ def rule(rows: Rows, metric: str) -> Rule | None:
     if below == above:
         return None
     labels = rows.plan.policies
-    return Rule(field, threshold, labels[below], labels[above], estimate(np.concatenate(gains)))
+    return Rule(field, threshold, labels[below], labels[above], estimate(gains))
 
 
-def _cells(rows: Rows, metric: str) -> tuple[Floats, dict[str, Floats], Floats]:
-    """Cells that every policy has a value in: their numbers, their numeric fields, and what each policy got."""
+def _cells(rows: Rows, metric: str) -> tuple[NDArray[np.int64], dict[str, Floats], Floats]:
+    """Cells of units in which every policy has a value: their units, their numeric fields, and what each policy got."""
     cell, values = rows.table["cell"].to_numpy(), sign(metric) * rows.values(metric)
-    numbers, at = np.unique(cell, return_inverse=True)
+    numbers, at = np.unique(rows.unit * rows.plan.cells + cell, return_inverse=True)
     policies = len(rows.plan.policies)
     use = ~np.isnan(values)
     slot = at[use] * policies + rows.policy[use]
@@ -109,7 +118,7 @@ def _cells(rows: Rows, metric: str) -> tuple[Floats, dict[str, Floats], Floats]:
         column = rows.table[field].to_numpy(zero_copy_only=False)
         if column.dtype != object:
             x[field] = column.astype(float)[first][whole]
-    return numbers[whole], x, y[whole]
+    return rows.unit[first][whole], x, y[whole]
 
 
 def _best(x: dict[str, Floats], y: Floats) -> tuple[str, float, int, int] | None:

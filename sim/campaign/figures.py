@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from sim.campaign.rows import Rows
+from sim.campaign.rows import Rows, is_accuracy
 from sim.campaign.statistics import estimate
 
-MAX_METRICS, MAX_FIELDS = 6, 6
+MAX_METRICS, MAX_FIELDS = 8, 6
+APART = 0.012
+"""How far policies stand beside one another, of a field's range, so that whiskers do not hide whiskers."""
 COST = ("bytes.data_sent", "bytes.data_delivered", "data_rate_mbps", "energy_j.total")
 
 
@@ -24,6 +26,12 @@ def with_values(rows: Rows) -> list[str]:
 def costs(metrics: Sequence[str]) -> list[str]:
     """The metrics that accuracy is set against: bytes, and energy."""
     return [m for m in COST if m in metrics]
+
+
+def drawn(rows: Rows) -> tuple[list[str], list[str]]:
+    """Metrics and fields that have a place in the figure."""
+    fields = [f for f in rows.plan.campaign.vary if rows.bins(f)]
+    return with_values(rows)[:MAX_METRICS], fields[:MAX_FIELDS]
 
 
 def on_front(x: list[float], y: list[float]) -> list[bool]:
@@ -44,8 +52,7 @@ def on_front(x: list[float], y: list[float]) -> list[bool]:
 
 def draw_varied(rows: Rows, path: Path) -> bool:
     """Metrics (rows) over varied fields (columns), a line a policy, whiskers 95 %; whether there is anything to draw."""
-    metrics = with_values(rows)[:MAX_METRICS]
-    fields = [f for f in rows.plan.campaign.vary if rows.bins(f)][:MAX_FIELDS]
+    metrics, fields = drawn(rows)
     if not metrics or not fields:
         return False
     figure, axes = _axes(len(metrics), len(fields))
@@ -54,8 +61,11 @@ def draw_varied(rows: Rows, path: Path) -> bool:
             ax = axes[r][c]
             bins = rows.bins(field)
             words = isinstance(rows.table[field][0].as_py(), str)
+            places = [x for _, x, _ in bins]
+            apart = APART * (max(places) - min(places) or 1.0)
             for p, label in enumerate(rows.plan.policies):
-                found = [(x, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
+                aside = apart * (p - (len(rows.plan.policies) - 1) / 2)
+                found = [(x + aside, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
                 ax.errorbar(
                     [x for x, _ in found],
                     [e.mean for _, e in found],
@@ -79,7 +89,7 @@ def draw_varied(rows: Rows, path: Path) -> bool:
 def draw_pareto(rows: Rows, path: Path) -> bool:
     """Accuracy against each cost, a point a policy with both intervals; whether there is anything to draw."""
     metrics = with_values(rows)
-    accuracies, prices = [m for m in metrics if m.startswith("ap50.")], costs(metrics)
+    accuracies, prices = [m for m in metrics if is_accuracy(m)], costs(metrics)
     if not accuracies or not prices:
         return False
     figure, axes = _axes(len(accuracies), len(prices))

@@ -100,6 +100,11 @@ class Plan:
         return len(self.points) if drawn_fields(self.campaign) else self.campaign.replications
 
     @property
+    def unit(self) -> str:
+        """What a unit is."""
+        return "draw" if drawn_fields(self.campaign) else "replication"
+
+    @property
     def shard(self) -> int:
         """Runs in one file of the table; policies of one scene never stand in two."""
         p = len(self.policies)

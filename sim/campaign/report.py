@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
 
 from sim.campaign.contexts import contexts, rule, winner
-from sim.campaign.figures import costs, draw_pareto, draw_varied, on_front, with_values
-from sim.campaign.rows import Rows, figure, judged, read_rows
+from sim.campaign.drive import Stop
+from sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
+from sim.campaign.rows import Rows, figure, figures, is_accuracy, judged, read_rows, sign
 from sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
-from sim.campaign.statistics import Estimate, estimate, paired
+from sim.campaign.statistics import Estimate, Floats, estimate, paired
 from sim.folders import RunError, write_text
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
@@ -26,34 +30,41 @@ def write_report(folder: Path) -> Path:
     """
     rows = read_rows(folder)
     try:
-        drawn = {VARIED: draw_varied(rows, folder / VARIED), PARETO: draw_pareto(rows, folder / PARETO)}
+        pictures = {VARIED: False, PARETO: False}
+        if _sampled(rows):
+            pictures = {VARIED: draw_varied(rows, folder / VARIED), PARETO: draw_pareto(rows, folder / PARETO)}
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror}") from error
-    write_text(folder / REPORT, "\n".join(_lines(rows, folder, drawn)) + "\n")
+    write_text(folder / REPORT, "\n".join(_lines(rows, folder, pictures)) + "\n")
     return folder / REPORT
 
 
-def _lines(rows: Rows, folder: Path, drawn: dict[str, bool]) -> Iterator[str]:
+def _lines(rows: Rows, folder: Path, pictures: dict[str, bool]) -> Iterator[str]:
     plan = rows.plan
     yield f"# {plan.campaign.campaign}"
     if plan.campaign.description:
         yield f"\n{plan.campaign.description.strip()}"
-    failed = int((~rows.done).sum())
-    shape = f"{plan.units} {'draws' if len(plan.points) > 1 else 'replications'}"
+    failed = len(_failures(rows))
+    shape = f"{plan.units} {plan.unit}s"
     grid = f" at {len(plan.grid)} grid points" if len(plan.grid) > 1 else ""
     yield (
-        f"\n{rows.table.num_rows} of {plan.runs} runs: {shape}{grid}, {plan.campaign.replications} replication(s), "
+        f"\n{rows.all.num_rows} of {plan.runs} runs: {shape}{grid}, {plan.campaign.replications} replication(s), "
         f"{len(plan.policies)} policies on the same draws; {failed} failed. Base scenario `{plan.campaign.base}`, "
-        f"seed {plan.campaign.seed}, Sortie {plan.code}. Intervals are 95 %, Student's, over "
-        f"{'draws' if len(plan.points) > 1 else 'replications'}; differences are paired."
+        f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )
+    if (asked := plan.campaign.stop_when) is not None and _stopped(rows):
+        yield f"`stop_when` ended it: the interval of {asked.metric} is narrow enough."
+    if left := rows.all.num_rows - rows.table.num_rows:
+        yield f"{left} of the runs are left out of all that follows: their {plan.unit} is not finished at every grid point."
     if plan.campaign.sample.method in ("latin_hypercube", "sobol") and len(plan.points) > 1:
         yield "Draws of this design are spread more evenly than independent ones, so the intervals are on the wide side."
     yield from _by_policy(rows)
-    yield from _varied(rows, drawn[VARIED])
-    yield from _pareto(rows, drawn[PARETO])
+    if _sampled(rows):
+        yield from _varied(rows, pictures[VARIED])
+        yield from _pareto(rows, pictures[PARETO])
     yield from _sensitivity(rows)
-    yield from _winners(rows)
+    if _sampled(rows):
+        yield from _winners(rows)
     yield from _failed(rows, folder)
     yield "\n## The rows\n"
     yield f"""```python
@@ -69,11 +80,11 @@ def _by_policy(rows: Rows) -> Iterator[str]:
     yield _header("metric", *labels)
     for metric in rows.plan.campaign.metrics:
         means = rows.by_unit(metric)
-        yield _row(metric, *(_interval(estimate(means[:, p])) for p in range(len(labels))))
+        yield _row(metric, *(_mean(rows, means[:, p]) for p in range(len(labels))))
     valued = with_values(rows)
     if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
         yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
-    if len(labels) > 1:
+    if len(labels) > 1 and _sampled(rows):
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
         yield _header("metric", *labels[1:])
         for metric in valued:
@@ -87,13 +98,17 @@ def _by_policy(rows: Rows) -> Iterator[str]:
             )
 
 
-def _varied(rows: Rows, drawn: bool) -> Iterator[str]:
-    metrics = judged(with_values(rows))
+def _varied(rows: Rows, picture: bool) -> Iterator[str]:
+    valued = with_values(rows)
+    metrics = judged(valued) or valued[:1]
     if not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## By varied field\n"
-    if drawn:
+    if picture:
         yield f"![metrics over varied fields]({VARIED})\n"
+        in_it = {name for names in drawn(rows) for name in names}
+        if missing := [name for name in (*valued, *rows.plan.campaign.vary) if name not in in_it]:
+            yield f"Not in the figure, which has no more room: {', '.join(missing)}.\n"
     for metric in metrics:
         yield _header(metric, "part", *rows.plan.policies)
         for field in rows.plan.campaign.vary:
@@ -103,13 +118,13 @@ def _varied(rows: Rows, drawn: bool) -> Iterator[str]:
         yield ""
 
 
-def _pareto(rows: Rows, drawn: bool) -> Iterator[str]:
+def _pareto(rows: Rows, picture: bool) -> Iterator[str]:
     metrics = with_values(rows)
-    accuracies, prices = [m for m in metrics if m.startswith("ap50.")], costs(metrics)
+    accuracies, prices = [m for m in metrics if is_accuracy(m)], costs(metrics)
     if not accuracies or not prices:
         return
     yield "\n## Accuracy against cost\n"
-    if drawn:
+    if picture:
         yield f"![accuracy against cost]({PARETO})\n"
     for accuracy in accuracies:
         for price in prices:
@@ -130,18 +145,20 @@ def _sensitivity(rows: Rows) -> Iterator[str]:
     method = found[0].method
     yield f"\n## Sensitivity\n\n{MEANING[method]}\n"
     if method == "other":
+        if words := [f for f in rows.plan.campaign.vary if f not in found[0].fields]:
+            yield f"Fields of text have no ranks and are left out: {', '.join(words)}.\n"
         yield _header("metric", "policy", *found[0].fields)
         for s in found:
             yield _row(s.metric, s.policy, *(f"{v:+.2f}" if not math.isnan(v) else "–" for v in s.figures[:, 0]))
         return
     yield _header("metric", "policy", "field", *COLUMNS[method])
     for s in found:
-        for field, figures in zip(s.fields, s.figures.tolist(), strict=True):
-            yield _row(s.metric, s.policy, field, *(figure(v) for v in figures))
+        for field, row in zip(s.fields, s.figures.tolist(), strict=True):
+            yield _row(s.metric, s.policy, field, *(figure(v) for v in row))
 
 
 def _winners(rows: Rows) -> Iterator[str]:
-    metrics = judged(with_values(rows))
+    metrics = [m for m in judged(with_values(rows)) if sign(m)]
     if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## Where the winner changes\n"
@@ -156,31 +173,73 @@ def _winners(rows: Rows) -> Iterator[str]:
         if (found := rule(rows, metric)) is not None:
             yield (
                 f"\nBest one-threshold rule: {found.field} below {found.threshold:.3g} → {found.below}, above → "
-                f"{found.above}. Rules found on one half of the cells gained {_interval(found.gain, signed=True)} over "
+                f"{found.above}. Rules found on one half of the {rows.plan.unit}s gained {_interval(found.gain, signed=True)} over "
                 "the best fixed policy on the other half."
             )
     yield "\nIntervals of parts are widened for all parts looked at (Bonferroni)."
 
 
 def _failed(rows: Rows, folder: Path) -> Iterator[str]:
-    table = rows.table.filter(~rows.done).slice(0, MAX_FAILED).to_pylist()
-    if not table:
+    failed = _failures(rows)
+    if not failed:
         return
     yield "\n## Failed runs\n"
-    for row in table:
+    if len(failed) > MAX_FAILED:
+        yield f"The first {MAX_FAILED} of {len(failed)}; the table's column `error` has all.\n"
+    for row in failed[:MAX_FAILED]:
         yield (
             f"- run {row['run']} ({row['policy']}, seed {row['seed']}): {row['error']}  \n"
             f"  `sortie fly --from-campaign {folder} --run {row['run']}`"
         )
 
 
+def _failures(rows: Rows) -> list[dict[str, Any]]:
+    failed: list[dict[str, Any]] = rows.all.filter(pc.equal(rows.all["status"], "failed")).to_pylist()
+    return failed
+
+
+def _sampled(rows: Rows) -> bool:
+    """Whether draws are of the fields' distributions; Morris' are a few levels, walked along in trajectories."""
+    return rows.plan.campaign.sample.method != "morris" or rows.plan.unit == "replication"
+
+
+def _intervals(rows: Rows) -> str:
+    """What the intervals are, or why there are none."""
+    unit = rows.plan.unit
+    if not _sampled(rows):
+        return (
+            "The draws are Morris' levels, for the elementary effects below: means over them are not of the distributions, "
+            "and have no intervals."
+        )
+    if rows.plan.units == 1:
+        return (
+            f"One {unit} gives no interval: ask for more, by `{'sample.count' if unit == 'draw' else 'replications'}`."
+        )
+    return f"Intervals are 95 %, Student's, over {unit}s; differences are paired."
+
+
+def _stopped(rows: Rows) -> bool:
+    """Whether the campaign ended because enough was known, as its driver finds out."""
+    stop, size, count = Stop(rows.plan), rows.plan.shard, rows.all.num_rows
+    enough = False
+    for begin in range(0, count, size):
+        enough = stop.enough(rows.all.slice(begin, size))
+    return enough and count < rows.plan.runs
+
+
+def _mean(rows: Rows, values: Floats) -> str:
+    found = estimate(values)
+    return _interval(found) if _sampled(rows) else figure(found.mean)
+
+
 def _interval(e: Estimate, *, signed: bool = False) -> str:
     if math.isnan(e.mean):
         return "–"
     plus = "+" if signed and e.mean >= 0 else ""
-    return f"{plus}{figure(e.mean)}" + (
-        "" if math.isnan(e.low) or e.low == e.high else f" [{figure(e.low)}, {figure(e.high)}]"
-    )
+    if math.isnan(e.low) or e.low == e.high:
+        return f"{plus}{figure(e.mean)}"
+    mean, low, high = figures(e.mean, e.low, e.high)
+    return f"{plus}{mean} [{low}, {high}]"
 
 
 def _header(*cells: str) -> str:

@@ -19,19 +19,30 @@ from sim.folders import RunError
 
 Floats = NDArray[np.float64]
 BINS = 4
-LOWER_IS_BETTER = ("bytes", "energy_j", "deadline_miss_rate", "age_s", "data_age_s", "switches", "medium_busy_fraction",
-                   "context_share", "data_rate_mbps", "payload_fates", "descriptor_drops")  # fmt: skip
+ACCURACIES = ("full_scene", "mission")
+MORE_IS_BETTER = {"soc", "battery", "data_delivered", "delivered", "voltage_v", "airborne", "connected_drones"}
+LESS_IS_BETTER = {"bytes", "energy_j", "deadline_miss_rate", "age_s", "data_age_s", "switches", "medium_busy_fraction",
+                  "context_share", "data_rate_mbps", "payload_fates", "descriptor_drops", "feature_payload_bytes",
+                  "invariant_violations", "shield_interventions", "distrusted_by"}  # fmt: skip
+"""Parts of a metric's path; of several the last one decides."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """All finished parts of a campaign."""
+    """What is finished of a campaign, as far as whole units of it are."""
 
     plan: Plan
     table: pa.Table
     unit: NDArray[np.int64]
     policy: NDArray[np.int64]
     """By number."""
+    finished: pa.Table | None = None
+    """All finished parts, those of units that are not whole among them; None: the same."""
+
+    @property
+    def all(self) -> pa.Table:
+        """Every finished row."""
+        return self.table if self.finished is None else self.finished
 
     @property
     def done(self) -> NDArray[np.bool_]:
@@ -42,17 +53,27 @@ class Rows:
         return np.asarray(self.table[metric].to_numpy(zero_copy_only=False), float)
 
     def by_unit(self, metric: str, mask: NDArray[np.bool_] | None = None) -> Floats:
-        """Means [units, policies] over the runs of a unit; NaN where no run has a value. Units without any are left out."""
+        """Means [units, policies] over the grid points of a unit, each the mean of its replications; NaN where there is no
+        value, or where a point's runs have all failed: without it the mean would be of something else. Units without
+        any are left out."""
         values = self.values(metric)
-        use = ~np.isnan(values) if mask is None else ~np.isnan(values) & mask
-        policies = len(self.plan.policies)
+        mask = np.ones(len(values), bool) if mask is None else mask
+        policies, points = len(self.plan.policies), len(self.plan.grid)
         units = int(self.unit.max()) + 1 if len(self.unit) else 0
-        at = self.unit[use] * policies + self.policy[use]
-        count = np.bincount(at, minlength=units * policies)
-        total = np.bincount(at, values[use], minlength=units * policies)
+        shape = (units, points, policies)
+        at = (self.unit * points + self.table["cell"].to_numpy() % points) * policies + self.policy
+
+        def count(which: NDArray[np.bool_], weights: Floats | None = None) -> Floats:
+            some = None if weights is None else weights[which]
+            return np.bincount(at[which], some, minlength=units * points * policies).reshape(shape).astype(float)
+
+        use = mask & ~np.isnan(values)
+        told, failed = count(use), (count(mask & ~self.done) > 0) & (count(mask & self.done) == 0)
         with np.errstate(invalid="ignore"):
-            means = (total / count).reshape(units, policies)
-        return means[~np.isnan(means).all(axis=1)]
+            of_points = count(use, values) / told
+            means = np.nansum(of_points, axis=1) / (told > 0).sum(axis=1)
+        means[failed.any(axis=1)] = math.nan
+        return np.asarray(means[~np.isnan(means).all(axis=1)])
 
     def pair(self, metric: str, a: int, b: int) -> tuple[Floats, Floats]:
         """Means by unit of two policies, over the scenes in which both have a value."""
@@ -72,7 +93,7 @@ class Rows:
         if len(distinct) <= 2 * BINS:
             distinct.sort(key=lambda v: (isinstance(v, str), v))
             return [
-                (v if isinstance(v, str) else f"{v:.4g}", i if isinstance(v, str) else v, column == v)
+                (v if isinstance(v, str) else f"{v:.10g}", i if isinstance(v, str) else v, column == v)
                 for i, v in enumerate(distinct)
             ]
         if isinstance(distinct[0], str):
@@ -90,7 +111,7 @@ def read_rows(folder: Path) -> Rows:
     """The finished parts of a campaign's folder.
 
     Raises:
-        RunError: no campaign there, or nothing finished.
+        RunError: no campaign there, or no unit of it finished at all its grid points.
     """
     plan = read_plan(folder)
     parts = sorted((folder / RUNS).glob("part-*.parquet"))
@@ -98,14 +119,32 @@ def read_rows(folder: Path) -> Rows:
         waiting = any((folder / JOURNAL).glob("*.jsonl"))
         raise RunError(f"{folder}: no part is finished yet" + (", go on with the campaign" if waiting else ""))
     table = pa.concat_tables([pq.read_table(p) for p in parts])
+    unit = table["unit"].to_numpy()
+    whole = np.bincount(unit)[unit] == plan.runs // plan.units
+    if not whole.any():
+        raise RunError(f"{folder}: no {plan.unit} is finished at all its grid points yet, go on with the campaign")
+    kept = table.filter(whole)
     number = {label: i for i, label in enumerate(plan.policies)}
-    policy = np.array([number[label] for label in table["policy"].to_pylist()], np.int64)
-    return Rows(plan, table, table["unit"].to_numpy(), policy)
+    policy = np.array([number[label] for label in kept["policy"].to_pylist()], np.int64)
+    return Rows(plan, kept, unit[whole], policy, table)
 
 
 def sign(metric: str) -> int:
-    """1 where more of a metric is better, -1 where less is."""
-    return -1 if metric.partition(".")[0] in LOWER_IS_BETTER else 1
+    """1 where more of a metric is better, -1 where less is, 0 where that is not known."""
+    if is_accuracy(metric):
+        return 1
+    for part in reversed(metric.replace("/", ".").split(".")):
+        if part in MORE_IS_BETTER:
+            return 1
+        if part in LESS_IS_BETTER:
+            return -1
+    return 0
+
+
+def is_accuracy(metric: str) -> bool:
+    """`ap50.mission`, `phases.1.ap50.full_scene` and their like."""
+    parts = metric.split(".")
+    return "ap50" in parts and parts[-1] in ACCURACIES
 
 
 def find_row(folder: Path, run: int) -> dict[str, Any]:
@@ -125,15 +164,17 @@ def find_row(folder: Path, run: int) -> dict[str, Any]:
 
 
 def judged(metrics: Sequence[str]) -> list[str]:
-    """The metrics by which a winner is told: accuracies, or the first one where there is none."""
-    return [m for m in metrics if m.startswith("ap50.")] or list(metrics[:1])
+    """The metrics by which a winner is told: accuracies, or the first one of which it is known what is better."""
+    return [m for m in metrics if is_accuracy(m)] or [m for m in metrics if sign(m)][:1]
+
+
+def figures(*values: float) -> list[str]:
+    """Four digits that count, with one unit prefix for all of them beyond a thousand."""
+    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    limit, prefix = next(((x, p) for x, p in ((1e9, " G"), (1e6, " M"), (1e3, " k")) if largest >= x), (1.0, ""))
+    return ["–" if math.isnan(v) else f"{v / limit:.4g}{prefix}" for v in values]
 
 
 def figure(value: float) -> str:
-    """Four digits that count, with a unit prefix beyond a thousand."""
-    if math.isnan(value):
-        return "–"
-    for limit, prefix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        if abs(value) >= limit:
-            return f"{value / limit:.4g}{prefix}"
-    return f"{value:.4g}" if abs(value) >= 1 or value == 0 else f"{value:.3f}" if abs(value) >= 1e-3 else f"{value:.2g}"
+    """One of them."""
+    return figures(value)[0]

@@ -18,7 +18,7 @@ from scenarios.campaign import Sample
 from sim.campaign.contexts import contexts, rule, winner
 from sim.campaign.drive import run_campaign
 from sim.campaign.figures import on_front
-from sim.campaign.rows import Rows, find_row, read_rows
+from sim.campaign.rows import Rows, figures, find_row, judged, read_rows, sign
 from sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sim.campaign.spread import design
 from sim.campaign.statistics import Mean, estimate, paired, t_interval
@@ -28,6 +28,8 @@ from sim.folders import RunError
 TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
     "replications: 2", "replications: 1"
 )
+
+ONE_METRIC = TWO.replace("[bytes.data_sent, energy_j.total]", "[bytes.data_sent]")
 
 
 def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> Rows:
@@ -224,6 +226,134 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     assert [line.split("\n")[1] for line in told if line.startswith("\n## ")] == ["## Metrics by policy", "## The rows"]
     assert not draw_varied(rows, tmp_path / "none.png")
     assert not draw_pareto(rows, tmp_path / "none.png")
+
+
+def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
+    """Parts hold 30 rows, a draw at 22 grid points 44: what a campaign that was cut off has of the next draw is left out."""
+    counts = ", ".join(map(str, range(1, 23)))
+    text = CAMPAIGN.replace(
+        "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", f"fleet.drones: {{kind: grid, values: [{counts}]}}"
+    )
+    p, folder = plan(tmp_path, text.replace("replications: 2", "replications: 1")), tmp_path / "a"
+
+    def drones(run: int) -> float:
+        return float(p.varied(p.at(run).cell)["fleet.drones"])
+
+    class Counting(Pretended):
+        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
+            for rows in super().results(code, tasks):  # type: ignore[arg-type]
+                yield [r._replace(values=(drones(r.run), 0.0)) for r in rows]
+
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(p, folder, Counting(stop_after=40))  # type: ignore[arg-type]
+    with pytest.raises(RunError, match="a: no draw is finished at all its grid points yet, go on with the campaign"):
+        read_rows(folder)
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(p, folder, Counting(stop_after=70))  # type: ignore[arg-type]
+    rows = read_rows(folder)
+    assert (rows.all.num_rows, rows.table.num_rows) == (90, 88)
+    assert rows.by_unit("bytes.data_sent") == pytest.approx(np.full((2, 2), 11.5))
+    pytest.importorskip("matplotlib")
+    from sim.campaign.report import write_report
+
+    told = write_report(folder).read_text()
+    assert "2 of the runs are left out of all that follows: their draw is not finished at every grid point." in told
+    assert "`stop_when` ended it" not in told
+
+
+def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
+    """Replications stand in for one another; without any of them the mean would be of other points."""
+    rows = rows_of(tmp_path, CAMPAIGN, lambda fields, policy: fields["fleet.formation.spacing_m"] + policy)
+    status, values = ["done"] * 48, rows.values("bytes.data_sent")
+    for run in (0, 8, 10):  # one replication of draw 0; both of draw 1 at 20 m
+        status[run], values[run] = "failed", math.nan
+    table = rows.table.set_column(rows.table.schema.get_field_index("status"), "status", pa.array(status))
+    table = table.set_column(table.schema.get_field_index("bytes.data_sent"), "bytes.data_sent", pa.array(values))
+    means = Rows(rows.plan, table, rows.unit, rows.policy).by_unit("bytes.data_sent")
+    assert means[0].tolist() == [30, 31]
+    assert math.isnan(means[1, 0])
+    assert means[1, 1] == 31
+
+
+def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from sim.campaign.report import write_report
+
+    enough = "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
+    folder = tmp_path / "a"
+    run_campaign(plan(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}") + enough), folder, Pretended())
+    assert "`stop_when` ended it: the interval of bytes.data_sent is narrow enough." in write_report(folder).read_text()
+
+
+def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
+    """Policy 0 wins by 1 at 20 m, policy 1 at 40 m: worth 1 over the best fixed policy, and sure of it over draws."""
+    rng = np.random.default_rng(7)
+
+    def value(fields: dict[str, float], policy: int) -> float:
+        return -(1.0 if (fields["fleet.formation.spacing_m"] == 20) == (policy == 0) else -1.0) + rng.normal(0, 0.01)
+
+    made = rule(rows_of(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}"), value), "bytes.data_sent")
+    assert made is not None
+    assert (made.field, made.threshold, made.below, made.above) == (
+        "fleet.formation.spacing_m", 30.0, "worked", "best-2(rho=0.1)",
+    )  # fmt: skip
+    assert made.gain.mean == pytest.approx(1.0, abs=0.01)
+    assert made.gain.count == 40, "draws, not cells"
+
+
+def test_levels_of_morris_have_no_intervals(tmp_path: Path) -> None:
+    from sim.campaign.report import _lines
+
+    text = ONE_METRIC.replace("{count: 6}", "{count: 8, method: morris}")
+    rows = rows_of(tmp_path, text, lambda fields, policy: fields["fleet.battery.initial_soc"] + policy)
+    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert "The draws are Morris' levels" in told
+    assert "| bytes.data_sent | 0.6 | 1.6 |" in told
+    assert "## Sensitivity" in told
+    assert not any(part in told for part in ("## By varied field", "## Where the winner changes", "Differences from"))
+
+
+def test_one_draw_gives_no_interval(tmp_path: Path) -> None:
+    from sim.campaign.report import _lines
+
+    rows = rows_of(tmp_path, ONE_METRIC.replace("{count: 6}", "{count: 1}"), lambda fields, policy: policy)
+    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert "1 draws, 1 replication(s)" in told
+    assert "One draw gives no interval: ask for more, by `sample.count`." in told
+
+
+@pytest.mark.parametrize(
+    ("metric", "better"),
+    [
+        ("ap50.mission", 1), ("phases.1.ap50.full_scene", 1), ("ap50.scored_fusions", 0), ("ap50.sample_rate_hz", 0),
+        ("bytes.data_sent", -1), ("bytes.data_delivered", 1), ("energy_j.total", -1), ("drones.0.energy_j", -1),
+        ("drones.0.soc", 1), ("battery.3", 1), ("deadline_miss_rate", -1), ("phases.0.deadline_miss_rate", -1),
+        ("policies.invariant_violations", -1), ("policies.shield_interventions", -1), ("policies.changes", 0),
+        ("distrusted_by.2", -1), ("age_s.p99", -1), ("payload_fates.delivered", 1),
+        ("payload_fates.expired/deadline_queued", -1), ("duration_s", 0),
+    ],
+)  # fmt: skip
+def test_what_is_better_of_a_metric(metric: str, better: int) -> None:
+    assert sign(metric) == better
+
+
+def test_a_winner_is_told_by_what_is_known_to_be_better() -> None:
+    assert judged(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
+    assert judged(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
+    assert judged(["policies.changes"]) == []
+
+
+def test_figures_of_an_interval_share_their_prefix() -> None:
+    assert figures(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
+    assert figures(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
+    assert figures(math.nan, 12.0) == ["–", "12"]
+
+
+def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:
+    seeds = "perception.scene.seed: {kind: grid, values: [12341, 12342]}"
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", seeds)
+    rows = rows_of(tmp_path, text, lambda fields, policy: policy)
+    assert [label for label, _, _ in rows.bins("perception.scene.seed")] == ["12341", "12342"]
 
 
 def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
