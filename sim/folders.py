@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,13 +15,15 @@ class RunError(ValueError):
     """What a user asked of files or folders and cannot be done; the message names the path."""
 
 
-def ensure_folder(path: Path, holds: str, what: str) -> None:
+def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = ()) -> None:
     """Refuse a path that `replacing` could not use, before anything is flown or measured.
 
     Args:
         path: the folder to be.
         holds: a file by which an older one of the kind is known.
         what: the kind's name, as in "run".
+        written: all that one of the kind may hold, by its path in it, so that nothing of a user's goes when it is
+            replaced; left out, anything.
 
     Raises:
         RunError: it holds something else, or cannot be made.
@@ -30,6 +32,9 @@ def ensure_folder(path: Path, holds: str, what: str) -> None:
         raise RunError(f"{path}: is a file, a {what} needs a folder")
     if path.is_dir() and any(path.iterdir()) and not (path / holds).is_file():
         raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
+    if written and path.is_dir() and (others := _others(path, written)):
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
     there = next(p for p in path.absolute().parents if p.exists())
     if not there.is_dir():
         raise RunError(f"{path}: cannot make its folder: {there} is a file")
@@ -83,6 +88,18 @@ def put_between(path: Path, section: str, begin: str, end: str) -> None:
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: {error}") from error
     write_text(path, text)
+
+
+def _others(folder: Path, written: Collection[str], within: str = "") -> list[str]:
+    """What a folder holds and `written` does not name, by its path in it; a folder of such things by its name alone."""
+    found = []
+    for entry in sorted(folder.iterdir()):
+        name = within + entry.name
+        if entry.is_dir() and any(w.startswith(f"{name}/") for w in written):
+            found += _others(entry, written, f"{name}/")
+        elif entry.is_dir() or name not in written:
+            found.append(name)
+    return found
 
 
 def _replace(new: Path, path: Path) -> None:

@@ -16,6 +16,13 @@ from sim.outcome import outcome
 from sim.record import TABLES, SortieRecord
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
+PAGE = "report.html"
+WRITTEN = frozenset(
+    {OUTCOME, SCENARIO, RECORD, RECORDING, *(f"{name}.parquet" for name in TABLES)}
+    | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
+    | {".DS_Store"}  # a desktop that looked in
+)
+"""All that a run's folder may hold for another run to take its place: what can be made again."""
 
 
 def default_path(record: SortieRecord) -> Path:
@@ -29,9 +36,11 @@ def ensure_writable(path: Path) -> None:
     """Refuse a path that `save` could not use, before the sortie is flown.
 
     Raises:
-        RunError: it holds something that is no run, or cannot be made.
+        RunError: it holds something that is no run, or besides a run what is not of it; or it cannot be made.
     """
-    ensure_folder(path, OUTCOME, "run")
+    ensure_folder(path, OUTCOME, "run", WRITTEN)
+    if (path / PAGE).is_file() and not _is_of_the_run(path / PAGE):
+        raise RunError(f"{path}: holds {PAGE}, which is not of the run there; choose another folder or move it")
 
 
 def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None = None) -> dict[str, Any]:
@@ -39,7 +48,7 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
 
     Args:
         record: what to write.
-        path: the run's folder; an older run there is replaced.
+        path: the run's folder; an older run there is replaced, with the page and the exports made of it.
         also: writes further files into the temporary folder (the recording).
 
     Raises:
@@ -65,6 +74,15 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
         if also is not None:
             also(partial)
     return result
+
+
+def _is_of_the_run(page: Path) -> bool:
+    """Whether a page tells the run that it lies with: it names that run's fingerprint."""
+    try:
+        fingerprint = json.loads((page.parent / OUTCOME).read_text())["fingerprint"]
+        return str(fingerprint) in page.read_text(encoding="utf-8")
+    except (OSError, ValueError, TypeError, LookupError):
+        return False
 
 
 def load(path: Path) -> SortieRecord:

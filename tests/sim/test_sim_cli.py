@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -101,6 +102,68 @@ def test_a_folder_that_is_no_run_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file, a run needs a folder"):
         rundir.ensure_writable(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "named"),
+    [
+        (["mynotes.txt"], "mynotes.txt"),
+        (["photos/a.jpg"], "photos"),
+        (["bag/mynotes.txt"], "bag/mynotes.txt"),
+        (["other_run/outcome.json"], "other_run"),
+        (["sortie.rrd/a"], "sortie.rrd"),
+        (["b.txt", "a.txt", "photos/a.jpg"], "a.txt and 2 more"),
+    ],
+)
+def test_what_no_run_wrote_is_not_replaced_with_the_run(theirs: list[str], named: str, tmp_path: Path) -> None:
+    record, path = run_sortie(example("duration_s=0.1")), tmp_path / "run"
+    rundir.save(record, path)
+    for name in theirs:
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_text("a day's work")
+    what = f"{path}: holds {named}, which no run wrote; choose another folder or move it"
+    for refuse in (lambda: rundir.ensure_writable(path), lambda: rundir.save(record, path)):
+        with pytest.raises(RunError, match=f"^{re.escape(what)}$"):
+            refuse()
+    assert [(path / name).read_text() for name in theirs] == ["a day's work"] * len(theirs)
+
+
+def test_what_was_made_of_a_run_goes_with_it(tmp_path: Path) -> None:
+    """The commands' own files, under the names that they have; a page of another run is no such thing."""
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("rosbags")
+    pytest.importorskip("pymavlink")
+    path = tmp_path / "run"
+    rundir.save(run_sortie(example("duration_s=1")), path, lambda folder: (folder / "sortie.rrd").write_text(""))
+    alone = {p.name for p in path.iterdir()}
+    for made in (["report"], ["export", "--mcap"], ["export", "--tlog"]):
+        done = CliRunner().invoke(app, [made[0], str(path), *made[1:]])
+        assert done.exit_code == 0, done.output
+    (path / ".DS_Store").write_text("")
+    assert {p.name for p in path.iterdir()} - alone == {"report.html", "bag", "sortie.tlog", ".DS_Store"}
+    page = (path / "report.html").read_text()
+    rundir.save(run_sortie(example("duration_s=0.5")), path)
+    assert {p.name for p in path.iterdir()} == alone - {"sortie.rrd"}
+    (path / "report.html").write_text(page)
+    with pytest.raises(
+        RunError, match=r"run: holds report\.html, which is not of the run there; choose another folder"
+    ):
+        rundir.ensure_writable(path)
+
+
+def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run"
+    rundir.save(run_sortie(example("duration_s=0.1")), path)
+    (path / "mynotes.txt").write_text("a day's work")
+
+    def flown(*_: object, **__: object) -> None:
+        raise AssertionError("flown")
+
+    monkeypatch.setattr("sim.cli.run_sortie", flown)
+    assert command("fly", scenario, "--no-recording", "--out", path) == 2
+    assert "run: holds mynotes.txt, which no run wrote; choose another folder or move it" in capsys.readouterr().err
 
 
 def test_a_damaged_run_says_so(tmp_path: Path) -> None:
