@@ -49,12 +49,13 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         RunError: the disk refuses.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    place = path.resolve()  # where a link leads: the link stays
+    partial = place.with_name(f".{place.name}.partial")
     try:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         yield partial
-        _replace(partial, path)
+        _replace(partial, place)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:

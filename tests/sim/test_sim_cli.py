@@ -166,6 +166,17 @@ def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
     assert "run: holds mynotes.txt, which no run wrote; choose another folder or move it" in capsys.readouterr().err
 
 
+def test_a_link_to_a_folder_stays_one(tmp_path: Path) -> None:
+    record = run_sortie(example("duration_s=0.1"))
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk")
+    for _ in range(2):
+        rundir.save(record, tmp_path / "run")
+        assert (tmp_path / "run").is_symlink()
+        assert rundir.load(tmp_path / "disk").fingerprint == record.fingerprint
+    assert {p.name for p in tmp_path.iterdir()} == {"disk", "run"}
+
+
 def test_a_damaged_run_says_so(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"no run there \(outcome\.json is missing\)"):
         rundir.load(tmp_path)
