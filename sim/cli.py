@@ -118,12 +118,11 @@ def fly(
         flown, seed, replication, expected = cli_campaign.again(campaign, run, (scenario, policy, seed, set_))
     else:
         flown, replication, expected = _load(_named(scenario), set_, policy), 0, None
-    if out_dir is not None:
-        rundir.ensure_writable(out_dir)
+    path = out_dir or rundir.default_path(flown, seed, replication)
+    rundir.ensure_writable(path)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=watchers or None)
-    path = out_dir or rundir.default_path(record)
 
     def save_recording(folder: Path) -> None:
         from sim.playback import save_rrd

@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from scenarios.load import ScenarioError, dump, loads
+from scenarios.schema import Scenario
 from sim.folders import RunError, ensure_folder, replacing
 from sim.outcome import outcome
 from sim.record import TABLES, SortieRecord
@@ -25,11 +26,11 @@ WRITTEN = frozenset(
 """All that a run's folder may hold for another run to take its place: what can be made again."""
 
 
-def default_path(record: SortieRecord) -> Path:
+def default_path(scenario: Scenario, seed: int | None, replication: int) -> Path:
     """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it, since it comes out the same."""
-    policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", record.policy).strip("_")
-    replication = f"-rep{record.replication}" if record.replication else ""
-    return Path("runs") / f"{record.scenario.name}-{policy}-seed{record.seed}{replication}"
+    policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
+    rep = f"-rep{replication}" if replication else ""
+    return Path("runs") / f"{scenario.name}-{policy}-seed{scenario.seed if seed is None else seed}{rep}"
 
 
 def ensure_writable(path: Path) -> None:
