@@ -15,7 +15,7 @@ from sim.campaign.statistics import estimate
 MAX_METRICS, MAX_FIELDS = 8, 6
 APART = 0.012
 """How far policies stand beside one another, of a field's range, so that whiskers do not hide whiskers."""
-COST = ("bytes.data_sent", "bytes.data_delivered", "data_rate_mbps", "energy_j.total")
+COST = ("bytes.data_sent", "data_rate_mbps", "energy_j.total")
 
 
 def with_values(rows: Rows) -> list[str]:
