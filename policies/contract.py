@@ -11,6 +11,7 @@ makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
@@ -211,35 +212,54 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
     """Hold a policy's output to the contract, once, where it enters the fleet.
 
     Raises:
-        PolicyError: naming the directive and the bound it breaks.
+        PolicyError: naming the directive, the field and what it must be.
     """
-    ego, peers = view.ego, view.descriptors
-    seen = {ego}
+    ego, peers, seen = view.ego, view.descriptors, {view.ego}
+    add, far_m = seen.add, _FAR_M
     for d in directives:
-        if not isinstance(d, Directive):
-            raise PolicyError(f"a policy returns Directive, got {type(d).__name__}")
-        source, destination, rung, rho, roi, rate_hz, deadline_s, weight, duty_percent, _ = d
-        if not (
-            source == ego
-            and destination in peers
-            and destination not in seen
-            and 0 <= rung <= 4
-            and 0 <= rho <= 1
-            and 0 <= rate_hz <= MAX_RATE_HZ
-            and 0 <= deadline_s <= MAX_DEADLINE_S
-            and 0 <= weight <= 1
-            and 0 <= duty_percent <= 100
-            and (roi is None or roi.radius_m > 0)
-        ):
-            raise PolicyError(_fault(d, view))
-        seen.add(destination)
+        try:
+            source, destination, rung, rho, roi, rate_hz, deadline_s, weight, duty_percent, reason = d
+            # Thousands of times a sortie, so what nearly every directive is made of is told first.
+            good = (
+                source == ego
+                and destination in peers
+                and destination not in seen
+                and 0 <= rung <= 4
+                and 0.0 <= rho <= 1.0
+                and 0.0 <= rate_hz <= MAX_RATE_HZ
+                and 0.0 <= deadline_s <= MAX_DEADLINE_S
+                and 0.0 <= weight <= 1.0
+                and 0 <= duty_percent <= 100
+                and source.__class__ is int
+                and destination.__class__ is int
+                and rung.__class__ is Representation
+                and duty_percent.__class__ is int
+                and reason.__class__ is str
+                and d.__class__ is Directive
+                and (
+                    roi is None
+                    or (
+                        roi.__class__ is Disc
+                        and -far_m <= roi.x_m <= far_m
+                        and -far_m <= roi.y_m <= far_m
+                        and 0.0 < roi.radius_m <= far_m
+                    )
+                )
+            )
+        except Exception:  # no directive, or a field that is no number
+            good = False
+        if not good:
+            fault = _fault(d, view, seen)
+            if fault is not None:
+                raise PolicyError(fault)
+        add(d.destination)
 
 
 def check_reposition(asked: object, view: FleetView) -> None:
     """Hold what a viewpoint returned to the contract, once, where it enters the fleet.
 
     Raises:
-        PolicyError: naming the drone and the bound it breaks.
+        PolicyError: naming the drone, the field and what it must be.
     """
     if asked is None:
         return
@@ -248,32 +268,89 @@ def check_reposition(asked: object, view: FleetView) -> None:
     where, me = f"reposition of drone {view.ego}", view.me
     if me is None:
         raise PolicyError(f"{where}: asked for in a view without it, must be None")
-    far_m = math.hypot(asked.x_m - me.position_m[0], asked.y_m - me.position_m[1])
+    if not isinstance(asked.reason, str):
+        raise PolicyError(f"{where}: reason is {asked.reason!r}, must be text")
+    away_m = []
+    for name, value, here_m in (("x_m", asked.x_m, me.position_m[0]), ("y_m", asked.y_m, me.position_m[1])):
+        try:
+            away_m.append(math.fabs(value - here_m))
+        except Exception as error:  # only a number does this; the message names what came instead
+            raise PolicyError(f"{where}: {name} is {value!r}, must be a number") from error
+    far_m = math.hypot(*away_m)
     if not far_m <= MAX_REPOSITION_M:  # also catches NaN
         raise PolicyError(f"{where}: {far_m:.1f} m from where it is, must be at most {MAX_REPOSITION_M:g} m")
 
 
-def _fault(d: Directive, view: FleetView) -> str:
-    """What is wrong with a directive that breaks its contract."""
+def kind_fault(d: object) -> str | None:
+    """What is no number, disc or text where a directive must have one, whatever the bounds; None where all are."""
+    if not isinstance(d, Directive):
+        return f"a policy returns Directive, got {type(d).__name__}"
+    where = f"directive {d.source}→{d.destination}"
+    for name in ("source", "destination"):
+        if not _is_whole(getattr(d, name)):
+            return f"{where}: {name} is {getattr(d, name)!r}, must be a drone's id, a whole number"
+    for name, low, high, kind in _BOUNDS:
+        value = getattr(d, name)
+        if not _compares(value, low, high) or (kind != "a number" and not _is_whole(value)):
+            return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}], {kind}"
+    if not (d.roi is None or isinstance(d.roi, Disc)):
+        return f"{where}: roi is {d.roi!r}, must be a Disc or None"
+    for name, value in () if d.roi is None else d.roi._asdict().items():
+        if not _compares(value, -_FAR_M, _FAR_M):
+            return f"{where}: roi.{name} is {value!r}, must be a number"
+    if not isinstance(d.reason, str):
+        return f"{where}: reason is {d.reason!r}, must be text"
+    return None
+
+
+def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
+    """What is wrong with a directive; None where it is sound and only made of rarer types, such as numpy's."""
+    wrong = kind_fault(d)
+    if wrong is not None:
+        return wrong
     where = f"directive {d.source}→{d.destination}"
     if d.source != view.ego:
         return f"{where}: source is {d.source}, must be the ego {view.ego}"
     if d.destination == view.ego or d.destination not in view.descriptors:
         return f"{where}: destination {d.destination} is not a peer in the view {list(view.peers)}"
-    for name, low, high in _BOUNDS:
+    for name, low, high, _ in _BOUNDS:
         value = getattr(d, name)
         if not low <= value <= high:  # also catches NaN
             return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}]"
-    if d.roi is not None and not d.roi.radius_m > 0:
-        return f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0"
-    return f"{where}: second directive for the same link"
+    if d.roi is not None:
+        if not d.roi.radius_m > 0:
+            return f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0"
+        for name, value in d.roi._asdict().items():
+            if not -_FAR_M <= value <= _FAR_M:
+                return f"{where}: roi.{name} is {value!r}, must be finite in 32 bits"
+    return f"{where}: second directive for the same link" if d.destination in seen else None
 
 
+def _compares(value: Any, low: float, high: float) -> bool:
+    """Whether it is a number, of whatever type: one that can be held against its bounds."""
+    try:
+        bool(low <= value <= high)
+    except Exception:  # whatever a foreign type raises
+        return False
+    return True
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether it is an int of whatever type, as the wire needs it: 2 and numpy's 2, not 2.0."""
+    try:
+        operator.index(value)
+    except TypeError:
+        return False
+    return True
+
+
+_FAR_M = 3.4028234663852886e38
+"""The largest float of 32 bits, as which a disc goes over the wire."""
 _BOUNDS = (
-    ("representation", 0, 4),
-    ("rho", 0.0, 1.0),
-    ("rate_hz", 0.0, MAX_RATE_HZ),
-    ("deadline_s", 0.0, MAX_DEADLINE_S),
-    ("fusion_weight", 0.0, 1.0),
-    ("duty_percent", 0, 100),
+    ("representation", 0, 4, "a Representation"),
+    ("rho", 0.0, 1.0, "a number"),
+    ("rate_hz", 0.0, MAX_RATE_HZ, "a number"),
+    ("deadline_s", 0.0, MAX_DEADLINE_S, "a number"),
+    ("fusion_weight", 0.0, 1.0, "a number"),
+    ("duty_percent", 0, 100, "a whole number"),
 )

@@ -8,7 +8,7 @@ import os
 import random
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from time import perf_counter
 
@@ -21,10 +21,19 @@ from policies_examples import fleet_of
 from fleet.auth import Dropped, Inbox, Sealer, open_datagram
 from fleet.gate import Gate
 from fleet.staleness import cap_by_age, health
-from fleet.wire import MAX_DESCRIPTOR_BYTES, encode_descriptor
+from fleet.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
 from policies.confine import Reached, confined
 from policies.conformance import RULES, full_view, raised_part
-from policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation, check_directives
+from policies.contract import (
+    Descriptor,
+    Directive,
+    Disc,
+    FleetView,
+    Policy,
+    PolicyError,
+    Representation,
+    check_directives,
+)
 from policies.damping import LinkState, damp
 from policies.registry import POLICIES
 from policies.views import draw_view, draw_views
@@ -74,6 +83,63 @@ def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
     directives = [d._replace(**{field: value}) for d in share(FLEET)]
     with pytest.raises(PolicyError, match=rf"directive 0→1: {field} is {value!r}, must be in \["):
         check_directives(directives, FLEET)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("source", 0.0, "source is 0.0, must be a drone's id, a whole number"),
+        ("destination", 1.0, "destination is 1.0, must be a drone's id, a whole number"),
+        ("destination", [1], "destination is [1], must be a drone's id, a whole number"),
+        ("destination", "1", "destination is '1', must be a drone's id, a whole number"),
+        ("representation", "features", "representation is 'features', must be in [0, 4], a Representation"),
+        ("representation", 2.0, "representation is 2.0, must be in [0, 4], a Representation"),
+        ("rho", None, "rho is None, must be in [0, 1], a number"),
+        ("rho", 0.5j, "rho is 0.5j, must be in [0, 1], a number"),
+        ("rate_hz", "10", "rate_hz is '10', must be in [0, 30], a number"),
+        ("deadline_s", "soon", "deadline_s is 'soon', must be in [0, 10], a number"),
+        ("fusion_weight", [1.0], "fusion_weight is [1.0], must be in [0, 1], a number"),
+        ("duty_percent", 50.0, "duty_percent is 50.0, must be in [0, 100], a whole number"),
+        ("roi", (0.0, 0.0, 5.0), "roi is (0.0, 0.0, 5.0), must be a Disc or None"),
+        ("roi", Disc(0.0, "0", 5.0), "roi.y_m is '0', must be a number"),
+        ("roi", Disc(float("nan"), 0.0, 5.0), "roi.x_m is nan, must be finite in 32 bits"),
+        ("roi", Disc(0.0, 0.0, 1e39), "roi.radius_m is 1e+39, must be finite in 32 bits"),
+        ("roi", Disc(0.0, 0.0, 0.0), "roi.radius_m is 0.0, must be > 0"),
+        ("reason", 5, "reason is 5, must be text"),
+        ("reason", b"why", "reason is b'why', must be text"),
+    ],
+)
+def test_a_directive_of_other_types_is_named(field: str, value: object, message: str) -> None:
+    directives = [d._replace(**{field: value}) for d in share(FLEET)]
+    with pytest.raises(PolicyError, match=r"^directive ") as caught:
+        check_directives(directives, FLEET)
+    assert str(caught.value).endswith(": " + message)
+
+
+@pytest.mark.parametrize("answer", ["hello", [None], [(0, 1)], [tuple(share(FLEET)[0])]])
+def test_what_is_no_directive_is_named(answer: Sequence[Directive]) -> None:
+    with pytest.raises(PolicyError, match=rf"^a policy returns Directive, got {type(answer[0]).__name__}$"):
+        check_directives(answer, FLEET)
+
+
+def test_a_second_directive_for_a_link_is_named_whatever_its_id_is_made_of() -> None:
+    again = share(FLEET)[0]._replace(destination=np.int64(1))
+    with pytest.raises(PolicyError, match=r"^directive 0→1: second directive for the same link$"):
+        check_directives([*share(FLEET), again], FLEET)
+
+
+def test_numpys_numbers_and_plain_rungs_are_a_directives_too() -> None:
+    """They fly: the wire takes each."""
+    for d in share(FLEET):
+        plain = d._replace(representation=3, rho=1, rate_hz=10, fusion_weight=True, roi=Disc(0, 0, 5))
+        scalars = plain._replace(
+            destination=np.int64(d.destination), representation=np.uint8(3), rho=np.float32(0.5), rate_hz=np.int64(10),
+            deadline_s=np.float64(0.1), duty_percent=np.int16(50), roi=Disc(np.float32(1), np.float64(2), np.int64(3)),
+            reason=np.str_("why"),
+        )  # fmt: skip
+        for directive in (plain, scalars):
+            check_directives([directive], FLEET)
+            assert decode_directive(encode_directive(directive)).destination == d.destination
 
 
 @given(st.integers(0, 400), st.integers(0, 600))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import pytest
 from policies_examples import fleet_of
 
@@ -38,6 +39,10 @@ def tracking(view: FleetView, region: Disc) -> FleetView:
         (Reposition(math.nan, 0.0), r"reposition of drone 0: nan m from where it is, must be at most 200 m"),
         (Reposition(0.0, math.inf), r"reposition of drone 0: inf m from where it is, must be at most 200 m"),
         ((3.0, 4.0), "a viewpoint returns Reposition or None, got tuple"),
+        (Reposition("a", 0.0, "x"), "reposition of drone 0: x_m is 'a', must be a number"),  # type: ignore[arg-type]
+        (Reposition(0.0, None), "reposition of drone 0: y_m is None, must be a number"),  # type: ignore[arg-type]
+        (Reposition(0.0, 1j), "reposition of drone 0: y_m is 1j, must be a number"),  # type: ignore[arg-type]
+        (Reposition(0.0, 0.0, 5), "reposition of drone 0: reason is 5, must be text"),  # type: ignore[arg-type]
     ],
 )
 def test_a_wish_out_of_bounds_is_named(asked: object, message: str) -> None:
@@ -47,6 +52,7 @@ def test_a_wish_out_of_bounds_is_named(asked: object, message: str) -> None:
         check_reposition(asked, view)
     check_reposition(None, view)
     check_reposition(Reposition(200.0, 0.0), view)
+    check_reposition(Reposition(np.float32(100), np.int64(5)), view)  # type: ignore[arg-type]
 
 
 def test_nobody_asks_for_a_drone_that_the_view_does_not_hold() -> None:
