@@ -20,7 +20,16 @@ from itertools import pairwise
 from typing import Any
 
 from policies.confine import Reached, confined
-from policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, check_directives, check_reposition
+from policies.contract import (
+    Descriptor,
+    Directive,
+    FleetView,
+    Policy,
+    PolicyError,
+    check_directives,
+    check_reposition,
+    kind_fault,
+)
 from policies.registry import viewpoint_of
 from policies.views import draw_view, draw_views, smaller
 
@@ -48,7 +57,7 @@ Rule = Callable[[Policy, FleetView], str | None]
 
 
 class _Raised(Exception):
-    """The policy itself raised; the rule `answers` reports it, no other rule does."""
+    """The policy itself raised, or gave no directives; `answers` and `bounds kept` report it, no other rule does."""
 
 
 def conform(
@@ -92,7 +101,9 @@ def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) ->
         if found is not None:
             small = smaller(view, lambda v: complaint(v) is not None)
             return Check(name, False, complaint(small) or found, small)
-    return Check(name, judged > 0, f"{judged} views" if judged else "the policy raised on every view")
+    return Check(
+        name, judged > 0, f"{judged} views" if judged else "could be judged on no view: see answers, bounds kept"
+    )
 
 
 # --- the rules -----------------------------------------------------------------------------------
@@ -100,6 +111,14 @@ def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) ->
 
 def _ask(policy: Policy, view: FleetView) -> list[Directive]:
     """What the policy decides on a copy of the view: one that changes its input spoils no other rule."""
+    directives = _answer(policy, view)
+    if any(kind_fault(d) is not None for d in directives):
+        raise _Raised
+    return directives
+
+
+def _answer(policy: Policy, view: FleetView) -> list[Directive]:
+    """The same, whatever its directives are made of."""
     try:
         return list(policy(_copied(view)))
     except Exception as error:
@@ -118,7 +137,7 @@ def _answers(policy: Policy, view: FleetView) -> str | None:
 
 def _keeps_bounds(policy: Policy, view: FleetView) -> str | None:
     try:
-        check_directives(_ask(policy, view), view)
+        check_directives(_answer(policy, view), view)
     except PolicyError as error:
         return str(error)
     return None

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from policies.conformance import raised_part
-from policies.contract import FleetView, Policy, PolicyError, check_directives
+from policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
 from policies.invariants import Invariant, spelt, violations
 from policies.ranges import FleetOfRanges
 from policies.symbols import Path, Refused, explore
@@ -202,7 +202,15 @@ def complaint_on(
     try:
         return prop.complaint(policy, View(plain=view, raised=raised))
     except Exception as error:
-        return f"raises {type(error).__name__}: {error}"
+        return _unsound(policy, view) or f"raises {type(error).__name__}: {error}"
+
+
+def _unsound(policy: Policy, view: FleetView) -> str | None:
+    """What in the policy's answer is no directive, over which a property stumbles; None where that is not the cause."""
+    try:
+        return next((wrong for d in policy(view) if (wrong := kind_fault(d)) is not None), None)
+    except Exception:
+        return None
 
 
 def _search(

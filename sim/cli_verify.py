@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
-from policies.conformance import VIEWS, Check, conform
+from policies.conformance import VIEWS, Check, conform, failing
 from policies.contract import FleetView, Policy
 from policies.invariants import Invariant, InvariantError, parse
 from policies.proof import PLANE, Verdict, prove
@@ -51,23 +52,13 @@ def verify(
     shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
     """
     section = _section(policy)
-    name, params = section.name, section.params
-    decide = resolve(name, params)
-    rules = _invariants(name, decide, invariants)
-    broken = 0
-    table = Table("rule", "verdict", "what", title=f"{policy}: the conformance kit, {views} drawn views")
-    checks = conform(decide, count=views)
-    for check in checks:
-        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
-        broken += not check.holds
-    out.print(table)
-    table = Table("property", "verdict", "what", title=f"{policy}: proofs")
-    verdicts = prove(decide, rules, max_drones=drones)
-    for verdict in verdicts:
-        table.add_row(verdict.name, _verdict(verdict.outcome), verdict.what)
-        broken += verdict.outcome == "refuted"
-    out.print(table)
-    _keep(out_dir / slug(policy), _counterexamples(decide, section, checks, verdicts))
+    decide = resolve(section.name, section.params)
+    rules = _invariants(section.name, decide, invariants)
+    try:
+        broken = _try(policy, section, decide, rules, drones, views, out_dir)
+    except SystemExit as stop:  # or a policy that ends the program would pass
+        err.print(f"[red]{escape(policy)} ends the program (exit code {stop.code}), must return directives[/red]")
+        raise typer.Exit(1) from None
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
         raise typer.Exit(1)
@@ -105,6 +96,24 @@ def overhead(
     out.print(
         f"{machine()}; a million additions in a plain loop take {host_s():.3f} s of CPU time here", soft_wrap=True
     )
+
+
+def _try(
+    policy: str, section: PolicySection, decide: Policy, rules: Sequence[Invariant], drones: int, views: int, kept: Path
+) -> int:
+    """Print and keep what the kit and the proofs say; how many rules and properties are broken."""
+    table = Table("rule", "verdict", "what", title=f"{escape(policy)}: the conformance kit, {views} drawn views")
+    checks = conform(decide, count=views)
+    for check in checks:
+        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
+    out.print(table)
+    table = Table("property", "verdict", "what", title=f"{escape(policy)}: proofs")
+    verdicts = prove(decide, rules, max_drones=drones)
+    for verdict in verdicts:
+        table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
+    out.print(table)
+    _keep(kept / slug(policy), _counterexamples(decide, section, checks, verdicts))
+    return len(failing(checks)) + sum(v.outcome == "refuted" for v in verdicts)
 
 
 def _verdict(word: str) -> str:
@@ -159,7 +168,7 @@ def _keep(folder: Path, found: Iterable[tuple[str, FleetView, Scenario]]) -> Non
     for name, view, scenario in found:
         path = unused(folder, scenario.name)
         write_text(path.with_suffix(".json"), to_json(view))
-        out.print(f"counterexample of [bold]{name}[/bold]: {path}.json", soft_wrap=True)
+        out.print(f"counterexample of [bold]{escape(name)}[/bold]: {path}.json", soft_wrap=True)
         if shows_in_flight(scenario):
             write_text(path.with_suffix(".yaml"), dump(scenario))
             out.print(f"  fails until the policy is mended: sortie check {path}.yaml", soft_wrap=True)

@@ -91,6 +91,34 @@ def gives_a_generator(view: FleetView) -> Sequence[Directive]:
     return (d for d in share(view))  # type: ignore[return-value]
 
 
+def gives_nothing(view: FleetView) -> Sequence[Directive]:
+    return None  # type: ignore[return-value]
+
+
+def gives_text(view: FleetView) -> Sequence[Directive]:
+    return "hello" if view.peers else []  # type: ignore[return-value]
+
+
+def rate_as_text(view: FleetView) -> list[Directive]:
+    return share(view, rate_hz="10")
+
+
+def rung_as_text(view: FleetView) -> list[Directive]:
+    return share(view, representation="features")
+
+
+def weighs_by_none(view: FleetView) -> list[Directive]:
+    return share(view, fusion_weight=None)
+
+
+def links_in_lists(view: FleetView) -> list[Directive]:
+    return [d._replace(destination=[d.destination]) for d in share(view)]
+
+
+def gives_reasons_as_numbers(view: FleetView) -> list[Directive]:
+    return share(view, reason=5)
+
+
 def dawdles(view: FleetView) -> list[Directive]:
     end_ns = time.thread_time_ns() + 300_000
     while len(view.descriptors) == 20 and time.thread_time_ns() < end_ns:
@@ -113,6 +141,13 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (needs_a_peer, "one drone and empty views", "raises ValueError"),
     (needs_youth, "stale views", "every descriptor 20 periods old: RuntimeError: nobody there"),
     (gives_a_generator, "answers", "returns generator, must be a sequence of directives"),
+    (gives_nothing, "answers", "returns NoneType, must be a sequence of directives"),
+    (gives_text, "bounds kept", "a policy returns Directive, got str"),
+    (rate_as_text, "bounds kept", "rate_hz is '10', must be in [0, 30], a number"),
+    (rung_as_text, "bounds kept", "representation is 'features', must be in [0, 4], a Representation"),
+    (weighs_by_none, "bounds kept", "fusion_weight is None, must be in [0, 1], a number"),
+    (links_in_lists, "bounds kept", "must be a drone's id, a whole number"),
+    (gives_reasons_as_numbers, "bounds kept", "reason is 5, must be text"),
 ]
 
 
@@ -153,6 +188,7 @@ def test_a_policy_that_always_raises_holds_no_rule() -> None:
     checks = conform(broken, count=5)
     assert [c.name for c in checks if c.holds] == ["input unchanged"]
     assert checks[0].what == "raises KeyError: 'battery'"
+    assert checks[1].what == "could be judged on no view: see answers, bounds kept"
 
 
 def test_views_of_the_users_choice() -> None:

@@ -180,6 +180,28 @@ def test_a_crash_at_one_single_float_is_found() -> None:
     assert (verdict.outcome, verdict.what) == ("refuted", "raises RuntimeError: the one goodput")
 
 
+@pytest.mark.parametrize(
+    ("fields", "what"),
+    [
+        ({"destination": 1.0}, "destination is 1.0, must be a drone's id, a whole number"),
+        ({"reason": 5}, "reason is 5, must be text"),
+        ({"rate_hz": "10"}, "rate_hz is '10', must be in [0, 30], a number"),
+    ],
+)
+def test_a_directive_of_other_types_is_refuted_and_named_by_every_property(
+    fields: dict[str, object], what: str
+) -> None:
+    def decide(view: FleetView) -> list[Directive]:
+        me = view.me
+        tired = me is not None and 0.12 < me.battery_soc < 0.12001
+        return [d._replace(**fields) if tired and d.destination == 1 else d for d in everyone(view)]
+
+    contract, *_, rates = prove(decide, parse("rate_hz <= 10"), max_drones=2)
+    assert (contract.outcome, contract.what) == ("refuted", f"directive 0→{fields.get('destination', 1)}: {what}")
+    assert rates.outcome == ("refuted" if "rate_hz" in fields else "proved")
+    assert rates.outcome == "proved" or rates.what == contract.what
+
+
 def test_what_cannot_be_searched_says_so() -> None:
     verdict = prove(random_k, max_drones=3)[0]
     assert verdict.outcome == "not proved"

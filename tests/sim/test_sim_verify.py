@@ -9,6 +9,7 @@ import pytest
 
 from policies.conformance import RULES
 from policies.contract import TaskPhase
+from policies.registry import resolve
 from policies.views import draw_views, from_json, to_json
 from sim.cli import main
 from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
@@ -98,8 +99,6 @@ def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: p
 
 @pytest.mark.parametrize("name", ["too_fast", "eager", "forgetful"])
 def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
-    from policies.registry import resolve
-
     reference = f"{faulty}:{name}"
     policy = resolve(reference)
     rule = {"too_fast": "bounds kept", "eager": "age-monotone", "forgetful": "one directive a link"}[name]
@@ -107,6 +106,89 @@ def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
     raised = raised_ages(policy, view) if name == "eager" else None
     assert shows_in_flight(replay_scenario(rule, "", reference, {}, view, raised_age_s=raised))
     assert not shows_in_flight(replay_scenario(rule, "", "worked", {}, view, raised_age_s=raised))
+
+
+BROKEN = """
+from policies.contract import Directive, Representation
+
+INVARIANTS = "rate_hz <= 20"
+
+def share(view, **fields):
+    rung = Representation.DETECTIONS
+    return [Directive(view.ego, p, rung, rate_hz=5.0, reason="shares")._replace(**fields) for p in view.peers]
+
+def tired(view):
+    return view.me is not None and view.me.battery_soc < 0.5
+
+def raises(view):
+    if tired(view):
+        raise RuntimeError("[/red] tired")
+    return share(view)
+
+def raises_when_old(view):
+    if any(view.age_s[p] > 2.0 for p in view.peers):
+        raise RuntimeError("too old")
+    return share(view)
+
+def nothing(view):
+    return None
+
+def lacks(view, *, must):
+    return share(view)
+
+def text(view):
+    return "hello" if tired(view) else share(view)
+
+def texts(view):
+    return share(view, rate_hz="10" if tired(view) else 5.0)
+
+def texts_when_old(view):
+    return [d._replace(rate_hz="10" if view.age_s[d.destination] > 2.0 else 5.0) for d in share(view)]
+
+def rung(view):
+    return share(view, representation="features")
+
+def leaves(view):
+    raise SystemExit(0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("raises", "raises RuntimeError: [/red] tired"),
+        ("raises_when_old", "raises RuntimeError: too old"),
+        ("nothing", "returns NoneType, must be a sequence of directives"),
+        ("lacks", "missing 1 required keyword-only argument: 'must'"),
+        ("text", "a policy returns Directive, got str"),
+        ("texts", "rate_hz is '10', must be in [0, 30], a number"),
+        ("texts_when_old", "rate_hz is '10', must be in [0, 30], a number"),
+        ("rung", "representation is 'features', must be in [0, 4], a Representation"),
+        ("leaves", "ends the program (exit code 0), must return directives"),
+    ],
+)
+def test_a_policy_that_gives_no_directives_is_a_broken_one(
+    name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "250")
+    path = tmp_path / "broken.py"
+    path.write_text(BROKEN)
+    assert sortie("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
+    printed = capsys.readouterr()
+    assert told in printed.out + printed.err
+
+
+def test_the_ages_at_which_a_policy_raises_are_shown_in_flight(tmp_path: Path) -> None:
+    path = tmp_path / "broken.py"
+    path.write_text(BROKEN)
+    policy = resolve(f"{path}:raises_when_old")
+    view = next(v for v in draw_views(2, 200) if len(v.peers) == 3 and max(v.age_s.values()) < 1.0)
+    raised = raised_ages(policy, view)
+    assert raised is not None
+    with pytest.raises(RuntimeError, match="too old"):
+        policy(view._replace(age_s=raised))
+    assert raised_ages(policy, view._replace(age_s=raised)) is None, "it raises on the view itself"
+    assert shows_in_flight(replay_scenario("ages", "", f"{path}:raises_when_old", {}, view, raised_age_s=raised))
 
 
 def test_an_unknown_policy_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
