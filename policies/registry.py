@@ -5,8 +5,11 @@ from __future__ import annotations
 import functools
 import importlib.util
 import inspect
+import math
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from policies import adaptive, baselines
 from policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
@@ -32,19 +35,46 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
 """One line a policy. Keyword-only arguments are its parameters."""
 
 
+class Bound(NamedTuple):
+    """What a parameter must be."""
+
+    words: str
+    low: float = -math.inf
+    high: float = math.inf
+    whole: bool = False
+
+    def holds(self, value: object) -> bool:
+        kind: Any = numbers.Integral if self.whole else numbers.Real
+        return isinstance(value, kind) and not isinstance(value, bool) and self.low <= value <= self.high  # NaN is not
+
+
+BOUNDS: dict[str, Bound] = {
+    "rho": Bound("a number in [0, 1]", 0, 1),
+    "k": Bound("a whole number from 0 on", 0, whole=True),
+    "salt": Bound("a whole number", whole=True),
+    "rounds": Bound("a whole number from 1 on", 1, whole=True),
+    "threshold": Bound("a number in [0, 1]", 0, 1),
+    "sharpness": Bound("a number in [0, 100]", 0, 100),  # e to the power of some 700 is no float any more
+    "trusted_for_s": Bound("a number in [0.001, 3600]", 0.001, 3600),
+}
+"""Of the registered policies' parameters, by name; what a user's file declares, its function judges."""
+
+
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     """A registered policy, or `path/to/file.py:function`, with its parameters bound.
 
     Raises:
-        PolicyError: unknown name or parameter, missing file or function.
+        PolicyError: unknown name or parameter, a parameter out of its bounds, missing file or function.
     """
     function = _from_file(name) if ":" in name else POLICIES.get(name)
     if function is None:
         raise PolicyError(f"unknown policy {name!r}, known: {', '.join(POLICIES)}, or path/to/file.py:function")
     known = parameters(function)
-    for key in params or {}:
+    for key, value in (params or {}).items():
         if key not in known:
             raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
+        if name in POLICIES and not BOUNDS[key].holds(value):
+            raise PolicyError(f"{name}: {key} is {value!r}, must be {BOUNDS[key].words}")
     return functools.partial(function, **params) if params else function
 
 
@@ -90,4 +120,10 @@ def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
     function = getattr(module, attribute, None)
     if not callable(function):
         raise PolicyError(f"policy file {file!r} has no function {attribute!r}")
+    try:
+        inspect.signature(function)
+    except (TypeError, ValueError) as error:  # some of those written in C
+        raise PolicyError(
+            f"policy file {file!r}: {attribute!r} names no parameters, must be a Python function"
+        ) from error
     return function  # type: ignore[no-any-return]
