@@ -119,6 +119,16 @@ SAMPLED = (Uniform, Integers, Normal, LogNormal, Triangular, Choice)
 
 # --- the campaign ---------------------------------------------------------------------------------
 
+PARAMS = "policy.params."
+"""Before the name of a policy's parameter that is varied: it is put over what each policy has of its own."""
+_LEFT_TO = {
+    "seed": "left to the campaign: its own seed decides every run's, replications are further draws",
+    "policy.name": "left to policies, which lists those that fly",
+    "policy.changes": "left to policies: one other than the base's own flies to the end",
+    "policy.commands": "left to policies: one other than the base's own flies to the end",
+}
+"""Fields of the base that the plan writes itself: varied, they would stand in the table and not be flown."""
+
 
 class Sample(Section):
     method: Literal["random", "latin_hypercube", "sobol", "morris", "saltelli"] = Field(
@@ -191,6 +201,14 @@ class Campaign(Section):
                     raise inconsistent((name, i), entry, "named once")
         for name in self.set.keys() & self.vary.keys():
             raise inconsistent(("set", name), name, "set or varied, not both")
+        for name in self.vary:
+            if name in ("policy", PARAMS[:-1]):
+                raise inconsistent(("vary", name), name, "one of its fields, as in policy.params.rho")
+            for field, bound in _LEFT_TO.items():
+                if f"{name}.".startswith(f"{field}."):
+                    raise inconsistent(("vary", name), name, bound)
+        if "seed" in self.set:
+            raise inconsistent(("set", "seed"), "seed", _LEFT_TO["seed"])
         return self
 
 

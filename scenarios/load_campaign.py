@@ -25,7 +25,7 @@ from scenarios.campaign import (
 )
 from scenarios.files import found_beside
 from scenarios.load import campaigns, library, load, read, tree, validated
-from scenarios.nodes import Node, ScenarioError, assign, plain
+from scenarios.nodes import Node, ScenarioError, assign, child, dotted, plain
 from scenarios.schema import Scenario
 
 
@@ -40,6 +40,15 @@ class Study:
     """By varied field: the values of a file's column."""
     folder: Path
     """Where it lies: files that its policies are in are looked for there too."""
+    root: Node
+    """The file's own tree."""
+
+    def where(self, *path: str | int) -> str:
+        """`FILE:LINE: a.b` of a field of the campaign's file; the line of what is above a field that is left out."""
+        node = self.root
+        for part in path:
+            node = child(node, part) or node
+        return f"{node.where}: {dotted(path)}"
 
 
 def load_campaign(path_or_name: str | Path) -> Study:
@@ -71,7 +80,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
         for value in _extremes(spread, columns.get(name, ())):
             node = as_node(value, varied[name].source, varied[name].line)
             validated(assign(resolved, name.split("."), node), Scenario)
-    return Study(campaign, base, columns, here)
+    return Study(campaign, base, columns, here, root)
 
 
 def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perception.surrogate.model import SHIPPED
+from policies.contract import PolicyError
 from policies.registry import resolve
-from scenarios.campaign import Campaign
+from scenarios.campaign import PARAMS, Campaign
 from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
 from scenarios.load import loads
 from scenarios.load_campaign import Study, as_node
-from scenarios.nodes import assign, plain
+from scenarios.nodes import ScenarioError, assign, plain
 from scenarios.schema import Scenario
 from scenarios.traces import located
 from sim.campaign.code import code_version, file_digest
@@ -141,13 +142,15 @@ class Plan:
     def task(self, run: int) -> str:
         """What the worker receives."""
         at = self.at(run)
-        node = self._base
-        for name, value in self.varied(at.cell).items():
+        node, varied = self._base, self.varied(at.cell)
+        for name, value in varied.items():
             node = assign(node, name.split("."), as_node(value))
         scenario = plain(node)
         assert isinstance(scenario, dict)  # noqa: S101
-        seed = self.seed(at.cell)
-        scenario |= {"policy": {**scenario["policy"], **self.spec["policies"][at.policy][1]}, "seed": seed}
+        seed, policy = self.seed(at.cell), self.spec["policies"][at.policy][1]
+        params = {name.removeprefix(PARAMS): value for name, value in varied.items() if name.startswith(PARAMS)}
+        policy = {**scenario["policy"], **policy, "params": {**policy["params"], **params}}
+        scenario |= {"policy": policy, "seed": seed}
         task = {
             "scenario": scenario,
             "seed": seed,
@@ -177,8 +180,8 @@ def make_plan(study: Study) -> Plan:
 
     sections = with_files(base.model_dump(mode="json", exclude_none=True), place)
     policies = [
-        (label or base.policy.name, with_files({"policy": _policy(label, base, study.folder)}, place)["policy"])
-        for label in campaign.policies
+        (label or base.policy.name, with_files({"policy": _policy(study, i)}, place)["policy"])
+        for i, label in enumerate(campaign.policies)
     ]
     asked, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
     named = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
@@ -202,12 +205,27 @@ def make_plan(study: Study) -> Plan:
     )
 
 
-def _policy(label: str, base: Scenario, folder: Path) -> dict[str, Any]:
+def _policy(study: Study, number: int) -> dict[str, Any]:
     """What a policy's runs have in the scenario's section: another than the base's own flies to the end."""
-    if label:
-        text = json.dumps(base.model_dump(mode="json", exclude_none=True))
-        base = found_beside(loads(text, label, policy_overrides(label, base.policy.name)), folder)
-    resolve(base.policy.name, base.policy.params)
+    label, base = study.campaign.policies[number], study.base
+    at = study.where("policies", number) if label else study.where("base")
+    try:
+        if label:
+            overrides = policy_overrides(label, base.policy.name)
+            for name in (override.partition("=")[0].strip() for override in overrides):
+                if name in study.campaign.vary:
+                    raise PolicyError(f"{label} has its own {name}, which is varied; leave it out here")
+            text = json.dumps(base.model_dump(mode="json", exclude_none=True))
+            base = found_beside(loads(text, label, overrides), study.folder)
+        resolve(base.policy.name, base.policy.params)
+    except (PolicyError, ScenarioError) as error:
+        raise PolicyError(f"{at}: {error}") from None
+    for name in study.campaign.vary:
+        if name.startswith(PARAMS):
+            try:
+                resolve(base.policy.name, {name.removeprefix(PARAMS): None})
+            except PolicyError as error:
+                raise PolicyError(f"{study.where('vary', name)}: {error}") from None
     section = base.policy.model_dump(mode="json", exclude_none=True)
     return {name: section[name] for name in ("name", "params", "changes", "commands")}
 

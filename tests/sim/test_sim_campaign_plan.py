@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from policies.contract import PolicyError
 from scenarios.campaign import (
     Choice,
     Integers,
@@ -26,6 +27,7 @@ from scenarios.load import ScenarioError
 from scenarios.load_campaign import load_campaign
 from sim.campaign.plan import Plan
 from sim.campaign.spread import design, quantile
+from sim.campaign.work import unpack
 from sim.folders import RunError
 
 U = st.floats(0.001, 0.999)
@@ -170,6 +172,38 @@ def test_the_plan_survives_its_json(tmp_path: Path) -> None:
         ("seed: 5", "stop_when: {metric: x, half_width: 1}", "11: stop_when.metric: x, must be one of metrics"),
         ("seed: 5", "vry: 5", "11: vry: unknown key, did you mean vary?"),
         (
+            "fleet.formation.spacing_m:", "seed:",
+            "6: vary.seed: seed, must be left to the campaign: its own seed decides every run's, replications are further "
+            "draws",
+        ),
+        (
+            "fleet.formation.spacing_m:", "policy.name:",
+            "6: vary.policy.name: policy.name, must be left to policies, which lists those that fly",
+        ),
+        (
+            "fleet.formation.spacing_m:", "policy.changes.0.at_s:",
+            "6: vary.policy.changes.0.at_s: policy.changes.0.at_s, must be left to policies: one other than the base's own "
+            "flies to the end",
+        ),
+        (
+            "fleet.formation.spacing_m:", "policy.commands:",
+            "6: vary.policy.commands: policy.commands, must be left to policies: one other than the base's own flies to "
+            "the end",
+        ),
+        (
+            "fleet.formation.spacing_m:", "policy:",
+            "6: vary.policy: policy, must be one of its fields, as in policy.params.rho",
+        ),
+        (
+            "fleet.formation.spacing_m:", "policy.params:",
+            "6: vary.policy.params: policy.params, must be one of its fields, as in policy.params.rho",
+        ),
+        (
+            "seed: 5", "set: {seed: 7}",
+            "11: set.seed: seed, must be left to the campaign: its own seed decides every run's, replications are further "
+            "draws",
+        ),
+        (
             "{kind: grid, values: [20, 40]}", "{kind: column, file: no.csv, column: a}",
             "6: {here}/no.csv: no such file",
         ),
@@ -201,6 +235,46 @@ def test_a_metric_that_is_none_is_refused(tmp_path: Path, name: str, message: st
     with pytest.raises(RunError) as error:
         plan(tmp_path, CAMPAIGN.replace("bytes.data_sent", name))
     assert str(error.value).startswith(message)
+
+
+BUDGETS = CAMPAIGN.replace(
+    "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", "policy.params.rho: {kind: grid, values: [0.1, 0.2]}"
+).replace('"best-2(rho=0.1)"', "best-2(k=1)")
+
+
+def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
+    """Over what the base and the policy's own brackets say; all else that they say stays."""
+    p = plan(tmp_path, BUDGETS, BASE + "policy: {name: worked, params: {rho: 0.3}, dwell_s: 2}\n")
+    for run in range(p.runs):
+        at = p.at(run)
+        policy, rho = unpack(p.task(run))[0].policy, (0.1, 0.2)[at.cell % 2]
+        assert p.varied(at.cell)["policy.params.rho"] == rho
+        assert policy.name == ("worked", "best-2")[at.policy]
+        assert policy.params == ({"rho": rho}, {"k": 1, "rho": rho})[at.policy]
+        assert policy.dwell_s == 2
+    assert p.key(0) != p.key(4)  # the next grid point, not the next replication
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("best-2(k=1)", "silence", "6: vary.policy.params.rho: policy 'silence' has no parameter 'rho', it has: none"),
+        ("params.rho:", "params.roh:", "6: vary.policy.params.roh: policy 'worked' has no parameter 'roh', it has: rho"),
+        (
+            "best-2(k=1)", '"best-2(k=1, rho=0.5)"',
+            "9: policies.1: best-2(k=1, rho=0.5) has its own policy.params.rho, which is varied; leave it out here",
+        ),
+        ("best-2(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', known: worked, "),
+        ("best-2(k=1)", "best-2(q=1)", "9: policies.1: policy 'best-2' has no parameter 'q', it has: k, rho"),
+        ("best-2(k=1)", "best-2(k)", "9: policies.1: --set policy.params.k: must be key.path=value"),
+        ("policies: [worked, best-2(k=1)]", "set: {policy.name: wirkt}", "3: base: unknown policy 'wirkt', known: "),
+    ],
+)  # fmt: skip
+def test_a_policy_that_cannot_fly_is_told_at_its_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in BUDGETS
+    with pytest.raises(PolicyError) as error:
+        plan(tmp_path, BUDGETS.replace(old, new))
+    assert str(error.value).startswith(f"{tmp_path / 'small_ones.yaml'}:{message}")
 
 
 def test_a_scenario_is_no_campaign_and_the_library_tells_them_apart() -> None:
