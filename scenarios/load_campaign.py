@@ -42,6 +42,10 @@ class Study:
     """Where it lies: files that its policies are in are looked for there too."""
     root: Node
     """The file's own tree."""
+    drones: int
+    """At most so many in a run."""
+    phases: int
+    """At most so many in a run's mission, whether they begin before its end or not."""
 
     def where(self, *path: str | int) -> str:
         """`FILE:LINE: a.b` of a field of the campaign's file; the line of what is above a field that is left out."""
@@ -76,11 +80,13 @@ def load_campaign(path_or_name: str | Path) -> Study:
             columns[name] = _column(spread, here, varied[name])
     _check_lengths(campaign, columns, varied)
     resolved = as_node(base.model_dump(mode="json", exclude_none=True), source)
+    drones, phases = base.fleet.drones, len(base.mission.phases)
     for name, spread in campaign.vary.items():
         for value in _extremes(spread, columns.get(name, ())):
             node = as_node(value, varied[name].source, varied[name].line)
-            validated(assign(resolved, name.split("."), node), Scenario)
-    return Study(campaign, base, columns, here, root)
+            made = validated(assign(resolved, name.split("."), node), Scenario)
+            drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
+    return Study(campaign, base, columns, here, root, drones, phases)
 
 
 def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

@@ -1,11 +1,18 @@
 """The fields of `outcome.json` and what they mean: the reference in `outcome.md` is made of this.
 
-A test holds `sim.outcome.outcome` to these types, field by field.
+A test holds `sim.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, TypedDict
+from collections.abc import Collection, Mapping
+from types import UnionType
+from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
+
+from fleet.auth import DropReason
+from fleet.battery import CAUSES, RECORDED
+from radio.transmission import Status
+from scenarios.nodes import nearest
 
 
 class Percentiles(TypedDict):
@@ -124,3 +131,97 @@ class Outcome(TypedDict):
     policy_eval_us: Annotated[Percentiles, "Wall time of a decision; no part of the fingerprint."]
     wall_s: Annotated[float | None, "Wall time of the flight; no part of the fingerprint."]
     realtime_factor: Annotated[float | None, "Simulated over wall time; no part of the fingerprint."]
+
+
+# --- names of numbers ----------------------------------------------------------------------------
+
+WALL = ("wall_s", "realtime_factor", "policy_eval_us")
+REASONS = {
+    Status.DELIVERED: ("",),
+    Status.LOST: ("fragment_lost", "no_link", "receiver_gone", "sender_gone"),
+    Status.EXPIRED: ("deadline_in_service", "deadline_queued", "replaced"),
+    Status.IN_FLIGHT: ("",),
+}
+"""By fate: the reasons that the radio gives; what arrived in part has those of what was lost or expired."""
+
+
+def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bool) -> dict[str, Collection[str]]:
+    """What the objects of an outcome that are open (`*` in the reference) may be keyed by, and how many phases there are.
+
+    Args:
+        drones, phases: at most so many.
+        policies: those that may decide, as the record names them.
+        traced: whether drones may follow a trace.
+    """
+    ids = tuple(map(str, range(drones)))
+    part = {Status.PARTIAL: (*REASONS[Status.LOST], *REASONS[Status.EXPIRED])}
+    return {
+        "payload_fates": tuple(f"{s}/{r}" if r else str(s) for s, reasons in (REASONS | part).items() for r in reasons),
+        "descriptor_drops": tuple(map(str, DropReason)),
+        "battery": ids,
+        "drones": ids,
+        "distrusted_by": ids,
+        "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
+        "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
+        "phases": tuple(map(str, range(phases))),
+    }
+
+
+def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
+    """Hold a dotted name against the reference: some run's outcome may have a number there.
+
+    Args:
+        keys: as `open_keys` gives them; a list that is not among them may be of any length.
+
+    Raises:
+        ValueError: it never has one: no such field, wall clock, or no number; with what could have been meant.
+    """
+    kind: Any = Outcome
+    parts = name.split(".")
+    if parts[0] in WALL:
+        raise ValueError(f"{name}: is wall clock, a metric must follow from the run alone")
+    for depth, part in enumerate(parts):
+        above = ".".join(parts[:depth])
+        below = _below(kind, part, keys.get(above))
+        if below is None:
+            raise ValueError(
+                f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, keys.get(above))}"
+            )
+        kind = below
+    if what := _no_number(kind):
+        raise ValueError(f"{name}: is {what}, a metric must be a number")
+
+
+def _below(kind: Any, part: str, keys: Collection[str] | None) -> Any:
+    """The kind of what stands under a key or number; None where nothing can."""
+    if is_typeddict(kind):
+        return get_type_hints(kind).get(part)
+    if get_origin(kind) is dict:
+        return get_args(kind)[1] if part in (keys or ()) else None
+    if get_origin(kind) is list and part.isdecimal() and part.isascii():
+        return get_args(kind)[0] if keys is None or part in keys else None
+    return None
+
+
+def _instead(kind: Any, part: str, keys: Collection[str] | None) -> str:
+    """What could have been meant by a key that is not there, or what there is."""
+    what = _no_number(kind)
+    if what in ("", "text"):
+        return f"it is {what or 'a number'}"
+    if what == "a list" and keys is None:
+        return "it has entries by number"
+    known = list(get_type_hints(kind) if is_typeddict(kind) else keys or ())
+    if all(key.isdecimal() for key in known):
+        return f"it has {known[0]} … {known[-1]}" if known else "it has none that can be named"
+    near = nearest(part, known)
+    return f"did you mean {near}?" if near else f"it has {', '.join(known)}"
+
+
+def _no_number(kind: Any) -> str:
+    """What a field is that is no number, in words; empty where it is one."""
+    if is_typeddict(kind) or get_origin(kind) is dict:
+        return "a section"
+    if get_origin(kind) is list:
+        return "a list"
+    members = get_args(kind) if get_origin(kind) is UnionType else (kind,)
+    return "text" if str in members else ""

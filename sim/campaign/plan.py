@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,14 +25,15 @@ from scenarios.files import FIELDS, found_beside, named_files, placed, with_file
 from scenarios.load import loads
 from scenarios.load_campaign import Study, as_node
 from scenarios.nodes import ScenarioError, assign, plain
-from scenarios.schema import Scenario
+from scenarios.schema import Perception, Scenario
 from scenarios.traces import located
 from sim.campaign.code import code_version, file_digest
 from sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
-from sim.campaign.work import number, task_key
+from sim.campaign.work import task_key
 from sim.folders import RunError
 from sim.named import policy_overrides
-from sim.outcome import outcome
+from sim.outcome_fields import check_number, open_keys
+from sim.pilot import named
 from sim.sortie import run_sortie
 
 FORMAT = 1
@@ -184,14 +185,14 @@ def make_plan(study: Study) -> Plan:
         for i, label in enumerate(campaign.policies)
     ]
     asked, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
-    named = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
+    reading = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
     for field in sorted(campaign.vary.keys() & set(FIELDS)):
         room, _, key = field.partition(".")
         holder, within = (columns, field) if field in columns else (asked["vary"][field], "values")
         varied = [with_files({room: {key: name}}, place) for name in holder[within]]
         holder[within] = [section[room][key] for section in varied]
-        named += varied
-    _check_metrics(campaign, base)
+        reading += varied
+    _check_metrics(study, [section for _, section in policies])
     return Plan(
         {
             "format": FORMAT,
@@ -199,7 +200,7 @@ def make_plan(study: Study) -> Plan:
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
-            "files": _files(base, [file for some in named for file in named_files(some)]),
+            "files": _files(base, [file for some in reading for file in named_files(some)]),
             "code": code_version(),
         }
     )
@@ -249,14 +250,28 @@ def _files(base: Scenario, named: list[str]) -> dict[str, str]:
     return found
 
 
-def _check_metrics(campaign: Campaign, base: Scenario) -> None:
-    """Against the outcome of a moment's flight, which has every field that does not depend on what happens."""
-    sections = base.model_dump(mode="json", exclude_none=True) | {"duration_s": 2 * base.frame_s, "events": []}
-    sections["perception"] = {"detector": "none"}
-    sections["policy"] |= {"changes": [], "commands": [], "replays": []}  # they lie beyond that moment
-    result = outcome(run_sortie(Scenario.model_validate_json(json.dumps(sections), strict=True)))
-    for i, name in enumerate(campaign.metrics):
+def _check_metrics(study: Study, policies: Sequence[Mapping[str, Any]]) -> None:
+    """Hold the metrics' names against the outcome's reference."""
+    # what the base reads is looked at here, once, not in thousands of runs; a copy is not validated, so that changes of
+    # policy may lie beyond its end
+    short = {"duration_s": 2 * study.base.frame_s, "events": (), "perception": Perception(detector="none")}
+    run_sortie(study.base.model_copy(update=short))
+    keys = _metric_keys(study, policies)
+    for i, name in enumerate(study.campaign.metrics):
         try:
-            number(result, name)
+            check_number(name, keys)
         except ValueError as error:
-            raise RunError(f"metrics.{i}: {error}") from None
+            raise RunError(f"{study.where('metrics', i)}: {error}") from None
+
+
+def _metric_keys(study: Study, policies: Sequence[Mapping[str, Any]]) -> dict[str, Collection[str]]:
+    """What the open parts of the runs' outcomes may be keyed by."""
+    base, vary = study.base, study.campaign.vary
+    timed = any(name == "duration_s" or name.partition(".")[0] == "mission" for name in vary)
+    phases = study.phases if timed else sum(phase.at_s < base.duration_s for phase in base.mission.phases)
+    traced = base.fleet.trace is not None or not vary.keys().isdisjoint({"fleet", "fleet.trace"})
+    flown = [change for section in policies for change in section["changes"]]
+    if not any(name.startswith(PARAMS) for name in vary):  # else every run has another name for its policy
+        flown += policies
+    names = [named(one["name"], dict(sorted(one["params"].items()))).name for one in flown]  # as tasks have them
+    return open_keys(study.drones, phases, names, traced=traced)

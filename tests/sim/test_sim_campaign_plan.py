@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from scenarios.load import ScenarioError
 from scenarios.load_campaign import load_campaign
 from sim.campaign.plan import Plan
 from sim.campaign.spread import design, quantile
-from sim.campaign.work import unpack
+from sim.campaign.work import number, unpack
 from sim.folders import RunError
 
 U = st.floats(0.001, 0.999)
@@ -118,7 +119,7 @@ def test_a_linspace_over_whole_numbers_gives_whole_numbers(tmp_path: Path) -> No
         ("seed: 5", "seed: 6"),
         ("low: 0.2", "low: 0.21"),
         ("rho=0.1", "rho=0.11"),
-        ("energy_j.total", "energy_j.hover"),
+        ("energy_j.total", "energy_j.rotor"),
     ],
 )
 def test_whatever_reaches_the_worker_changes_the_key(tmp_path: Path, old: str, new: str) -> None:
@@ -225,16 +226,66 @@ def test_what_is_wrong_is_told_at_its_line(tmp_path: Path, old: str, new: str, m
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("bytes.nothing", "metrics.0: bytes.nothing: bytes has no 'nothing', it has context_sent"),
-        ("wall_s", "metrics.0: wall_s: is wall clock, a metric must follow from the run alone"),
-        ("policy", "metrics.0: policy: is text, a metric must be a number"),
-        ("bytes", "metrics.0: bytes: is a section, a metric must be a number"),
+        ("bytes.nothing", "bytes.nothing: bytes has no 'nothing', it has context_sent"),
+        ("bytes.data_snt", "bytes.data_snt: bytes has no 'data_snt', did you mean data_sent?"),
+        ("wall_s", "wall_s: is wall clock, a metric must follow from the run alone"),
+        ("policy", "policy: is text, a metric must be a number"),
+        ("bytes", "bytes: is a section, a metric must be a number"),
+        ("events.0.kind", "events.0.kind: is text, a metric must be a number"),
+        ("transitions.0.peers", "transitions.0.peers: is a list, a metric must be a number"),
+        ("ap50.mission.x", "ap50.mission.x: ap50.mission has no 'x', it is a number"),
+        ("energy_j.totl", "energy_j.totl: energy_j has no 'totl', did you mean total?"),
+        ("energy_j.recorded", "energy_j.recorded: energy_j has no 'recorded', it has rotor, avionics, compute,"),
+        ("battery.2", "battery.2: battery has no '2', it has 0 … 1"),
+        ("distrusted_by.2", "distrusted_by.2: distrusted_by has no '2', it has 0 … 1"),
+        ("drones.9.soc", "drones.9.soc: drones has no '9', it has 0 … 1"),
+        ("drones.1.sock", "drones.1.sock: drones.1 has no 'sock', did you mean soc?"),
+        ("phases.0.ap50.missio", "phases.0.ap50.missio: phases.0.ap50 has no 'missio', did you mean mission?"),
+        ("phases.1.begin_s", "phases.1.begin_s: phases has no '1', it has 0 … 0"),
+        ("events.x", "events.x: events has no 'x', it has entries by number"),
+        ("payload_fates.lost", "payload_fates.lost: payload_fates has no 'lost', did you mean lost/fragment_lost?"),
+        ("payload_fates.x", "payload_fates.x: payload_fates has no 'x', it has delivered, lost/fragment_lost, "),
+        ("descriptor_drops.forgd", "descriptor_drops.forgd: descriptor_drops has no 'forgd', did you mean forged?"),
+        (
+            "policies.decisions.workd",
+            "policies.decisions.workd: policies.decisions has no 'workd', did you mean worked?",
+        ),
     ],
 )
 def test_a_metric_that_is_none_is_refused(tmp_path: Path, name: str, message: str) -> None:
     with pytest.raises(RunError) as error:
         plan(tmp_path, CAMPAIGN.replace("bytes.data_sent", name))
-    assert str(error.value).startswith(message)
+    assert str(error.value).startswith(f"{tmp_path / 'small_ones.yaml'}:10: metrics.0: {message}")
+
+
+def test_a_metric_that_only_some_runs_have_is_kept(tmp_path: Path) -> None:
+    """By the largest fleet, the longest mission, the traces and the policies of any run; null in the others."""
+    (tmp_path / "a.csv").write_text("t_s,drone,soc\n0,0,0.5\n")
+    base = BASE + "mission: {phases: [{at_s: 0, phase: search}, {at_s: 1, phase: track}]}\n"
+    vary = (
+        "fleet.drones: {kind: grid, values: [2, 4]}\n  duration_s: {kind: grid, values: [0.5, 2]}\n"
+        "  fleet.trace: {kind: grid, values: [a.csv, null]}"
+    )
+    names = (
+        "battery.3, drones.3.soc, distrusted_by.3, phases.1.begin_s, energy_j.recorded, policies.decisions.silence, "
+        "events.7.t_s, transitions.5.peers.1, payload_fates.lost/no_link, payload_fates.partial/deadline_queued, "
+        "descriptor_drops.forged, ap50.mission, drones.0.airborne"
+    )
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
+    text = text.replace("bytes.data_sent", names).replace('"best-2(rho=0.1)"', "silence")
+    assert "battery.3" in plan(tmp_path, text, base).campaign.metrics
+    with pytest.raises(RunError, match="phases has no '1', it has 0 … 0"):  # if no run is that long
+        plan(
+            tmp_path,
+            text.replace("duration_s: {kind: grid", "context.publish_every: {kind: grid").replace("0.5, 2", "1, 2"),
+            base,
+        )
+
+
+def test_the_number_of_a_metric_is_null_where_a_run_has_none() -> None:
+    result = {"a": {"b": 2, "c": None, "d": math.inf}, "phases": [{"x": True}]}
+    names = ("a.b", "a.c", "a.d", "a.e", "phases.0.x", "phases.1.x")
+    assert [number(result, name) for name in names] == [2.0, None, None, None, 1.0, None]
 
 
 BUDGETS = CAMPAIGN.replace(

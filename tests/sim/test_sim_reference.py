@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
 
 import pytest
 from sim_examples import example
 
+import radio
 from sim import reference
+from sim.golden import figures
 from sim.outcome import outcome
-from sim.outcome_fields import Outcome
+from sim.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
 from sim.record import ABOUT, TABLES
 from sim.sortie import run_sortie
 
@@ -53,6 +57,45 @@ def test_a_sortie_s_outcome_has_the_fields_of_the_reference() -> None:
     assert faults(result, Outcome, "outcome") == []
     assert result["ap50"]["full_scene"] is not None
     assert all(result[k] for k in ("transitions", "phases", "events", "drones", "descriptor_drops", "payload_fates"))
+
+
+def test_every_number_of_an_outcome_may_be_named() -> None:
+    """Of a sortie with losses, drops, doubts and a second policy; what is no number, or wall clock, may not."""
+    flown = example(
+        "radio.framing=tiles", "radio.tx_power_dbm=-8", "policy.changes=[{at_s: 4, name: silence}]",
+        "events=[{kind: drone_lost, at_s: 2, drone: 3}, {kind: spoof, at_s: 1, drone: 1, until_s: 3},"
+        " {kind: lie, at_s: 1, drone: 1, about: battery}]",
+    )  # fmt: skip
+    result = outcome(run_sortie(flown))
+    assert {s.partition("/")[0] for s in result["payload_fates"]} >= {"delivered", "lost", "expired", "partial"}
+    assert result["distrusted_by"]
+    keys = open_keys(5, len(result["phases"]), result["policies"]["decisions"], traced=False)
+    tried = 0
+    for name, value in figures(result).items():
+        if isinstance(value, int | float) and not name.startswith("policies.decisions.worked("):  # a dot in its rho
+            check_number(name, keys)
+            tried += 1
+        elif isinstance(value, str):
+            with pytest.raises(ValueError, match="is text, a metric must be a number"):
+                check_number(name, keys)
+    assert tried > 50
+    for name in ("wall_s", "policy_eval_us.p50"):
+        assert name.partition(".")[0] in WALL
+        with pytest.raises(ValueError, match="is wall clock"):
+            check_number(name, keys)
+
+
+def test_what_may_be_keyed_is_known_of_every_object_that_is_open() -> None:
+    found = {path for path, value, _ in reference.fields(Outcome) if value.startswith("object of")}
+    found |= {path.partition(".*")[0] for path, _, _ in reference.fields(Outcome) if ".*" in path}
+    assert open_keys(1, 1, (), traced=False).keys() == found | {"phases"}
+
+
+def test_the_reasons_of_fates_are_those_that_the_radio_gives() -> None:
+    text = "".join(path.read_text("utf-8") for path in sorted(Path(radio.__path__[0]).glob("*.py")))
+    said = re.findall(r"_close\(\w+, _(?:LOST|EXPIRED), (.*)\)|^ +reason = (.*)$", text, re.MULTILINE)
+    given = {word for line in said for word in re.findall(r'"(\w+)"', "".join(line))}
+    assert given == {reason for reasons in REASONS.values() for reason in reasons if reason}
 
 
 @pytest.mark.parametrize(
