@@ -82,7 +82,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
     resolved = as_node(base.model_dump(mode="json", exclude_none=True), source)
     drones, phases = base.fleet.drones, len(base.mission.phases)
     for name, spread in campaign.vary.items():
-        for value in _extremes(spread, columns.get(name, ())):
+        for value in extremes(spread, columns.get(name, ())):
             node = as_node(value, varied[name].source, varied[name].line)
             made = validated(assign(resolved, name.split("."), node), Scenario)
             drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
@@ -128,7 +128,7 @@ def _base(name: str, here: Path, source: str, root: Node) -> Scenario:
     return load(name if name in library() else here / name)
 
 
-def _extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
+def extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
     """The values that a spread can take, or its ends; of one without ends its middle alone."""
     if isinstance(spread, Uniform | Triangular | Integers):
         yield from (spread.low, spread.high)

@@ -23,7 +23,7 @@ from policies.registry import resolve
 from scenarios.campaign import PARAMS, Campaign
 from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
 from scenarios.load import loads
-from scenarios.load_campaign import Study, as_node
+from scenarios.load_campaign import Study, as_node, extremes
 from scenarios.nodes import ScenarioError, assign, plain
 from scenarios.schema import Perception, Scenario
 from scenarios.traces import located
@@ -221,10 +221,11 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
         resolve(base.policy.name, base.policy.params)
     except (PolicyError, ScenarioError) as error:
         raise PolicyError(f"{at}: {error}") from None
-    for name in study.campaign.vary:
+    for name, spread in study.campaign.vary.items():
         if name.startswith(PARAMS):
             try:
-                resolve(base.policy.name, {name.removeprefix(PARAMS): None})
+                for value in extremes(spread, study.columns.get(name, ())):
+                    resolve(base.policy.name, {name.removeprefix(PARAMS): value})
             except PolicyError as error:
                 raise PolicyError(f"{study.where('vary', name)}: {error}") from None
     section = base.policy.model_dump(mode="json", exclude_none=True)

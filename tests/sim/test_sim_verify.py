@@ -170,7 +170,7 @@ def leaves(view):
 def test_a_policy_that_gives_no_directives_is_a_broken_one(
     name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "250")
+    monkeypatch.setenv("COLUMNS", "1000")
     path = tmp_path / "broken.py"
     path.write_text(BROKEN)
     assert sortie("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
