@@ -10,8 +10,10 @@ prison for a hostile one: C extensions and further methods of a policy's own cla
 from __future__ import annotations
 
 import builtins
+import dis
 import functools
 import importlib
+import inspect
 import sys
 import types
 from collections.abc import Callable
@@ -133,6 +135,69 @@ class _Rebuilding:
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
             return self.function(value)
         return value
+
+
+_FROZEN = ("__setattr__", "__delattr__")
+"""What `dataclass` writes into a frozen class; they ask for the class's own type."""
+
+
+def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
+    """Whether a policy's own code, or what it names outside installed packages, names a builtin such as `type`."""
+    met: dict[int, object] = {}
+    waiting: list[Any] = [policy]
+    while waiting:
+        value = waiting.pop()
+        if value is builtin:
+            return True
+        if id(value) in met:
+            continue
+        met[id(value)] = value
+        if isinstance(value, functools.partial):
+            waiting += [value.func, *value.args, *value.keywords.values()]
+        elif isinstance(value, types.MethodType):
+            waiting += [value.__func__, value.__self__]
+        elif isinstance(value, types.FunctionType):
+            waiting += _named_by(value) if _is_own(value.__module__) else ()
+        elif isinstance(value, staticmethod | classmethod):
+            waiting.append(value.__func__)
+        elif isinstance(value, property):
+            waiting.append(value.fget)
+        elif isinstance(value, type):
+            held = vars(value) if _is_own(value.__module__) else {}
+            waiting += [v for name, v in held.items() if name not in _FROZEN]
+        elif isinstance(value, dict | list | tuple):
+            waiting += [v for v in (value.values() if isinstance(value, dict) else value) if callable(v)]
+        else:
+            waiting += [getattr(value, "__wrapped__", None), type(value)]
+    return False
+
+
+def _named_by(found: types.FunctionType) -> list[Any]:
+    """What a function names: globals and builtins, parts of its modules, what it closes over, its defaults."""
+    names, parts, codes = set(), set(), [found.__code__]
+    for code in codes:  # grows
+        codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
+        for step in dis.get_instructions(code):
+            if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+                names.add(step.argval)
+            elif step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+                parts.add(step.argval)
+    space = {**vars(builtins), **found.__globals__}
+    named = [space[name] for name in names if name in space]
+    modules = [m for m in named if isinstance(m, types.ModuleType) and (m is builtins or _is_own(m.__name__))]
+    return [
+        *(v for v in named if not isinstance(v, types.ModuleType)),
+        *(vars(m)[part] for m in modules for part in parts if part in vars(m)),
+        *inspect.getclosurevars(found).nonlocals.values(),
+        *(found.__defaults__ or ()),
+        *(found.__kwdefaults__ or {}).values(),
+    ]
+
+
+def _is_own(home: str | None) -> bool:
+    """Whether a module is neither Python's nor an installed package's."""
+    file = getattr(sys.modules.get(home or ""), "__file__", None) or ""
+    return (home or "").split(".")[0] not in sys.stdlib_module_names and "site-packages" not in file
 
 
 def _names(code: types.CodeType) -> set[str]:

@@ -9,7 +9,7 @@ and the search visits all of them: every roster up to `max_drones`, every ego, e
 | goodput | every float of 0 … 10⁵ Mb/s |
 | ages | every float of 0 … 3600 s |
 | phase, region | all five; none, or any disc |
-| novelty flags, target ids | the two bits of the plane; how many, 0 … 16 |
+| novelty flags, target ids | every byte; how many, 0 … 16 |
 | positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |
 
 A policy that asks for anything else (the coverage grid's cells, a clock, two goodputs compared with each other) is
@@ -17,7 +17,9 @@ not proved: it is tried on drawn views, and where none breaks it the verdict say
 a view of plain numbers on which the policy itself was run again and failed.
 
 Outside the proof: fleets larger than `max_drones`, another period than the one given, NaN, and a policy that
-sees through its input with `is`, `type`, `isinstance` or by parsing a formatted number.
+compares text in which a number stands among other text (`f"charge {soc:.2f}" == "charge 0.12"`: Python makes plain
+text of it), or that looks behind its input with `is`, `id`, or code that is not Python's. Text of a number alone,
+`isinstance` and `type` are answered as in flight or not proved.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from policies.confine import looks_up
 from policies.conformance import raised_part
 from policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
 from policies.invariants import Invariant, spelt, violations
@@ -180,14 +183,17 @@ def _verdict(policy: Policy, prop: Property, max_drones: int, period_s: float, m
     except Refused as refused:
         reason = str(refused)
     else:
-        if system is None:
+        if system is not None:
+            found = system.example()
+            raised = system.raised_example()
+            confirmed = complaint_on(prop, policy, found, raised)
+            if confirmed is not None:
+                return Verdict(prop.name, "refuted", confirmed, found, raised)
+            reason = "the search meets a fault that no plain view shows"
+        elif looks_up(policy, type):
+            reason = "asks for a type(…), which is another one in the search"
+        else:
             return Verdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
-        found = system.example()
-        raised = system.raised_example()
-        confirmed = complaint_on(prop, policy, found, raised)
-        if confirmed is not None:
-            return Verdict(prop.name, "refuted", confirmed, found, raised)
-        reason = "the search meets a fault that no plain view shows"
     for view in draw_views(seed, TRIED_VIEWS):
         if fails(view):
             small = smaller(view, fails)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
@@ -14,6 +14,8 @@ from policies.symbols import Path, Ranged
 from policies.views import GRID_BYTES
 
 _FOOTPRINT_M = 42.0
+_FLAGS = 8
+"""Bits of a descriptor's novelty flags; the plane itself uses two."""
 _HIGHEST: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
 
@@ -76,7 +78,7 @@ class FleetOfRanges:
                     number(f"goodput of drone {i} to slot {slot}", 100.0) for slot in range(self.drones - 1)
                 ),
                 coverage_grid=bytes(GRID_BYTES),
-                novelty_flags=path.picks.get(f"novelty_flags of drone {i}", 0),
+                novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
                 task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
                 priority_target_ids=tuple(range(int(targets))),
@@ -140,8 +142,8 @@ class DescriptorOfRanges:
         return self._system.path.pick(f"task_phase of drone {self.agent_id}", tuple(TaskPhase))
 
     @property
-    def novelty_flags(self) -> int:
-        return self._system.path.pick(f"novelty_flags of drone {self.agent_id}", range(4))
+    def novelty_flags(self) -> Any:
+        return _Flags(self._system.path, self.agent_id)
 
     @property
     def region(self) -> Disc | None:
@@ -187,6 +189,49 @@ class DescriptorOfRanges:
 
     __hash__ = None  # type: ignore[assignment]
 
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return Descriptor  # as `isinstance` finds it in flight
+
+
+class _Flags:
+    """A byte of flags, forked bit by bit as they are asked for, and into all its values by whatever asks for more."""
+
+    def __init__(self, path: Path, agent_id: int) -> None:
+        self._path, self._id = path, agent_id
+
+    def _bits(self, mask: int) -> int:
+        asked = [bit for bit in range(_FLAGS) if mask >> bit & 1]
+        return sum(self._path.pick(_flag(bit, self._id), (0, 1 << bit)) for bit in asked)
+
+    def __and__(self, mask: object) -> Any:
+        return self._bits(mask) if isinstance(mask, int) else NotImplemented
+
+    __rand__ = __and__
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bits(-1), name)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return int
+
+
+def _of_all_bits(name: str) -> Callable[..., Any]:
+    def operator(*operands: Any) -> Any:
+        return getattr(int, name)(*(x._bits(-1) if type(x) is _Flags else x for x in operands))
+
+    return operator
+
+
+_UNASKED = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
+for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _UNASKED:
+    setattr(_Flags, _asked, _of_all_bits(_asked))  # where Python looks for operators
+
+
+def _flag(bit: int, agent_id: int) -> str:
+    return f"novelty flag {bit} of drone {agent_id}"
+
 
 class _Counted:
     """Target ids of which only the number is known."""
@@ -207,6 +252,10 @@ class _Counted:
         self._path.refuse("reads what the targets' ids are")
 
     __iter__ = __contains__ = __getitem__ = __eq__ = __hash__ = __getattr__ = _cannot
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return tuple
 
 
 def _orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:

@@ -5,7 +5,8 @@ where it is not, the run takes one side, narrows the range to it, and the search
 So the policy itself tells where its decision boundaries are, on whatever axis it looks at, and every run stands
 for a cell of views on which it decides the same. The search is complete when no side is left.
 
-What a range cannot answer exactly (a comparison of two axes, a square root, a conversion to int) raises `Refused`.
+What a range cannot answer exactly (a comparison of two axes, a square root, a conversion to int, a look into its
+text) raises `Refused`.
 Arithmetic with constants is kept as steps and boundaries are found among the floats themselves: rounding is
 monotone, so that a bisection over the floats finds the very last one below.
 """
@@ -13,6 +14,7 @@ monotone, so that a bisection over the floats finds the very last one below.
 from __future__ import annotations
 
 import math
+import numbers
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn, TypeVar
@@ -132,7 +134,11 @@ class Ranged:
             if low == high:
                 return other._at(low)
             self._path.refuse(f"compares or combines two inputs, {self._axis} and {other._axis}")
-        return other if isinstance(other, int | float) else None
+        if isinstance(other, int | float):
+            return other
+        if isinstance(other, numbers.Number):  # a Decimal, numpy's 32 bits: it would be rounded otherwise
+            self._path.refuse(f"compares or combines {self._axis} with a {type(other).__name__}")
+        return None
 
     def _same(self, other: object) -> bool:
         return isinstance(other, Ranged) and other._axis == self._axis and other._steps == self._steps
@@ -224,17 +230,80 @@ class Ranged:
     __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = _cannot
     __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = _cannot
     __hash__ = _cannot
+    __array_ufunc__ = None  # numpy's scalars leave the operation to this side
 
     def __getattr__(self, name: str) -> NoReturn:
         self._cannot()
 
     def __format__(self, spec: str) -> str:
-        """Some value of the range: text is for reasons, on which no property depends."""
-        return format(self._at(self._path.ranges[self._axis][0]), spec)
+        """The number's text where the range is down to one; otherwise one that may be handed on as a reason alone."""
+        low, high = self._path.ranges[self._axis]
+        written = format(self._at(low), spec)  # also where the range is wide: a spec that fits no float is a fault
+        return written if low == high else Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
 
-    def __repr__(self) -> str:
-        return f"⟨{self._axis}⟩"
+    def __str__(self) -> str:
+        return self.__format__("")
 
+    __repr__ = __str__
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        """The plain number's, so that `isinstance` and `match` answer as they do in flight; `type` cannot be answered."""
+        return type(self._at(self._path.ranges[self._axis][0]))
+
+
+class Text(str):
+    """The text of a number of which only the range is known: good as a reason, refused to whoever looks into it.
+
+    It stays so through `str`, `format`, `+`, and an f-string that holds nothing else. Among other text in an f-string,
+    in `join` and in `str.format` Python makes plain text of it, with a mark from the private use area in the number's
+    place, so that what reads a number there fails. A comparison of such text is not noticed.
+    """
+
+    _path: Path
+    _axis: str
+
+    def __new__(cls, path: Path, axis: str, content: str) -> Text:
+        made = super().__new__(cls, content)
+        made._path, made._axis = path, axis
+        return made
+
+    def _plain(self) -> str:
+        return str.__str__(self)
+
+    def __add__(self, other: str) -> Text:
+        return Text(self._path, self._axis, str.__add__(self, other))
+
+    def __radd__(self, other: str) -> Text:
+        return Text(self._path, self._axis, str.__add__(other, self._plain()))
+
+    def __rmod__(self, other: str) -> Text:
+        return Text(self._path, self._axis, str.__mod__(other, self._plain()))
+
+    def __format__(self, spec: str) -> Text:
+        return Text(self._path, self._axis, str.__format__(self, spec))
+
+    def __str__(self) -> Text:
+        return self
+
+    def __repr__(self) -> Text:
+        return Text(self._path, self._axis, str.__repr__(self))
+
+    def __bool__(self) -> bool:
+        return True  # no number is written as nothing
+
+    def _looked_into(self, *_: object, **__: object) -> NoReturn:
+        self._path.refuse(f"looks into the text of {self._axis}, which is for reasons alone")
+
+
+_HANDED_ON = {
+    "__new__", "__init__", "__init_subclass__", "__subclasshook__", "__class__", "__doc__", "__dir__", "__getattribute__",
+    "__setattr__", "__delattr__", *vars(Text),
+}  # fmt: skip
+for _asked in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _HANDED_ON:
+    setattr(Text, _asked, Text._looked_into)
+
+_MARK = "\ue000"
 
 _STEPS: dict[str, Callable[[float, float], float]] = {
     "plus": lambda x, c: x + c,

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 from collections.abc import Callable, Sequence
+from decimal import Decimal
+from functools import partial
 from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from policies.baselines import everyone, random_k
-from policies.contract import Directive, FleetView, Representation, TaskPhase
+from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from policies.geometry import footprint_overlap, peers_by_overlap
 from policies.invariants import parse
 from policies.proof import Verdict, complaint_on, property_of, prove
 from policies.properties import PROMISES
-from policies.ranges import _places
+from policies.ranges import FleetOfRanges, _places
 from policies.symbols import Path, Ranged, Refused, explore
 from policies.views import from_json, to_json
 from policies.worked import worked
@@ -81,6 +86,113 @@ def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Calla
 
     with pytest.raises(Refused, match="charge"):
         list(explore(run))
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda x: f"{x:.3f}" == "0.123",
+        lambda x: f"{x:.3f}" != "0.123",
+        lambda x: f"{x}" < "0.5",
+        lambda x: str(x).startswith("0.123"),
+        lambda x: repr(x) == "0.123",
+        lambda x: f"{x!r}" == "0.123",
+        lambda x: format(x, ".3f") in ("0.122", "0.123"),
+        lambda x: f"{x:.3f}" in {"0.123"},
+        lambda x: {"0.123": 1}.get(f"{x:.3f}"),
+        lambda x: "charge " + f"{x:.3f}" == "charge 0.123",
+        lambda x: f"{x:.3f}" + " left" == "0.123 left",
+        lambda x: "charge %s" % str(x) == "charge 0.123",  # noqa: UP031 - what older code does
+        lambda x: "0.12" in str(x),
+        lambda x: str(x)[:4] == "0.12",
+        lambda x: len(str(x)) == 5,
+        lambda x: next(iter(str(x))) == "0",
+        lambda x: float(f"{x:.3f}") < 0.5,
+        lambda x: int(f"{x:.0f}") == 0,
+        lambda x: str(str(x)).split("."),
+    ],
+)
+def test_whoever_looks_into_the_text_of_a_number_is_refused(look: Callable[[object], object]) -> None:
+    with pytest.raises(Refused, match="looks into the text of charge, which is for reasons alone"):
+        list(explore(lambda p: look(p.number("charge", 0.0, 1.0))))
+
+
+def test_text_that_is_handed_on_is_not_and_one_number_alone_has_its_own() -> None:
+    def reasons(x: object) -> list[str]:
+        return [f"{x:.3f}", "charge " + str(x), f"{x:.1f}, {x:.2f}", str(x) or "none", f"{x:>9}"]
+
+    ((path, found),) = explore(lambda p: reasons(p.number("charge", 0.0, 1.0)))
+    assert path.refusal is None
+    assert all(isinstance(text, str) for text in found)
+    assert list(cells(lambda x: f"{x:.2f}" == "0.50", 0.5, 0.5)) == [(0.5, 0.5, True)]
+    with pytest.raises(ValueError, match="Unknown format code 'd'"):  # as of a plain float
+        list(explore(lambda p: f"{p.number('charge', 0.0, 1.0):d}"))
+
+
+def test_a_number_read_out_of_other_text_fails_instead_of_being_one() -> None:
+    with pytest.raises(ValueError, match="could not convert string to float"):
+        list(explore(lambda p: float(f"charge {p.number('charge', 0.0, 1.0):.3f}".split()[1])))
+
+
+def test_isinstance_and_match_answer_as_in_flight() -> None:
+    def kind(x: object) -> tuple[bool, ...]:
+        match x:
+            case float():
+                matched = True
+            case _:
+                matched = False
+        return isinstance(x, float), isinstance(x, int), isinstance(x, int | float), isinstance(x, str), matched
+
+    assert kind(0.5) == kind(Path([]).number("charge", 0.0, 1.0))
+    assert kind(5)[:4] == kind(Path([]).number("targets", 0, 16))[:4]
+
+
+@pytest.mark.parametrize("other", [Decimal("0.5"), np.float32(0.3), np.int64(1), 1j])
+@pytest.mark.parametrize("act", [operator.eq, operator.ne, lambda a, b: b == a, operator.mul, lambda a, b: b * a])
+def test_a_number_that_rounds_otherwise_is_refused(act: Callable[[object, object], object], other: object) -> None:
+    with pytest.raises(Refused, match=f"compares or combines charge with a {type(other).__name__}"):
+        list(explore(lambda p: act(p.number("charge", 0.0, 1.0), other)))
+
+
+def flags_of(act: Callable[[Any], object]) -> list[object]:
+    """What becomes of the ego's novelty flags, cell by cell."""
+
+    def run(path: Path) -> object:
+        me = FleetOfRanges(path, 1, 0, (0,), 0.1).view().me
+        assert me is not None
+        return act(me.novelty_flags)
+
+    return [found for _, found in explore(run)]
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda n: n + 1, lambda n: 300 - n, lambda n: n | 1, lambda n: ~n, lambda n: n >> 6, lambda n: 1 << n, hash, bool,
+        int, lambda n: n == 77, lambda n: n != 77, lambda n: n in {3, 200}, lambda n: n < 128, lambda n: f"{n:08b}", str,
+        lambda n: n.bit_count(), lambda n: list(range(256))[n], lambda n: isinstance(n, int), lambda n: n & ~n,
+        lambda n: divmod(n, 7),
+    ],
+)  # fmt: skip
+def test_novelty_flags_are_every_byte(act: Callable[[Any], object]) -> None:
+    assert set(flags_of(act)) == {act(n) for n in range(256)}
+
+
+def test_novelty_flags_fork_by_the_bits_that_are_asked_for() -> None:
+    assert sorted(flags_of(lambda n: n & 128)) == [0, 128]  # type: ignore[type-var]
+    assert sorted(flags_of(lambda n: 3 & n)) == [0, 1, 2, 3]  # type: ignore[type-var]
+    assert sorted(flags_of(lambda n: (n & 5, n & 4))) == [(0, 0), (1, 0), (4, 4), (5, 4)]  # type: ignore[type-var]
+
+
+def test_flags_of_two_drones_are_compared() -> None:
+    def run(path: Path) -> tuple[int, int, bool]:
+        view = FleetOfRanges(path, 2, 0, (0, 1), 0.1).view()
+        mine, other = (view.descriptors[i].novelty_flags for i in (0, 1))
+        if mine & 254 or other & 254:
+            return 0, 0, True
+        return mine & 1, other & 1, mine == other
+
+    assert {found for _, found in explore(run)} == {(0, 0, True), (0, 1, False), (1, 0, False), (1, 1, True)}
 
 
 def test_two_axes_are_not_compared() -> None:
@@ -225,6 +337,89 @@ def best_goodput(view: FleetView) -> list[Directive]:
     assert me is not None
     best = max(view.peers, key=me.goodput_to, default=None)
     return [d if d.destination == best else d._replace(rate_hz=1.0) for d in everyone(view)]
+
+
+def rises(view: FleetView, tired: object) -> list[Directive]:
+    return [d._replace(rho=2.0) if tired else d for d in everyone(view)]
+
+
+def charge(view: FleetView) -> float:
+    return 1.0 if view.me is None else view.me.battery_soc
+
+
+def reads_text(view: FleetView) -> list[Directive]:
+    return rises(view, f"{charge(view):.7f}" == "0.1234567")
+
+
+def reads_the_start_of_text(view: FleetView) -> list[Directive]:
+    return rises(view, str(charge(view)).startswith("0.1234567"))
+
+
+def asks_for_the_type(view: FleetView) -> list[Directive]:
+    return rises(view, type(charge(view)) is float and 0.1234567 < charge(view) < 0.12345671)
+
+
+def asks_for_the_type_in_a_helper(view: FleetView) -> list[Directive]:
+    return rises(view, Kind.of(charge(view)) and 0.1234567 < charge(view) < 0.12345671)
+
+
+class Kind:
+    @staticmethod
+    def of(x: object) -> bool:
+        return KINDS["one"](x) is float
+
+
+KINDS = {"one": lambda x: type(x)}
+
+
+class Asks:
+    def __call__(self, view: FleetView) -> list[Directive]:
+        return asks_for_the_type(view)
+
+
+def guards(view: FleetView) -> list[Directive]:
+    me = view.me
+    sound = isinstance(me, Descriptor) and isinstance(me.battery_soc, float)
+    return rises(view, sound and isinstance(charge(view), int | float) and 0.1234567 < charge(view) < 0.12345671)
+
+
+def reads_the_highest_flag(view: FleetView) -> list[Directive]:
+    return rises(view, view.me is not None and view.me.novelty_flags & 128)
+
+
+@pytest.mark.parametrize(
+    ("policy", "why"),
+    [
+        (reads_text, "looks into the text of battery_soc of drone 0, which is for reasons alone"),
+        (reads_the_start_of_text, "looks into the text of battery_soc of drone 0, which is for reasons alone"),
+        (asks_for_the_type, "asks for a type(…), which is another one in the search"),
+        (partial(asks_for_the_type), "asks for a type(…), which is another one in the search"),
+        (Asks(), "asks for a type(…), which is another one in the search"),
+        (asks_for_the_type_in_a_helper, "asks for a type(…), which is another one in the search"),
+    ],
+)
+def test_a_policy_that_sees_through_its_numbers_is_not_proved(policy: Decide, why: str) -> None:
+    verdict = prove(policy, max_drones=2)[0]
+    assert (verdict.outcome, verdict.what) == ("not proved", f"{why}; 1000 drawn views keep it")
+
+
+@pytest.mark.parametrize("policy", [guards, reads_the_highest_flag])
+def test_what_is_answered_as_in_flight_is_searched(policy: Decide) -> None:
+    verdict = prove(policy, max_drones=2)[0]
+    assert (verdict.outcome, verdict.what) == ("refuted", "directive 0→1: rho is 2.0, must be in [0, 1]")
+
+
+def test_a_number_in_a_reason_is_no_obstacle() -> None:
+    def explains(view: FleetView) -> list[Directive]:
+        return [
+            d._replace(reason=f"{charge(view):.0%}" if d.destination == 1 else f"{charge(view):.0%} left")
+            for d in everyone(view)
+        ]
+
+    assert [v.outcome for v in prove(explains, parse("rho <= 1\nrepresentation >= features"), max_drones=3)] == [
+        "proved"
+    ] * 4
+    assert last(explains, "rho <= 0.5").outcome == "refuted"
 
 
 @pytest.mark.parametrize(
