@@ -47,16 +47,20 @@ def run_campaign(
     engine: Engine,
     *,
     resume_only: bool = False,
+    retry_failed: bool = False,
     progress: Callable[[Progress], None] = lambda p: None,
 ) -> Progress:
     """Fly what is missing of a campaign into its folder.
 
     Rows are on disk before `progress` counts them; whenever this ends early, the next call goes on.
 
+    Args:
+        retry_failed: runs that failed count as missing.
+
     Raises:
         RunError: a folder that cannot be used, a cluster that is not there, a disk that is full.
     """
-    store = Store(folder, plan, resume_only=resume_only)
+    store = Store(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
         return _drive(plan, store, engine, progress)
     finally:

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sim.campaign.plan import Plan
-from sim.campaign.store import JOURNAL, RUNS, read_plan
+from sim.campaign.store import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
 from sim.folders import RunError
 
 Floats = NDArray[np.float64]
@@ -111,14 +110,15 @@ def read_rows(folder: Path) -> Rows:
     """The finished parts of a campaign's folder.
 
     Raises:
-        RunError: no campaign there, or no unit of it finished at all its grid points.
+        RunError: no campaign there, no unit of it finished at all its grid points, or a part that is broken.
     """
     plan = read_plan(folder)
-    parts = sorted((folder / RUNS).glob("part-*.parquet"))
+    numbers = range(shards(plan))
+    parts = [part for n in numbers if (part := read_part(folder, plan, n)) is not None]
     if not parts:
-        waiting = any((folder / JOURNAL).glob("*.jsonl"))
+        waiting = any(journal_file(folder, n).is_file() for n in numbers)
         raise RunError(f"{folder}: no part is finished yet" + (", go on with the campaign" if waiting else ""))
-    table = pa.concat_tables([pq.read_table(p) for p in parts])
+    table = pa.concat_tables(parts)
     unit = table["unit"].to_numpy()
     whole = np.bincount(unit)[unit] == plan.runs // plan.units
     if not whole.any():
@@ -147,19 +147,20 @@ def is_accuracy(metric: str) -> bool:
     return "ap50" in parts and parts[-1] in ACCURACIES
 
 
-def find_row(folder: Path, run: int) -> dict[str, Any]:
-    """One run's row.
+def find_row(folder: Path, run: int) -> dict[str, Any] | None:
+    """One run's row; None where it is not flown yet.
 
     Raises:
-        RunError: no campaign there, no such run, or one that is not finished.
+        RunError: no campaign there, no such run, or its part is broken.
     """
     plan = read_plan(folder)
     if not 0 <= run < plan.runs:
         raise RunError(f"--run {run}: {folder} has runs 0 … {plan.runs - 1}")
-    path = folder / RUNS / f"part-{run // plan.shard:05d}.parquet"
-    if not path.is_file():
-        raise RunError(f"--run {run}: {folder} has not finished it yet")
-    row: dict[str, Any] = pq.read_table(path).slice(run % plan.shard, 1).to_pylist()[0]
+    table = read_part(folder, plan, run // plan.shard)
+    if table is None:
+        found = find_in_journal(folder, plan, run)
+        return None if found is None else row_of(plan, columns(plan), found)
+    row: dict[str, Any] = table.slice(run % plan.shard, 1).to_pylist()[0]
     return row
 
 

@@ -10,15 +10,18 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, plan, table_bytes
+from campaign_examples import CAMPAIGN, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
 from sim.campaign import engine as engines
 from sim.campaign.drive import Progress, run_campaign
 from sim.campaign.engine import Dask, InProcess, open_engine
 from sim.campaign.plan import Plan
+from sim.campaign.rows import find_row
+from sim.campaign.store import Store
 from sim.campaign.work import Task, fly_batch
 from sim.cli import app
+from sim.console import user_errors
 from sim.folders import RunError
 
 pytest.importorskip("distributed")
@@ -215,6 +218,70 @@ def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
     )
 
 
+def test_failed_runs_are_flown_again_on_the_command_line(tmp_path: Path) -> None:
+    cause = tmp_path / "cause"
+    cause.touch()
+    policy = tmp_path / "faulty.py"
+    policy.write_text(FAULTY.format(what=f"assert not os.path.exists({str(cause)!r}), 'planted'"))
+    path, folder = write(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide")), tmp_path / "a"
+    command = ["campaign", str(path), "--workers", "0", "--out", str(folder), "--no-report"]
+    told = CliRunner().invoke(app, command)
+    failed = [r["run"] for r in pq.read_table(folder / "runs").to_pylist() if r["status"] == "failed"]
+    assert (told.exit_code, f"{len(failed)} failed" in told.stdout) == (1, True)
+    assert failed
+    cause.unlink()
+    told = CliRunner().invoke(app, [*command, "--retry-failed"])
+    assert (told.exit_code, f"48 runs finished; {len(failed)} of them now" in told.stdout) == (0, True)
+    assert CliRunner().invoke(app, [*command[:-2], str(tmp_path / "b"), "--no-report"]).exit_code == 0
+    assert table_bytes(folder) == table_bytes(tmp_path / "b")
+
+
+def test_any_run_of_a_campaign_that_broke_off_can_be_flown(tmp_path: Path) -> None:
+    """One whose row waits in the journal is held against it; one that was not flown has nothing to be held against."""
+    p, folder = plan(tmp_path), tmp_path / "a"
+    store = Store(folder, p)
+    store.add(fly_batch(p.code, [(run, p.task(run)) for run in (0, 3)])[0])
+    store.close()
+    for run, said in (
+        (3, "the record is the campaign's"),
+        (40, "has not flown run 40 yet: there is no record to compare"),
+    ):
+        out = tmp_path / str(run)
+        command = ["fly", "--from-campaign", str(folder), "--run", str(run), "--no-recording", "--out", str(out)]
+        result = CliRunner().invoke(app, command)
+        assert (result.exit_code, said in result.output) == (0, True), result.output
+        assert ("the record is" in result.output) == (run == 3)
+        assert (out / "outcome.json").is_file()
+    waiting = find_row(folder, 3)
+    run_campaign(p, folder, InProcess())
+    assert waiting == find_row(folder, 3) is not None  # the same row in the part
+
+
+def test_a_broken_part_is_one_line_on_the_command_line(tmp_path: Path) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    run_campaign(p, folder, Pretended())
+    part = folder / "runs" / "part-00001.parquet"
+    part.write_bytes(part.read_bytes()[:-100])
+    for command in (["campaign", "report", str(folder)], ["fly", "--from-campaign", str(folder), "--run", "40"]):
+        result = CliRunner().invoke(app, command)
+        assert isinstance(result.exception, RunError)  # sim.cli.main prints it in one line and exits with 2
+        assert str(result.exception).startswith(f"{part}: is broken (")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError("ZSTD decompression failed"), "ZSTD decompression failed"),
+        (OSError(2, "No such file"), "No such file"),
+        (OSError(2, "No such file", "a.yaml"), "a.yaml: No such file"),
+    ],
+)
+def test_an_error_without_a_file_or_a_number_still_says_what_it_is(error: OSError, message: str) -> None:
+    with pytest.raises(RunError) as told, user_errors():
+        raise error
+    assert str(told.value) == message
+
+
 def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -> None:
     text = CAMPAIGN.replace("{kind: uniform, low: 0.2, high: 1}", "{kind: normal, mean: 0.9, sd: 0.2}")
     p = plan(tmp_path, text)
@@ -236,8 +303,6 @@ def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -
     ],
 )
 def test_what_cannot_be_done_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
-    from campaign_examples import write
-
     path = write(tmp_path)
     if "--out" not in arguments:
         arguments = [*arguments, "--out", str(tmp_path / "a")]

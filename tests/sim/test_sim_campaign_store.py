@@ -6,10 +6,14 @@ import errno
 import json
 import os
 import random
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -18,7 +22,9 @@ from campaign_examples import BASE, CAMPAIGN, Pretended, plan, pretend, table_by
 
 from sim.campaign.drive import run_campaign
 from sim.campaign.plan import Plan
-from sim.campaign.store import Store
+from sim.campaign.rows import find_row, read_rows
+from sim.campaign.store import BrokenPartError, Store, read_part
+from sim.campaign.work import Result, Task
 from sim.folders import RunError
 
 
@@ -87,6 +93,192 @@ def test_a_full_disk_is_one_line_and_costs_nothing(tmp_path: Path, monkeypatch: 
     monkeypatch.undo()
     run_campaign(p, folder, Pretended())
     assert table_bytes(folder) == flown(p, tmp_path / "b")
+
+
+@contextmanager
+def no_file_beyond(size_b: int) -> Iterator[None]:
+    """A quota: a write that reaches it is short, the next one fails."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_b, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_short_write_is_not_counted_and_leaves_no_torn_line(tmp_path: Path) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    store, journal = Store(folder, p), folder / "journal" / "00000.jsonl"
+    rows = [pretend(run, p.task(run), p.code) for run in range(12)]
+    store.add(rows[:2])
+    size = journal.stat().st_size
+    with (
+        no_file_beyond(4 * size),
+        pytest.raises(RunError, match=r"a: cannot be written: File too large; what is .* goes on once there is room"),
+    ):
+        store.add(rows[2:])
+    assert (store.finished, journal.stat().st_size) == (2, size)
+    store.add(rows[4:])  # behind a torn line they would not be read again
+    assert store.finished == 10
+    store.close()
+    store = Store(folder, p)
+    assert (store.finished, list(store.missing([0]))[:3]) == (10, [2, 3, 12])
+    store.close()
+
+
+@pytest.mark.parametrize("left", ["", "campaign.json", "killed"])
+def test_a_campaign_that_could_not_write_its_manifest_begins_again(tmp_path: Path, left: str) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    with no_file_beyond(100), pytest.raises(RunError, match="a: cannot be written: File too large"):
+        run_campaign(p, folder, Pretended())
+    assert sorted(x.name for x in folder.iterdir()) == ["journal", "runs"]
+    if left == "killed":  # on the way
+        (folder / ".campaign.json.partial").write_text("{")
+    elif left:  # rows of nobody knows which campaign
+        (folder / "runs" / "part-00000.parquet").write_text("x")
+        with pytest.raises(RunError, match=r"a: holds files but no campaign.json"):
+            run_campaign(p, folder, Pretended())
+        return
+    run_campaign(p, folder, Pretended())
+    assert table_bytes(folder) == flown(p, tmp_path / "b")
+
+
+@pytest.mark.parametrize("harm", ["overwritten", "torn", "empty", "copied", "swapped", "of another campaign", "text"])
+def test_a_broken_part_is_told_and_flown_again(tmp_path: Path, harm: str) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    before = flown(p, folder)
+    part = folder / "runs" / "part-00001.parquet"
+    data = part.read_bytes()
+    if harm == "of another campaign":
+        other = flown(plan(tmp_path, CAMPAIGN.replace("seed: 5", "seed: 6")), tmp_path / "other")[part.name]
+    elif harm == "swapped":  # two rows in the middle, keys and all
+        pq.write_table(pq.read_table(part).take([*range(8), 9, 8, *range(10, 18)]), part)
+        other = part.read_bytes()
+    else:
+        other = {
+            "overwritten": data[:300] + b"\xaa" * 400 + data[700:],
+            "torn": data[: len(data) // 2],
+            "empty": b"",
+            "copied": before["part-00000.parquet"],
+            "text": b"not Parquet at all",
+        }[harm]
+    part.write_bytes(other)
+    told = r"part-00001\.parquet: is broken \(.+\); the campaign's command flies it again$"
+    with pytest.raises(RunError, match=told):
+        read_rows(folder)
+    with pytest.raises(RunError, match=told):
+        find_row(folder, 40)
+    assert find_row(folder, 3) is not None  # in a part that is whole
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(p, folder, Pretended(stop_after=5))
+    rest = Pretended()
+    run_campaign(p, folder, rest)
+    assert rest.flown == list(range(35, 48))
+    assert table_bytes(folder) == before
+
+
+def test_a_flipped_bit_of_a_part_is_found_wherever_it_lies(tmp_path: Path) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    data = flown(p, folder)["part-00001.parquet"]
+    table, found = read_part(folder, p, 1), 0
+    for at in random.Random(1).sample(range(len(data)), 200):
+        (folder / "runs" / "part-00001.parquet").write_bytes(data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :])
+        try:
+            assert read_part(folder, p, 1).equals(table)  # type: ignore[union-attr]  # where nothing is read from
+        except BrokenPartError:
+            found += 1
+    assert found > 100
+
+
+def test_files_of_others_among_the_journals_are_left_alone(tmp_path: Path) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(p, folder, Pretended(stop_after=5))
+    others = [folder / "journal" / name for name in ("notes.jsonl", "00099.jsonl", "0.jsonl", "-0001.jsonl")]
+    text = (folder / "journal" / "00000.jsonl").read_text()
+    for other in others:
+        other.write_text(text)
+    rest = Pretended()
+    run_campaign(p, folder, rest)
+    assert rest.flown == list(range(5, 48))
+    assert [other.read_text() for other in others] == [text] * 4
+
+
+FAILED = [2, 29, 30, 41]
+"""In both parts, and at their edges."""
+
+
+class Failing(Pretended):
+    """Some of its runs fail."""
+
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+        for (row,) in super().results(code, tasks):
+            failed = row.run in FAILED
+            yield [
+                row._replace(status="failed", error="planted", fingerprint="", values=(None, None)) if failed else row
+            ]
+
+
+def with_failures(p: Plan, folder: Path, stop_after: int | None = None) -> None:
+    """A campaign some of whose runs failed."""
+    with suppress(KeyboardInterrupt):
+        run_campaign(p, folder, Failing(stop_after=stop_after))
+
+
+@pytest.mark.parametrize("stop_after", [None, 35, 46])
+def test_failed_runs_are_flown_again_where_that_is_asked(tmp_path: Path, stop_after: int | None) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    with_failures(p, folder, stop_after)
+    rest = Pretended()
+    done = run_campaign(p, folder, rest, retry_failed=True)
+    assert rest.flown == sorted({*FAILED, *range(stop_after or 48, 48)})
+    assert (done.finished, done.failed) == (48, 0)
+    assert table_bytes(folder) == flown(p, tmp_path / "b")
+    assert [x.name for x in (folder / "journal").iterdir()] == [".lock"]
+
+
+def test_failed_runs_that_fail_again_stay_failed(tmp_path: Path) -> None:
+    p, folder = plan(tmp_path), tmp_path / "a"
+    with_failures(p, folder)
+    before = table_bytes(folder)
+    again = Failing()
+    done = run_campaign(p, folder, again, retry_failed=True)
+    assert (again.flown, done.failed) == (FAILED, 4)
+    assert table_bytes(folder) == before
+    unasked = Pretended()
+    assert run_campaign(p, folder, unasked).failed == 4
+    assert unasked.flown == []
+
+
+def test_a_retry_that_is_killed_at_any_moment_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At every fsync in turn, before and after it: between the journal and the part that it takes the place of, too."""
+    p, real = plan(tmp_path), os.fsync
+    with_failures(p, tmp_path / "failed")
+    whole = flown(p, tmp_path / "b")
+    for kill in range(1, 100):
+        folder, calls = tmp_path / str(kill), [0]
+        shutil.copytree(tmp_path / "failed", folder)
+
+        def fsync(handle: int, kill: int = kill, calls: list[int] = calls) -> None:
+            calls[0] += 1
+            if 2 * calls[0] - 1 == kill:
+                raise KeyboardInterrupt
+            real(handle)
+            if 2 * calls[0] == kill:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        first, rest = Pretended(), Pretended()
+        with suppress(KeyboardInterrupt):
+            run_campaign(p, folder, first, retry_failed=True)
+        monkeypatch.undo()
+        run_campaign(p, folder, rest, retry_failed=True)
+        assert table_bytes(folder) == whole
+        assert set(rest.flown) <= set(FAILED)  # a row that was good is not flown again
+        if 2 * calls[0] < kill:
+            assert kill > 20
+            return
+    pytest.fail("it was killed every time")
 
 
 def test_a_late_answer_for_a_run_that_is_finished_is_not_counted_twice(tmp_path: Path) -> None:
