@@ -46,6 +46,7 @@ def run(
         Path | None, typer.Option("--out", help="The campaign's folder; left out, runs/campaign-NAME.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Only go on; an error if there is nothing.")] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Fly runs that failed once more.")] = False,
     report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
     """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
@@ -53,6 +54,7 @@ def run(
     from sim.campaign.drive import run_campaign
     from sim.campaign.engine import open_engine
     from sim.campaign.plan import make_plan
+    from sim.campaign.store import ensure_usable
     from sim.folders import RunError
 
     if scheduler is not None and workers is not None:
@@ -63,9 +65,9 @@ def run(
     try:
         with user_errors():
             plan = make_plan(study)
-            _ensure_usable(folder, plan)
+            ensure_usable(folder, plan)
             with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
-                done = run_campaign(plan, folder, engine, resume_only=resume, progress=show)
+                done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=show)
     except KeyboardInterrupt:
         err.print(f"interrupted; what is finished is kept in {folder}, the same command goes on")
         raise typer.Exit(130) from None
@@ -107,18 +109,13 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     row, plan = find_row(folder, run), read_plan(folder)
     if code_version() != plan.code:
         err.print(f"[yellow]this is Sortie {code_version()}, the campaign was flown with {plan.code}[/yellow]")
+    if row is None:
+        err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
+    elif row["status"] == "failed":
+        err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True, markup=False)
     with user_errors():
         scenario, seed, replication = unpack(plan.task(run))
-    return scenario, seed, replication, row["fingerprint"] or None
-
-
-def _ensure_usable(folder: Path, plan: Any) -> None:
-    """Before a cluster is started for nothing."""
-    from sim.campaign.store import MANIFEST, check_same
-    from sim.folders import ensure_folder
-
-    ensure_folder(folder, MANIFEST, "campaign")
-    check_same(folder, plan)
+    return scenario, seed, replication, (row or {}).get("fingerprint") or None
 
 
 def _in_words(done: Progress) -> str:

@@ -54,6 +54,7 @@ def user_errors() -> Iterator[None]:
             raise
         raise RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") from error
     except OSError as error:
-        raise RunError(f"{error.filename}: {error.strerror}") from error
+        where = "" if error.filename is None else f"{error.filename}: "
+        raise RunError(f"{where}{error.strerror or error}") from error
     except ValueError as error:
         raise RunError(str(error)) from error
