@@ -11,6 +11,7 @@ from typing import Any
 from scenarios.load import library, load
 from scenarios.schema import Scenario
 from sim.expect import Verdict, check
+from sim.folders import RunError
 from sim.golden import golden_path, moved, write_golden
 from sim.outcome import outcome
 from sim.record import SortieRecord
@@ -29,6 +30,8 @@ class Checked:
     verdicts: tuple[Verdict, ...]
     replay: str
     """The command that shows the sortie."""
+    written: str = ""
+    """Which golden outcome was written, in words; empty if none was."""
 
     @property
     def failed(self) -> list[Verdict]:
@@ -46,23 +49,33 @@ def check_scenario(
 
     Args:
         path_or_name: a file, or a library scenario's name.
-        update: write the golden outcome anew instead of comparing.
+        update: write the golden outcome anew instead of comparing; not with overrides.
         progress: called with simulated seconds over all replications.
 
     Raises:
         ScenarioError, PolicyError, RunError: what is wrong with the scenario, its policy or its golden outcome.
     """
+    ensure_own(overrides, update=update)
     scenario = load(path_or_name, overrides)
     record = run_sortie(scenario, progress=progress)
     result = outcome(record)
     results = [result, *_more(scenario, progress)]
     verdicts = [_explained(v, record, result) for v in check(scenario, record, result, results)]
     golden = golden_path(library().get(path_or_name, Path(path_or_name)))
-    if update:
-        write_golden(golden, result)
-    elif golden.is_file() and not overrides:
+    written = write_golden(golden, result) if update else ""
+    if golden.is_file() and not overrides and not update:
         verdicts.append(_golden(golden, result))
-    return Checked(scenario, tuple(verdicts), _replay(path_or_name, overrides))
+    return Checked(scenario, tuple(verdicts), _replay(path_or_name, overrides), written)
+
+
+def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
+    """Refuse to write the outcome of another sortie than the scenario's own as its golden one.
+
+    Raises:
+        RunError: the first override.
+    """
+    if update and overrides:
+        raise RunError(f"{overrides[0]}: a golden outcome is written of the scenario as its file has it, set nothing")
 
 
 def flights(scenario: Scenario) -> int:

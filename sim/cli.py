@@ -209,6 +209,8 @@ def check(
             checked = check_scenario(name, set_ or [], update=update, progress=watch)
         failed += len(checked.failed)
         out.print(tables.verdict_table(flown.name, checked.verdicts))
+        if checked.written:
+            out.print(checked.written, soft_wrap=True, markup=False)
         if checked.failed:
             out.print(f"see it with: {checked.replay}", soft_wrap=True)
     if failed:

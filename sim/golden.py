@@ -38,16 +38,23 @@ def figures(result: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def write_golden(path: Path, result: dict[str, Any]) -> None:
-    """Write an outcome as the golden one; tolerances of an older file stay.
+def write_golden(path: Path, result: dict[str, Any]) -> str:
+    """Write an outcome as the golden one; tolerances of an older file stay, and a broken one is replaced.
+
+    Returns:
+        What was written, in words.
 
     Raises:
         RunError: the disk refuses.
     """
-    tolerance = {"relative": RELATIVE, "absolute": ABSOLUTE}
+    tolerance, instead = {"relative": RELATIVE, "absolute": ABSOLUTE}, ""
     if path.is_file():
-        tolerance = _read(path)["tolerance"]
+        try:
+            tolerance = _read(path)["tolerance"]
+        except RunError as error:
+            instead = f", in place of a broken file ({str(error).removeprefix(f'{path}: ')})"
     write_text(path, json.dumps({"tolerance": tolerance, "outcome": figures(result)}, indent=1) + "\n")
+    return f"golden outcome written: {path}{instead}"
 
 
 def moved(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
@@ -74,11 +81,14 @@ def moved(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        golden: dict[str, Any] = json.loads(path.read_text())
-        tolerance = golden["tolerance"]
-        if not (float(tolerance["relative"]) >= 0 and float(tolerance["absolute"]) >= 0):
-            raise ValueError("tolerances must be ≥ 0")
-        dict(golden["outcome"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        golden: Any = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
         raise RunError(f"{path}: no golden outcome: {error}") from None
-    return golden
+    for name in ("tolerance", "outcome"):
+        if not isinstance(golden, dict) or not isinstance(golden.get(name), dict):
+            raise RunError(f"{path}: no golden outcome: {name} must be an object")
+    for name in ("relative", "absolute"):
+        value = golden["tolerance"].get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+            raise RunError(f"{path}: no golden outcome: tolerance.{name}: {value!r}, must be a number ≥ 0")
+    return dict(golden)

@@ -1,7 +1,8 @@
 """`pytest my_scenarios/`: every expectation of every scenario file is a test.
 
 A YAML file is a scenario with something to check where it has, on top, a `name` and `expect` or `expect_decisions`, or
-a golden outcome beside it; other YAML files are left alone. A file's sorties are flown once, when its first test runs.
+a golden outcome beside it, whether in block or in flow style; other YAML files are left alone. A file's sorties are flown
+once, when its first test runs.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ if TYPE_CHECKING:
     from sim.expect import Verdict
 
 MAX_BYTES = 1_000_000
-_NAME = re.compile(r"^name\s*:", re.MULTILINE)
-_EXPECTS = re.compile(r"^expect(_decisions)?\s*:", re.MULTILINE)
+WRITTEN = pytest.StashKey[list[str]]()
+_NAME = re.compile(r"""^(["']?)name\1\s*:""", re.MULTILINE)
+_EXPECTS = re.compile(r"""^(["']?)expect(_decisions)?\1\s*:""", re.MULTILINE)
+_FLOW = re.compile(r"(\s|#[^\n]*\n|---(?=\s))*\{")
+"""How a file begins that is one section in braces."""
+_FLOW_NAMED = re.compile(_FLOW.pattern + r"""\s*(["']?)name\2\s*:""")
+_FLOW_EXPECTS = re.compile(r"""[{,]\s*(["']?)expect(_decisions)?\1\s*:""")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -29,6 +35,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--sortie-set", action="append", default=[], metavar="KEY=VALUE", help="Override a field of every scenario."
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Both options at once would write the outcome of another sortie than the scenario's."""
+    if config.getoption("sortie_update") and config.getoption("sortie_set"):
+        from sim.checking import ensure_own
+        from sim.folders import RunError
+
+        try:
+            ensure_own(config.getoption("sortie_set"), update=True)
+        except RunError as error:
+            raise pytest.UsageError(str(error)) from None
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Which golden outcomes were written."""
+    for line in config.stash.get(WRITTEN, []):
+        terminalreporter.write_line(line)
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
@@ -46,7 +70,24 @@ def _is_scenario(path: Path) -> bool:
             text = file.read(MAX_BYTES).decode("utf-8", "replace")
     except OSError:
         return False
-    return bool(_NAME.search(text) and (_EXPECTS.search(text) or golden_path(path).is_file()))
+    text = text.removeprefix("\ufeff")
+    golden = golden_path(path).is_file()
+    if _FLOW.match(text):
+        return (golden or bool(_FLOW_EXPECTS.search(text))) and _is_flow_scenario(text, golden=golden)
+    return bool(_NAME.search(text) and (golden or _EXPECTS.search(text)))
+
+
+def _is_flow_scenario(text: str, *, golden: bool) -> bool:
+    """Which keys stand on top only the reader can tell; a file that it cannot read is a scenario's if it begins as one."""
+    from scenarios.load import ScenarioError, tree
+    from scenarios.nodes import child
+
+    try:
+        root = tree(text, "")
+    except ScenarioError:
+        return bool(_FLOW_NAMED.match(text))
+    expects = golden or any(child(root, key) is not None for key in ("expect", "expect_decisions"))
+    return expects and child(root, "name") is not None
 
 
 class ScenarioFile(pytest.File):
@@ -78,6 +119,8 @@ class ScenarioFile(pytest.File):
         if self._checked is None:
             update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))
             self._checked = check_scenario(str(self.path), overrides, update=update)
+            if self._checked.written:
+                self.config.stash.setdefault(WRITTEN, []).append(self._checked.written)
         return self._checked
 
 
@@ -92,7 +135,9 @@ class ScenarioItem(pytest.Item):
         """Fly if nobody has, and look at the verdict."""
         assert isinstance(self.parent, ScenarioFile)  # noqa: S101
         checked = self.parent.checked()
-        if self.number >= len(checked.verdicts):  # the golden outcome, just written or not asked for
+        if self.number >= len(checked.verdicts):  # the golden outcome
+            if not checked.written:
+                pytest.skip("not compared under --sortie-set")
             return
         verdict = checked.verdicts[self.number]
         if not verdict.holds:

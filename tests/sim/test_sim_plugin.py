@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 from scipy import stats
 from sim_examples import BASE, example
+from typer.testing import CliRunner
 
 from scenarios.load import load
+from sim import cli
 from sim.checking import check_scenario
 from sim.expect import check, limit
 from sim.folders import RunError
 from sim.golden import golden_path, moved, write_golden
 from sim.outcome import outcome
+from sim.pytest_plugin import _is_scenario
 from sim.sortie import run_sortie
 
 SHORT = BASE.replace("duration_s: 6", "duration_s: 1").replace("at_s: 3", "at_s: 0.5")
@@ -153,9 +156,84 @@ def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
     assert moved(path, {**result, "a": 1.001}) == {}
     write_golden(path, {**result, "a": 2.0})
     assert json.loads(path.read_text())["tolerance"]["relative"] == 0.01
-    path.write_text("{}")
-    with pytest.raises(RunError, match=r"x.golden.json: no golden outcome: 'tolerance'"):
-        moved(path, result)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("{}", "tolerance must be an object"),
+        ("[]", "tolerance must be an object"),
+        ('{"tolerance": {"relative": 0, "absolute": 0}, "outcome": []}', "outcome must be an object"),
+        ('{"tolerance": {"relative": 0}, "outcome": {}}', "tolerance.absolute: None, must be a number ≥ 0"),
+        ('{"tolerance": {"relative": "1", "absolute": 0}, "outcome": {}}', "tolerance.relative: '1', must be a number ≥ 0"),
+        ('{"tolerance": {"relative": NaN, "absolute": 0}, "outcome": {}}', "tolerance.relative: nan, must be a number ≥ 0"),
+        ('{"tolerance": {"relative": -1, "absolute": 0}, "outcome": {}}', "tolerance.relative: -1, must be a number ≥ 0"),
+        ("{", "Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
+    ],
+)  # fmt: skip
+def test_a_broken_golden_outcome_is_named_and_replaced(tmp_path: Path, text: str, what: str) -> None:
+    path = tmp_path / "x.golden.json"
+    path.write_text(text)
+    with pytest.raises(RunError) as error:
+        moved(path, {"a": 1})
+    assert str(error.value) == f"{path}: no golden outcome: {what}"
+    said = write_golden(path, {"a": 1})
+    assert said == f"golden outcome written: {path}, in place of a broken file (no golden outcome: {what})"
+    assert moved(path, {"a": 1}) == {}
+
+
+def test_another_sortie_than_the_files_own_is_never_its_golden_outcome(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    assert check_scenario(str(path), update=True).written == f"golden outcome written: {golden_path(path)}"
+    before = golden_path(path).read_bytes()
+    line = "fleet.drones=2: a golden outcome is written of the scenario as its file has it, set nothing"
+    with pytest.raises(RunError, match=line):
+        check_scenario(str(path), ["fleet.drones=2"], update=True)
+    done = CliRunner().invoke(cli.app, ["check", str(path), "--update", "--set", "fleet.drones=2"])
+    assert isinstance(done.exception, RunError)
+    code, lines = _pytest(tmp_path, "--sortie-update", "--sortie-set", "fleet.drones=2")
+    assert (code, lines) == (4, [f"ERROR: {line}", ""])
+    assert golden_path(path).read_bytes() == before
+    done = CliRunner().invoke(cli.app, ["check", str(path), "--update"])
+    assert f"golden outcome written: {golden_path(path)}\n" in done.output
+    code, lines = _pytest(tmp_path, "--sortie-update")
+    assert (code, lines[-2:]) == (0, [f"golden outcome written: {golden_path(path)}", "1 passed"])
+
+
+def test_a_golden_outcome_that_is_not_compared_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    check_scenario(str(path), update=True)
+    assert _pytest(tmp_path) == (0, ["1 passed"])
+    code, lines = _pytest(tmp_path, "-rs", "--sortie-set", "fleet.drones=2")
+    assert (code, lines[-1]) == (0, "1 skipped")
+    assert any("not compared under --sortie-set" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_one"),
+    [
+        ("{name: x, fleet: {drones: 2}, expect: [{metric: switches, at_most: 9}]}", True),
+        ('\ufeff# a note\n---\n{ "expect_decisions" : [],\n  "name" : x}', True),
+        ('"name": x\n"expect": []', True),
+        ("{name: x, expect: [}", True),  # broken: told when it is collected
+        ("{name: x}", False),
+        ("{services: {name: x, expect: []}}", False),
+        ("{expect: 1, services: [{name: x}]}", False),
+        ("{{ name: x, expect: 1 }}", False),  # a template
+        ("[{name: x, expect: []}]", False),
+        ("a: {name: x, expect: []}", False),
+        ("- name: x\n  expect: []", False),
+        ("#" * 60 + "\n" * 60 + "x: {", False),  # in no time
+    ],
+)
+def test_a_scenario_is_told_from_other_yaml(tmp_path: Path, text: str, is_one: bool) -> None:
+    path = tmp_path / "some.yaml"
+    path.write_text(text, "utf-8")
+    assert _is_scenario(path) is is_one
+    golden_path(path).write_text("{}")
+    assert _is_scenario(path) is (is_one or text == "{name: x}")
 
 
 def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:
@@ -163,6 +241,10 @@ def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Pat
     (tmp_path / "good.yaml").write_text(SHORT + EXPECT.splitlines()[1] + "\n" + EXPECT.splitlines()[2] + "\n")
     (tmp_path / "compose.yaml").write_text("services: {web: {image: x}}\nexpect: 3\n")
     assert _pytest(tmp_path) == (0, ["1 passed"])
+    (tmp_path / "flow.yaml").write_text("{name: x, duration_s: 0.2, perception: {detector: none},\n"
+                                        " expect: [{metric: switches, at_least: 0}]}\n")  # fmt: skip
+    assert _pytest(tmp_path) == (0, ["2 passed"])
+    (tmp_path / "flow.yaml").unlink()
     (tmp_path / "bad.yaml").write_text(SHORT + EXPECT)
     code, lines = _pytest(tmp_path)
     assert code == 1
@@ -179,11 +261,12 @@ def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Pat
     assert any("bad.yaml:3: duration: unknown key, did you mean duration_s?" in line for line in lines)
 
 
-def _pytest(folder: Path) -> tuple[int, list[str]]:
+def _pytest(folder: Path, *options: str) -> tuple[int, list[str]]:
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "--color=no", "-p", "no:cacheprovider", "--rootdir", str(folder), str(folder)],
+        [sys.executable, "-m", "pytest", "-q", "--color=no", "-p", "no:cacheprovider", "--rootdir", str(folder), *options,
+         str(folder)],
         capture_output=True, text=True, cwd=folder,
     )  # fmt: skip
-    lines = done.stdout.splitlines()
+    lines = (done.stdout or done.stderr).splitlines()
     last = [line.partition(" in ")[0].strip("= ") for line in lines[-1:]]
-    return done.returncode, last if done.returncode == 0 else lines[:-1] + last
+    return done.returncode, last if done.returncode == 0 and not options else lines[:-1] + last
