@@ -11,6 +11,7 @@ from policies.conformance import RULES
 from policies.contract import TaskPhase
 from policies.registry import resolve
 from policies.views import draw_views, from_json, to_json
+from sim import console
 from sim.cli import main
 from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 
@@ -170,7 +171,7 @@ def leaves(view):
 def test_a_policy_that_gives_no_directives_is_a_broken_one(
     name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
+    monkeypatch.setattr(console.out, "width", 1000)
     path = tmp_path / "broken.py"
     path.write_text(BROKEN)
     assert sortie("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
