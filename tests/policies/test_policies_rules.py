@@ -6,6 +6,7 @@ import functools
 import gc
 import os
 import random
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -110,7 +111,8 @@ def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
     ],
 )
 def test_a_directive_of_other_types_is_named(field: str, value: object, message: str) -> None:
-    directives = [d._replace(**{field: value}) for d in share(FLEET)]
+    first, *rest = share(FLEET)
+    directives = [first._replace(**{field: value}), *rest]
     with pytest.raises(PolicyError, match=r"^directive ") as caught:
         check_directives(directives, FLEET)
     assert str(caught.value).endswith(": " + message)
@@ -120,6 +122,24 @@ def test_a_directive_of_other_types_is_named(field: str, value: object, message:
 def test_what_is_no_directive_is_named(answer: Sequence[Directive]) -> None:
     with pytest.raises(PolicyError, match=rf"^a policy returns Directive, got {type(answer[0]).__name__}$"):
         check_directives(answer, FLEET)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"source": 2}, "directive 2→1: source is 2, must be the ego 0"),
+        ({"destination": 0}, "directive 0→0: destination 0 is not a peer in the view [1, 2, 3, 4]"),
+        ({"destination": 7}, "directive 0→7: destination 7 is not a peer in the view [1, 2, 3, 4]"),
+        ({"destination": 3}, "directive 0→3: second directive for the same link"),
+    ],
+)
+@pytest.mark.parametrize("answer", [list, tuple, iter])
+def test_a_directive_for_no_link_of_its_own_is_named(
+    answer: Callable[[list[Directive]], Sequence[Directive]], fields: dict[str, int], message: str
+) -> None:
+    first, *rest = share(FLEET)
+    with pytest.raises(PolicyError, match=f"^{re.escape(message)}$"):
+        check_directives(answer([*rest, first._replace(**fields)]), FLEET)
 
 
 def test_a_second_directive_for_a_link_is_named_whatever_its_id_is_made_of() -> None:
