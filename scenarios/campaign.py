@@ -156,7 +156,9 @@ class StopWhen(Section):
     )
     confidence: float = Field(0.95, ge=0.5, le=0.9999, description="Of the interval of the mean.")
     difference: bool = Field(False, description="Of the paired difference from the first policy, not of the mean.")
-    at_least: int = Field(30, ge=2, description="Cells flown before it is asked.")
+    at_least: int = Field(
+        30, ge=2, description="Units flown before it is asked: draws, or replications where no field is drawn."
+    )
 
 
 class Campaign(Section):
