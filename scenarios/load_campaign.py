@@ -24,7 +24,8 @@ from scenarios.campaign import (
     Uniform,
 )
 from scenarios.files import found_beside
-from scenarios.load import campaigns, library, load, read, tree, validated
+from scenarios.load import _scalar as scalar
+from scenarios.load import campaigns, context_sets, library, load, read, tree, validated
 from scenarios.nodes import Node, ScenarioError, assign, child, dotted, plain
 from scenarios.schema import Scenario
 
@@ -67,11 +68,12 @@ def load_campaign(path_or_name: str | Path) -> Study:
         raise ScenarioError(f"{source}: is a scenario, a campaign begins with `campaign: its_name` and names its base")
     campaign = validated(root, Campaign)
     here = Path(source).parent
-    base = _base(campaign.base, here, source, root)
-    written = _section(root, "set")
-    resolved = as_node(base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}, source)
-    for name, node in written.items():
-        resolved = assign(resolved, name.split("."), _relined(node))
+    base = _base(campaign.base, here, root)
+    written = child(root, "set") or root
+    sections = base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}
+    resolved = as_node(sections, written.source, written.line)  # what set breaks elsewhere in the base is told there
+    for name, node in _section(root, "set").items():
+        resolved = _put(resolved, name, _relined(node))
     base = found_beside(validated(resolved, Scenario), here)
     columns: dict[str, tuple[Any, ...]] = {}
     varied = _section(root, "vary")
@@ -79,12 +81,13 @@ def load_campaign(path_or_name: str | Path) -> Study:
         if isinstance(spread, Column):
             columns[name] = _column(spread, here, varied[name])
     _check_lengths(campaign, columns, varied)
-    resolved = as_node(base.model_dump(mode="json", exclude_none=True), source)
+    sections = base.model_dump(mode="json", exclude_none=True)
     drones, phases = base.fleet.drones, len(base.mission.phases)
     for name, spread in campaign.vary.items():
+        at = varied[name]
+        resolved = as_node(sections, at.source, at.line)
         for value in extremes(spread, columns.get(name, ())):
-            node = as_node(value, varied[name].source, varied[name].line)
-            made = validated(assign(resolved, name.split("."), node), Scenario)
+            made = validated(_put(resolved, name, as_node(value, at.source, at.line)), Scenario)
             drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
     return Study(campaign, base, columns, here, root, drones, phases)
 
@@ -121,11 +124,27 @@ def _section(root: Node, name: str) -> dict[str, Node]:
     return dict(node.value) if node is not None and isinstance(node.value, dict) else {}
 
 
-def _base(name: str, here: Path, source: str, root: Node) -> Scenario:
-    """From the library, or a file beside the campaign's."""
-    if name in campaigns():
-        raise ScenarioError(f"{source}: base: {name}, must be a scenario, it is a campaign itself")
-    return load(name if name in library() else here / name)
+def _put(root: Node, name: str, new: Node) -> Node:
+    """`assign`, with a path that leads nowhere told at the line that names it."""
+    try:
+        return assign(root, name.split("."), new)
+    except ScenarioError as error:
+        raise ScenarioError(f"{new.where}{str(error).removeprefix(new.source)}") from None
+
+
+def _base(name: str, here: Path, root: Node) -> Scenario:
+    """From the library, or a file beside the campaign's; what is wrong within it is told at its own line."""
+    at = f"{(child(root, 'base') or root).where}: base: "
+    path = {**library(), **campaigns(), **context_sets()}.get(name, here / name)
+    try:
+        text, source = read(path)
+    except ScenarioError as error:
+        raise ScenarioError(f"{at}{error}") from None
+    top = tree(text, source)
+    for key, what in (("campaign", "a campaign itself"), ("contexts", "a set of contexts")):
+        if child(top, key) is not None and child(top, "name") is None:
+            raise ScenarioError(f"{at}{name}, must be a scenario, it is {what}")
+    return load(path)
 
 
 def extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
@@ -171,13 +190,10 @@ def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
 
 
 def _number(text: str) -> Any:
-    """A whole number, a number, or the text itself."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
+    """A whole number or a number, if it is one as scenarios write them; else the text itself."""
+    value, problem, doubt = scalar(text.strip())
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and not (problem or doubt)
+    return value if is_number else text
 
 
 def _check_lengths(campaign: Campaign, columns: dict[str, tuple[Any, ...]], varied: dict[str, Node]) -> None:

@@ -95,11 +95,24 @@ def quantile(spread: Spread, u: float, *, tail: float = 0.0) -> Any:
     if isinstance(spread, Normal):
         low = -np.inf if spread.low is None else spread.low
         high = np.inf if spread.high is None else spread.high
-        below, above = (float(ndtr((end - spread.mean) / spread.sd)) for end in (low, high))
         cut = np.clip(u, tail if spread.low is None else 0.0, 1.0 - (tail if spread.high is None else 0.0))
-        return float(np.clip(spread.mean + spread.sd * ndtri(below + cut * (above - below)), low, high))
+        a, b = ((end - spread.mean) / spread.sd for end in (low, high))
+        if a < 0 < b:
+            below, above = float(ndtr(a)), float(ndtr(b))
+            z = ndtri(below + cut * (above - below))
+        else:
+            z = _in_tail(a, b, cut) if b <= 0 else -_in_tail(-b, -a, 1.0 - cut)
+        return float(np.clip(spread.mean + spread.sd * z, low, high))
     assert isinstance(spread, LogNormal)  # noqa: S101
     return spread.median * float(np.exp(spread.sigma * ndtri(np.clip(u, tail, 1.0 - tail))))
+
+
+def _in_tail(a: float, b: float, u: float) -> float:
+    """The standard normal's quantile u between a and b, both at most 0; in logarithms, where tails do not vanish."""
+    from scipy.special import log_ndtr, ndtri_exp
+
+    with np.errstate(divide="ignore"):  # u is 0 or 1 at the ends
+        return float(ndtri_exp(np.logaddexp(log_ndtr(a) + np.log1p(-u), log_ndtr(b) + np.log(u))))
 
 
 def grid(campaign: Campaign, columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:

@@ -49,6 +49,17 @@ def test_quantiles_are_those_of_scipy(u: float) -> None:
         assert quantile(spread, u) == pytest.approx(reference.ppf(u), abs=1e-9)  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(("low", "high"), [(9, None), (40, None), (9, 9.5), (1, 2), (0, None), (-9.5, -9), (None, -40)])
+def test_a_normal_cut_off_in_its_tail_is_that_of_scipy(low: float | None, high: float | None) -> None:
+    """Beyond 8 sd above the mean the distribution function is 1, beyond 38 sd either tail is 0."""
+    ends = [None if end is None else 1.0 + 2.0 * end for end in (low, high)]
+    spread = Normal(kind="normal", mean=1, sd=2, low=ends[0], high=ends[1])
+    reference = stats.truncnorm(-np.inf if low is None else low, np.inf if high is None else high, 1, 2)
+    for u in (0.0, 1e-12, 0.001, 0.3, 0.5, 0.9, 1 - 1e-12):
+        if math.isfinite(reference.ppf(u)):
+            assert quantile(spread, u) == pytest.approx(reference.ppf(u), rel=1e-9)
+
+
 def test_choices_and_integers_come_as_often_as_they_should() -> None:
     u = (np.arange(1000) + 0.5) / 1000
     choice = Choice(kind="choice", values=("a", "b", "c"), weights=(1, 0, 3))
@@ -212,12 +223,41 @@ def test_the_plan_survives_its_json(tmp_path: Path) -> None:
             "{kind: grid, values: [20, 40]}", "{kind: column, file: some.csv, column: b}",
             "6: {here}/some.csv: no column b, it has a",
         ),
+        (
+            "{kind: grid, values: [20, 40]}", "{kind: column, file: odd.csv, column: a}",
+            "6: fleet.formation.spacing_m: 1_0, must be a number",
+        ),
+        ("base: base.yaml", "base: basse.yaml", "3: base: {here}/basse.yaml: no such file, did you mean base.yaml?"),
+        (
+            "base: base.yaml", "base: small_ones.yaml",
+            "3: base: small_ones.yaml, must be a scenario, it is a campaign itself",
+        ),
+        (
+            "base: base.yaml", "base: link_battery",
+            "3: base: link_battery, must be a scenario, it is a campaign itself",
+        ),
+        ("base: base.yaml", "base: contexts", "3: base: contexts, must be a scenario, it is a set of contexts"),
+        (
+            "fleet.formation.spacing_m:", "mission.phases.3.at_s:",
+            "6: mission.phases.3: no such entry, mission.phases has 0 … 0",
+        ),
+        (
+            "seed: 5", "set: {mission.phases.3.at_s: 2}",
+            "11: mission.phases.3: no such entry, mission.phases has 0 … 0",
+        ),
+        ("seed: 5", "set: {name.x: 2}", "11: name.x: no such field, name is the value small"),
+        ("seed: 5", "set: {fleet.drones: 1}", "11: events.0.drone: 1, must be below fleet.drones = 1"),
+        (
+            "fleet.formation.spacing_m: {kind: grid, values: [20,", "duration_s: {kind: grid, values: [0.1,",
+            "6: events.0.at_s: 0.1, must be below duration_s = 0.1",
+        ),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_told_at_its_line(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "some.csv").write_text("a\n1\n")
+    (tmp_path / "odd.csv").write_text("a\n1_0\n")
     assert old in CAMPAIGN
-    path = write(tmp_path, CAMPAIGN.replace(old, new))
+    path = write(tmp_path, CAMPAIGN.replace(old, new), BASE + "events: [{kind: drone_lost, at_s: 0.1, drone: 1}]\n")
     with pytest.raises(ScenarioError) as error:
         load_campaign(path)
     assert str(error.value) == f"{path}:{message.format(here=tmp_path)}"
