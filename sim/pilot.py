@@ -15,7 +15,16 @@ import simpy
 
 from fleet.agent import Agent
 from policies.conformance import raised_part
-from policies.contract import Directive, FleetView, Policy, PolicyError, Reposition, TaskPhase, check_reposition
+from policies.contract import (
+    Directive,
+    FleetView,
+    Policy,
+    PolicyError,
+    Reposition,
+    TaskPhase,
+    check_directives,
+    check_reposition,
+)
 from policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
 from policies.registry import handshake_bytes, resolve, viewpoint_of
 from policies.shield import MARK, checked, enforce
@@ -200,6 +209,7 @@ class Pilot:
     def _kept(self, view: FleetView) -> Sequence[Directive]:
         name, audit = self.policy.name, self._audit
         directives = self._ask(view)
+        check_directives(directives, view)  # before the rules read them
         fresh = self._ask(just_heard(view)) if self._asks_fresh else ()
         if self._shielded:
             directives = enforce(self._rules, view, directives, fresh)

@@ -226,6 +226,8 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
             try:
                 for value in extremes(spread, study.columns.get(name, ())):
                     resolve(base.policy.name, {name.removeprefix(PARAMS): value})
+                    if ":" in base.policy.name:
+                        break  # a file's function has no bounds, and is loaded each time
             except PolicyError as error:
                 raise PolicyError(f"{study.where('vary', name)}: {error}") from None
     section = base.policy.model_dump(mode="json", exclude_none=True)

@@ -205,3 +205,14 @@ def test_a_users_policy_that_breaks_the_contract_is_told_how(name: str, tmp_path
     path.write_text(f"from policies.contract import Directive\n\ndef {name}(view):\n    return {code}\n")
     with pytest.raises(PolicyError, match=message.replace("directive 0", r"directive \d")):
         run_sortie(example("duration_s=1", "mission.phases=[{at_s: 0, phase: search}]"), f"{path}:{name}")
+
+
+def test_what_the_audit_cannot_read_is_told_as_without_it(tmp_path: Path) -> None:
+    path = tmp_path / "texts.py"
+    path.write_text(
+        "from policies.contract import Directive, Representation\n\ndef decide(view):\n"
+        "    return [Directive(view.ego, p, Representation.FEATURES, 0.1, rate_hz='10') for p in view.peers]\n"
+    )
+    for rules in ("policy.invariants=''", f"policy.invariants={SLOW}"):
+        with pytest.raises(PolicyError, match=r"rate_hz is '10', must be in \[0, 30\], a number"):
+            run_sortie(example(f"policy.name={path}:decide", "policy.params={}", rules))
