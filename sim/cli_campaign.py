@@ -97,8 +97,8 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
     from sim.campaign.code import code_version
+    from sim.campaign.parts import read_plan
     from sim.campaign.rows import find_row
-    from sim.campaign.store import read_plan
     from sim.campaign.work import unpack
     from sim.folders import RunError
 

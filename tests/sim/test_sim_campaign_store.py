@@ -21,9 +21,10 @@ import pytest
 from campaign_examples import BASE, CAMPAIGN, Pretended, plan, pretend, table_bytes, write
 
 from sim.campaign.drive import run_campaign
+from sim.campaign.parts import BrokenPartError, read_part
 from sim.campaign.plan import Plan
 from sim.campaign.rows import find_row, read_rows
-from sim.campaign.store import BrokenPartError, Store, read_part
+from sim.campaign.store import Store
 from sim.campaign.work import Result, Task
 from sim.folders import RunError
 
