@@ -50,26 +50,28 @@ def run(
     report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
     """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
-    from scenarios.load_campaign import load_campaign
-    from sim.campaign.drive import run_campaign
-    from sim.campaign.engine import open_engine
-    from sim.campaign.plan import make_plan
-    from sim.campaign.store import ensure_usable
-    from sim.folders import RunError
-
-    if scheduler is not None and workers is not None:
-        raise RunError("--workers and --scheduler: name one of them")
-    study = load_campaign(campaign)
-    folder = out_dir or Path("runs") / f"campaign-{study.campaign.campaign}"
-    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    folder = out_dir
     try:
+        from scenarios.load_campaign import load_campaign
+        from sim.campaign.drive import run_campaign
+        from sim.campaign.engine import open_engine
+        from sim.campaign.plan import make_plan
+        from sim.campaign.store import ensure_usable
+        from sim.folders import RunError
+
+        if scheduler is not None and workers is not None:
+            raise RunError("--workers and --scheduler: name one of them")
+        study = load_campaign(campaign)
+        folder = out_dir or Path("runs") / f"campaign-{study.campaign.campaign}"
+        count = len(os.sched_getaffinity(0)) if workers is None else workers
         with user_errors():
             plan = make_plan(study)
             ensure_usable(folder, plan)
             with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
                 done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=show)
     except KeyboardInterrupt:
-        err.print(f"interrupted; what is finished is kept in {folder}, the same command goes on")
+        where = "" if folder is None else f" in {folder}"
+        err.print(f"interrupted; what is finished is kept{where}, the same command goes on", soft_wrap=True)
         raise typer.Exit(130) from None
     out.print(_in_words(done), soft_wrap=True)
     if report_:

@@ -5,11 +5,17 @@ An engine takes tasks as it can use them and gives results as they come; it neve
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
+import logging
+import signal
+import threading
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
 from sim.campaign.work import Result, Task, fly_batch, task_key
@@ -18,6 +24,7 @@ from sim.folders import RunError
 BATCH_S = 1.0
 """A task of the engine is about this long, so that its overhead of some milliseconds is below a hundredth."""
 MAX_BATCH = 200
+CONNECT_S = 15
 AHEAD = 2
 """Tasks of the engine given out per worker: one flies, one waits."""
 
@@ -138,24 +145,99 @@ def open_engine(workers: int = 0, scheduler: str | None = None) -> Iterator[Engi
         ) from error
     settings = {
         "distributed.scheduler.allowed-failures": 3,
-        "distributed.comm.timeouts.connect": "15s",
+        "distributed.comm.timeouts.connect": f"{CONNECT_S}s",
         "distributed.worker.profile.enabled": False,  # a sample every 10 ms, and nobody looks at them
     }
-    with dask.config.set(settings):
+    with dask.config.set(settings), _quiet():
         if scheduler is not None:
-            try:
-                client = Client(scheduler, timeout="15s", set_as_default=False)
-            except (OSError, ValueError, TimeoutError) as error:
-                raise RunError(f"--scheduler {scheduler}: no scheduler answers there") from error
-            with client:
-                yield Dask(client)
-            return
-        # quiet: a worker that is killed is told by its rows, not by tracebacks
-        with (
-            LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", memory_limit=0,
-                silence_logs="CRITICAL",
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):  # fmt: skip
+            _ensure_answers(scheduler)
+        opened = ExitStack()
+        try:
+            with _undisturbed():
+                if scheduler is not None:
+                    joins: Any = scheduler
+                else:
+                    joins = opened.enter_context(
+                        LocalCluster(
+                            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
+                            memory_limit=0, silence_logs="CRITICAL",
+                        )
+                    )  # fmt: skip
+                client = opened.enter_context(Client(joins, timeout=f"{CONNECT_S}s", set_as_default=False))
             yield Dask(client)
+        finally:
+            with _undisturbed():
+                opened.close()
+
+
+def _ensure_answers(scheduler: str) -> None:
+    """Before a client is made: one that finds nobody takes half a minute to go, and complains."""
+    from distributed.comm import connect, get_address_host_port
+    from distributed.core import send_recv
+    from distributed.security import Security
+
+    try:
+        get_address_host_port(scheduler)
+    except ValueError as error:
+        raise RunError(f"--scheduler {scheduler}: must be an address like tcp://host:8786: {error}") from None
+    answered: Future[str] = Future()
+
+    async def greet() -> str:
+        comm = await connect(scheduler, timeout=CONNECT_S, **Security().get_connection_args("client"))
+        who = await send_recv(comm, reply=True, op="identity")
+        comm.abort()
+        return str(who["type"])
+
+    def ask() -> None:
+        try:
+            answered.set_result(asyncio.run(greet()))
+        except Exception as error:
+            answered.set_exception(error)
+
+    # in a thread: Ctrl-C ends the wait at once, a notebook has a loop of its own, and dask does not give up whoever takes
+    # a connection and says nothing
+    threading.Thread(target=ask, daemon=True).start()
+    try:
+        kind = answered.result(CONNECT_S + 1)
+    except Exception as error:  # whatever they say there
+        raise RunError(f"--scheduler {scheduler}: no scheduler answers there") from error
+    if kind != "Scheduler":
+        raise RunError(f"--scheduler {scheduler}: no scheduler answers there, but a {kind}")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """A worker that is killed is told by its rows, a campaign that is interrupted by one line, neither by tracebacks: dask
+    logs one where Ctrl-C breaks off a question to the cluster."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "tornado.application", "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ctrl-C waits until the end of the block.
+
+    A terminal sends it to the whole process group, and the driver alone is to answer: threads that begin in here have it
+    blocked, and what they begin inherits that, workers that take the place of dead ones too.
+    """
+    if threading.current_thread() is not threading.main_thread():  # handlers are the main thread's
+        yield
+        return
+    resource_tracker.ensure_running()  # it lifts the block when it begins
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
+    if came and callable(before):
+        before(signal.SIGINT, None)
