@@ -100,7 +100,7 @@ def journal_file(folder: Path, shard: int) -> Path:
 def read_part(folder: Path, plan: Plan, shard: int) -> pa.Table | None:
     """A finished part, read in full and held against the plan; None where there is no such file.
 
-    Keys are held against the plan at the part's ends: each costs a millisecond or more, an hour for a million runs.
+    Keys are held against the plan at the part's ends: each costs 0.3 ms, five minutes for a million runs.
 
     Raises:
         BrokenPartError: it is damaged, or holds other runs.
