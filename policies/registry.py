@@ -57,7 +57,8 @@ BOUNDS: dict[str, Bound] = {
     "sharpness": Bound("a number in [0, 100]", 0, 100),  # e to the power of some 700 is no float any more
     "trusted_for_s": Bound("a number in [0.001, 3600]", 0.001, 3600),
 }
-"""Of the registered policies' parameters, by name; what a user's file declares, its function judges."""
+"""Of the registered policies' parameters, by name; one that has none here is its function's to judge, as all are that a
+user's file declares."""
 
 
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
@@ -73,8 +74,9 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     for key, value in (params or {}).items():
         if key not in known:
             raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
-        if name in POLICIES and not BOUNDS[key].holds(value):
-            raise PolicyError(f"{name}: {key} is {value!r}, must be {BOUNDS[key].words}")
+        bound = BOUNDS.get(key) if name in POLICIES else None
+        if bound is not None and not bound.holds(value):
+            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.words}")
     return functools.partial(function, **params) if params else function
 
 
