@@ -196,6 +196,10 @@ class Campaign(Section):
         if self.sample.method in ("morris", "saltelli") and (not drawn or len(drawn) < len(self.vary)):
             bound = "another, or every field of vary drawn, none a grid"
             raise inconsistent(("sample", "method"), self.sample.method, bound)
+        if self.sample.method == "morris" and self.stop_when is not None:  # its levels are no sample
+            raise inconsistent(
+                ("stop_when",), "morris", "left out, or another sample.method: its means have no intervals"
+            )
         for name in ("policies", "metrics"):
             entries = getattr(self, name)
             for i, entry in enumerate(entries):

@@ -403,3 +403,14 @@ def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> N
     own, other = (json.loads(plan(tmp_path, base=base).task(run))["scenario"]["policy"] for run in (0, 1))
     assert (own["name"], [change["name"] for change in own["changes"]]) == ("worked", ["silence"])
     assert (other["name"], other["changes"]) == ("best-2", [])
+
+
+def test_levels_of_morris_stop_at_no_interval(tmp_path: Path) -> None:
+    text = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "")
+    text = text.replace("{count: 6}", "{count: 6, method: morris}")
+    assert load_campaign(write(tmp_path, text)).campaign.sample.method == "morris"
+    path = write(tmp_path, text + "stop_when: {metric: bytes.data_sent, half_width: 1}\n")
+    with pytest.raises(ScenarioError) as error:
+        load_campaign(path)
+    must = "must be left out, or another sample.method: its means have no intervals"
+    assert str(error.value) == f"{path}:11: stop_when: morris, {must}"
