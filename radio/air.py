@@ -276,9 +276,7 @@ class Air:
         self._measure(s, how is not _DEADLINE_QUEUED, now_s)
         if how is not _SERVED:
             queued = how is _DEADLINE_QUEUED and s.repairs == 0
-            if (
-                queued and s.hops == 1
-            ):  # it may have come to the head at this very instant; a hop before this one did serve
+            if queued and s.hops == 1:  # it may have come to the head at this very instant
                 s.t_first_s = nan
             self._close(s, _EXPIRED, "deadline_queued" if queued else "deadline_in_service")
             return

@@ -203,7 +203,7 @@ _WORDS: dict[str, Scalar] = {
 }
 
 
-def _scalar(text: str) -> tuple[Scalar, str, str]:
+def read_scalar(text: str) -> tuple[Scalar, str, str]:
     """A plain scalar's value, the problem and the doubt about it (see Node), if any."""
     if text in _WORDS:
         return _WORDS[text], "", ""
@@ -293,7 +293,7 @@ class _Reader:
         self.grow(event, 0, len(text) // 100)
         if not event.implicit[0]:  # quoted, a block, or tagged
             return Node(text, self.source, self.line(event), json.dumps(text, ensure_ascii=False))
-        value, problem, doubt = _scalar(text)
+        value, problem, doubt = read_scalar(text)
         shown = json.dumps(text, ensure_ascii=False) if isinstance(value, str) and not doubt else text
         return Node(value, self.source, self.line(event), shown, problem, doubt)
 
@@ -371,7 +371,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    value, problem, doubt = _scalar(text)
+    value, problem, doubt = read_scalar(text)
     style = '"' if problem or doubt or not isinstance(value, str) or not text.isprintable() else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 

@@ -24,8 +24,7 @@ from scenarios.campaign import (
     Uniform,
 )
 from scenarios.files import found_beside
-from scenarios.load import _scalar as scalar
-from scenarios.load import campaigns, context_sets, library, load, read, tree, validated
+from scenarios.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
 from scenarios.nodes import Node, ScenarioError, assign, child, dotted, plain
 from scenarios.schema import Scenario
 
@@ -191,7 +190,7 @@ def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
 
 def _number(text: str) -> Any:
     """A whole number or a number, if it is one as scenarios write them; else the text itself."""
-    value, problem, doubt = scalar(text.strip())
+    value, problem, doubt = read_scalar(text.strip())
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and not (problem or doubt)
     return value if is_number else text
 

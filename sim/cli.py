@@ -40,7 +40,7 @@ from sim import (
 )
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
-from sim.folders import RunError, put_between
+from sim.folders import RunError, put_between, write_text
 from sim.named import policy_overrides
 from sim.sortie import VERSION, run_sortie
 from sim.watchers import Watcher, Watchers
@@ -361,13 +361,7 @@ def _split_policies(text: str) -> list[str]:
 
 
 def _write_json(path: Path, data: Any) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(data, indent=2) + "\n")
-        partial.rename(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+    write_text(path, json.dumps(data, indent=2) + "\n")
 
 
 @contextmanager

@@ -6,8 +6,9 @@
 
 A step is as many whole frames as come nearest to one simulated second, and never none: exactly a second where
 `context.rate_hz` is a whole number, 1.33 s at 1.5 Hz, 2 s at 0.5 Hz; the last step ends with the sortie. Each drone's
-action stands for its directives until the next. All that stands between a policy and the gate (checks, staleness, damping) stands there too. The sortie runs in a thread of its own that takes
-turns with the caller, so that the same seed and actions give the same record.
+action stands for its directives until the next. All that stands between a policy and the gate (checks, staleness,
+damping) stands there too. The sortie runs in a thread of its own that takes turns with the caller, so that the same seed
+and actions give the same record.
 """
 
 from __future__ import annotations

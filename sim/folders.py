@@ -50,7 +50,7 @@ def replacing(path: Path) -> Iterator[Path]:
         RunError: the disk refuses.
     """
     place = path.resolve()  # where a link leads: the link stays
-    partial = place.with_name(f".{place.name}.partial")
+    partial = partial_file(place)
     try:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -63,19 +63,48 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text under a temporary name, then rename it.
+    """Write a text durably, its folder too where there is none.
 
     Raises:
         RunError: the disk refuses.
     """
-    part = path.with_name(f".{path.name}.partial")
     try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, text.encode())
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """A file whole or not at all, under a temporary name and then renamed; on disk at the return.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    partial = partial_file(path)
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
     finally:
-        part.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def partial_file(path: Path) -> Path:
+    """Where a file or folder is written before it is renamed."""
+    return path.with_name(f".{path.name}.partial")
+
+
+def sync_folder(folder: Path) -> None:
+    """Its entries are on disk at the return."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def put_between(path: Path, section: str, begin: str, end: str) -> None:

@@ -26,7 +26,7 @@ import rerun.blueprint as rrb
 
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
-from sim.folders import RunError
+from sim.folders import RunError, partial_file
 from sim.playback_canvas import Canvas, Floats
 from sim.playback_charts import Charts
 from sim.playback_comparison import comparison, roots
@@ -100,7 +100,7 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
 @contextmanager
 def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
     """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_file(path)
     try:
         partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
         recording = rr.RecordingStream(APPLICATION)

@@ -19,7 +19,7 @@ from perception.geometry import CELLS
 from perception.harness.picture import Picture, to_world
 from perception.render import CAMERAS
 from perception.types import Boxes
-from sim.folders import RunError
+from sim.folders import RunError, partial_file
 from sim.playback_canvas import MISSION, drone_colour
 
 APPLICATION = "sortie-frame"
@@ -35,7 +35,7 @@ def save_frame(picture: Picture, path: Path) -> None:
     Raises:
         RunError: the file cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_file(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.open("wb").close()  # Rerun would tell of a bad path in a log line only

@@ -10,7 +10,6 @@ A part is a function of its rows, so the table does not tell how often, or where
 from __future__ import annotations
 
 import json
-import os
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -211,31 +210,3 @@ def read_lines(path: Path) -> tuple[list[Result], int]:
             results.append(Result(run, key, status, error, fingerprint, tuple(values)))
             good += len(line)
     return results, good
-
-
-def write_durably(path: Path, data: bytes) -> None:
-    """A file whole or not at all, on disk at the return."""
-    partial = partial_file(path)
-    try:
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-    sync_folder(path.parent)
-
-
-def partial_file(path: Path) -> Path:
-    """Where a file is written before it is renamed."""
-    return path.with_name(f".{path.name}.partial")
-
-
-def sync_folder(folder: Path) -> None:
-    """Its entries are on disk at the return."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from sim.campaign.contexts import contexts, rule, winner
 from sim.campaign.drive import Stop
 from sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
-from sim.campaign.rows import Rows, figure, figures, is_accuracy, judged, read_rows, sign
+from sim.campaign.rows import Rows, figure, figures, is_accuracy, judged, read_rows
 from sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sim.campaign.statistics import Estimate, Floats, estimate, paired
 from sim.folders import RunError, write_text
@@ -158,7 +158,7 @@ def _sensitivity(rows: Rows) -> Iterator[str]:
 
 
 def _winners(rows: Rows) -> Iterator[str]:
-    metrics = [m for m in judged(with_values(rows)) if sign(m)]
+    metrics = judged(with_values(rows))
     if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## Where the winner changes\n"

@@ -24,18 +24,16 @@ from sim.campaign.parts import (
     journal_file,
     line_of,
     part_file,
-    partial_file,
     read_lines,
     read_part,
     row_of,
     runs_of,
+    schema_of,
     shards,
-    sync_folder,
-    write_durably,
 )
 from sim.campaign.plan import Plan
 from sim.campaign.work import Result
-from sim.folders import RunError, ensure_folder
+from sim.folders import RunError, ensure_folder, partial_file, sync_folder, write_durably
 
 LOCK = ".lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -206,15 +204,10 @@ class Store:
     def _write_part(self, shard: int) -> None:
         results = {r.run: r for r in read_lines(journal_file(self.folder, shard))[0]}
         rows = [row_of(self.plan, self._columns, results[run]) for run in self.runs_of(shard)]
-        table = pa.table(
-            {name: pa.array([row[name] for row in rows], kind) for name, kind in self._columns.items()}
-        ).replace_schema_metadata({"sortie.campaign": self.plan.digest})
-        partial = self.folder / RUNS / f".part-{shard:05d}.partial"
-        pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(part_file(self.folder, shard))
-        sync_folder(self.folder / RUNS)
+        table = pa.Table.from_pylist(rows, schema=schema_of(self.plan))
+        file = pa.BufferOutputStream()
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+        write_durably(part_file(self.folder, shard), file.getvalue().to_pybytes())
         self._close_journal(shard)
         journal_file(self.folder, shard).unlink(missing_ok=True)
         self._known.pop(shard, None)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
+from scenarios.files import found_beside, named_files, placed, with_files
 from scenarios.load import load, loads
 
 TEXT = """
@@ -77,4 +77,3 @@ def test_a_shipped_trace_is_one_that_is_here(tmp_path: Path) -> None:
 def test_a_scenario_without_files_is_left_alone(tmp_path: Path) -> None:
     plain = loads("name: plain")
     assert found_beside(plain, tmp_path) is plain
-    assert len(FIELDS) == len(set(FIELDS))
