@@ -6,10 +6,16 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pytest
+
 from scenarios.load_campaign import load_campaign
 from sim.campaign.plan import Plan, make_plan
 from sim.campaign.work import Result, Task, task_key
 
+CLUSTER = pytest.mark.filterwarnings(
+    "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
+)
+"""A cluster whose processes are killed leaves sockets behind; dask says so when they are collected."""
 BASE = """
 name: small
 duration_s: 0.5

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, Pretended, plan, table_bytes, write
+from campaign_examples import CAMPAIGN, CLUSTER, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
 from sim.campaign import engine as engines
@@ -32,10 +26,6 @@ from sim.folders import RunError
 
 pytest.importorskip("distributed")
 
-CLUSTER = pytest.mark.filterwarnings(
-    "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
-)
-"""A cluster whose processes are killed leaves sockets behind; dask says so when they are collected."""
 FAULTY = """
 import os
 from policies.contract import Directive
@@ -87,110 +77,6 @@ def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
     assert not victims
     assert (done.finished, done.failed) == (96, 0)
     assert table_bytes(tmp_path / "cluster") == table_bytes(tmp_path / "alone")
-
-
-DRIVER = """
-import sys
-from sim.cli import main
-if __name__ == "__main__":
-    sys.argv[:2] = ["sortie", "campaign"]
-    main()
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-def test_ctrl_c_is_one_line_and_leaves_nothing_running(tmp_path: Path, workers: int) -> None:
-    """It goes to the whole process group, as a terminal sends it."""
-    folder, script = tmp_path / "a", tmp_path / "driver.py"
-    script.write_text(DRIVER)
-    campaign = write(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 200}"))
-    command = [sys.executable, str(script), "", str(campaign), "--workers", str(workers), "--out", str(folder)]
-    deadline = time.monotonic() + 300
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    ) as driver:
-        while not any(file.stat().st_size for file in folder.glob("journal/*.jsonl")):
-            assert driver.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        assert len(_processes(driver.pid)) >= 1 + workers
-        os.killpg(driver.pid, signal.SIGINT)
-        said, _ = driver.communicate(timeout=60)
-    assert said == f"interrupted; what is finished is kept in {folder}, the same command goes on\n"
-    assert driver.returncode == 130
-    while _processes(driver.pid):  # multiprocessing's resource tracker goes last, by itself
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def _processes(session: int) -> list[int]:
-    """A session's processes, but for those that have ended and wait to be asked how."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            state, _, _, its, *_ = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(its) == session and state != "Z":
-                found.append(int(folder.name))
-    return found
-
-
-@CLUSTER
-@pytest.mark.slow
-def test_workers_never_get_ctrl_c_those_that_replace_dead_ones_either(tmp_path: Path) -> None:
-    with open_engine(1) as engine:
-        client = engine._client  # type: ignore[attr-defined]
-        (first,) = client.run(os.getpid).values()
-        assert _blocks_ctrl_c(first)
-        os.kill(first, signal.SIGKILL)
-        deadline, second = time.monotonic() + 300, first
-        while second == first:
-            assert time.monotonic() < deadline
-            client.wait_for_workers(1)
-            with suppress(OSError, ValueError):
-                (second,) = client.run(os.getpid).values()
-        assert _blocks_ctrl_c(second)
-        (address,) = client.scheduler_info()["workers"]
-        with pytest.raises(RunError, match=f"--scheduler {address}: no scheduler answers there, but a Worker"):
-            open_engine(scheduler=address).__enter__()
-
-
-def _blocks_ctrl_c(pid: int) -> bool:
-    status = dict(line.split(":\t", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-    return bool(int(status["SigBlk"], 16) & 1 << signal.SIGINT - 1)
-
-
-@CLUSTER
-@pytest.mark.slow
-def test_a_question_to_the_cluster_that_ctrl_c_breaks_off_is_not_told(caplog: pytest.LogCaptureFixture) -> None:
-    """dask takes back what it has not asked yet, stumbles over that, and would log a traceback."""
-    with open_engine(1) as engine:
-        loop = engine._client.loop  # type: ignore[attr-defined]
-        loop.add_callback(time.sleep, 1)
-        hand = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
-        hand.start()
-        with pytest.raises(KeyboardInterrupt):
-            assert engine.workers
-        hand.join()
-    assert caplog.messages == []
-    assert logging.getLogger("tornado.application").isEnabledFor(logging.ERROR)
-
-
-def test_ctrl_c_waits_for_the_end_of_what_must_not_be_broken_off() -> None:
-    blocked, before = [], signal.getsignal(signal.SIGINT)
-
-    def work() -> None:
-        with engines._undisturbed():
-            signal.raise_signal(signal.SIGINT)
-            with subprocess.Popen(["sleep", "60"]) as child:
-                blocked.append(_blocks_ctrl_c(child.pid))
-                child.kill()
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert blocked == [True]
-    assert signal.getsignal(signal.SIGINT) is before
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 class _Future:

@@ -147,9 +147,10 @@ def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path
     assert said.exit_code == 0, said.output
     assert (tmp_path / "run" / "report.html").read_text("utf-8") == page(record)
     rundir.save(record, tmp_path / "run")  # a run with a report is a run still
-    elsewhere = tmp_path / "gone" / "page.html"
-    with pytest.raises(RunError, match=r"gone/page\.html"):
-        save_page(record, elsewhere)
+    save_page(record, tmp_path / "new" / "page.html")
+    assert (tmp_path / "new" / "page.html").read_text("utf-8") == page(record)
+    with pytest.raises(RunError, match=r"page\.html/again\.html: cannot be written"):
+        save_page(record, tmp_path / "new" / "page.html" / "again.html")
 
 
 def test_without_matplotlib_it_is_said_how_to_get_it(record: SortieRecord, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,195 @@
+"""The search under the proofs: what ranges answer, what they refuse, and that every case is met."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import operator
+from collections.abc import Callable
+from decimal import Decimal
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from policies.geometry import peers_by_overlap
+from policies.ranges import FleetOfRanges, _places
+from policies.symbols import Path, Ranged, Refused, explore
+
+
+def cells(run: Callable[[Ranged], object], low: float = 0.0, high: float = 1.0) -> list[tuple[float, float, object]]:
+    found = []
+    for path, result in explore(lambda p: run(p.number("x", low, high))):
+        found.append((*path.ranges["x"], result))
+    return sorted(found, key=lambda c: c[0])
+
+
+@given(
+    st.lists(st.floats(-2, 2), max_size=5),
+    st.sampled_from([1.0, -1.0, 3.0, -0.1, 1e-3]),
+    st.floats(-2, 2),
+    st.lists(st.floats(0, 1), max_size=20),
+)
+def test_cells_cover_every_float_and_decide_alike(
+    thresholds: list[float], factor: float, offset: float, points: list[float]
+) -> None:
+    def decide(x: object) -> list[bool]:
+        value = x * factor + offset  # type: ignore[operator]
+        return [value < t for t in thresholds] + [value == t for t in thresholds]
+
+    found = cells(decide)
+    assert found[0][0] == 0.0
+    assert found[-1][1] == 1.0
+    for (_, end, _), (begin, _, _) in pairwise(found):
+        assert math.nextafter(end, math.inf) == begin, "no float lies between two cells"
+    for low, high, answer in found:
+        assert decide(low) == answer == decide(high)
+    for x in points:
+        assert [answer for low, high, answer in found if low <= x <= high] == [decide(x)]
+
+
+def test_a_threshold_cuts_at_the_very_float() -> None:
+    below = math.nextafter(0.3, 0)
+    assert cells(lambda x: x >= 0.3) == [(0.0, below, False), (0.3, 1.0, True)]
+    assert cells(lambda x: x == 0.3) == [(0.0, below, False), (0.3, 0.3, True), (math.nextafter(0.3, 1), 1.0, False)]
+    assert cells(lambda n: 2 <= n < 4, 0, 5) == [(0, 1, False), (2, 3, True), (4, 5, False)]
+
+
+@pytest.mark.parametrize(
+    "act", [math.sqrt, int, round, hash, lambda x: x % 2, lambda x: x**2, lambda x: 1 / x, lambda x: x.is_integer()]
+)
+def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Callable[[object], object]) -> None:
+    def run(path: Path) -> None:
+        with contextlib.suppress(BaseException):
+            act(path.number("charge", 0.0, 1.0))
+
+    with pytest.raises(Refused, match="charge"):
+        list(explore(run))
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda x: f"{x:.3f}" == "0.123",
+        lambda x: f"{x:.3f}" != "0.123",
+        lambda x: f"{x}" < "0.5",
+        lambda x: str(x).startswith("0.123"),
+        lambda x: repr(x) == "0.123",
+        lambda x: f"{x!r}" == "0.123",
+        lambda x: format(x, ".3f") in ("0.122", "0.123"),
+        lambda x: f"{x:.3f}" in {"0.123"},
+        lambda x: {"0.123": 1}.get(f"{x:.3f}"),
+        lambda x: "charge " + f"{x:.3f}" == "charge 0.123",
+        lambda x: f"{x:.3f}" + " left" == "0.123 left",
+        lambda x: "charge %s" % str(x) == "charge 0.123",  # noqa: UP031 - what older code does
+        lambda x: "0.12" in str(x),
+        lambda x: str(x)[:4] == "0.12",
+        lambda x: len(str(x)) == 5,
+        lambda x: next(iter(str(x))) == "0",
+        lambda x: float(f"{x:.3f}") < 0.5,
+        lambda x: int(f"{x:.0f}") == 0,
+        lambda x: str(str(x)).split("."),
+    ],
+)
+def test_whoever_looks_into_the_text_of_a_number_is_refused(look: Callable[[object], object]) -> None:
+    with pytest.raises(Refused, match="looks into the text of charge, which is for reasons alone"):
+        list(explore(lambda p: look(p.number("charge", 0.0, 1.0))))
+
+
+def test_text_that_is_handed_on_is_not_and_one_number_alone_has_its_own() -> None:
+    def reasons(x: object) -> list[str]:
+        return [f"{x:.3f}", "charge " + str(x), f"{x:.1f}, {x:.2f}", str(x) or "none", f"{x:>9}"]
+
+    ((path, found),) = explore(lambda p: reasons(p.number("charge", 0.0, 1.0)))
+    assert path.refusal is None
+    assert all(isinstance(text, str) for text in found)
+    assert list(cells(lambda x: f"{x:.2f}" == "0.50", 0.5, 0.5)) == [(0.5, 0.5, True)]
+    with pytest.raises(ValueError, match="Unknown format code 'd'"):  # as of a plain float
+        list(explore(lambda p: f"{p.number('charge', 0.0, 1.0):d}"))
+
+
+def test_a_number_read_out_of_other_text_fails_instead_of_being_one() -> None:
+    with pytest.raises(ValueError, match="could not convert string to float"):
+        list(explore(lambda p: float(f"charge {p.number('charge', 0.0, 1.0):.3f}".split()[1])))
+
+
+def test_isinstance_and_match_answer_as_in_flight() -> None:
+    def kind(x: object) -> tuple[bool, ...]:
+        match x:
+            case float():
+                matched = True
+            case _:
+                matched = False
+        return isinstance(x, float), isinstance(x, int), isinstance(x, int | float), isinstance(x, str), matched
+
+    assert kind(0.5) == kind(Path([]).number("charge", 0.0, 1.0))
+    assert kind(5)[:4] == kind(Path([]).number("targets", 0, 16))[:4]
+
+
+@pytest.mark.parametrize("other", [Decimal("0.5"), np.float32(0.3), np.int64(1), 1j])
+@pytest.mark.parametrize("act", [operator.eq, operator.ne, lambda a, b: b == a, operator.mul, lambda a, b: b * a])
+def test_a_number_that_rounds_otherwise_is_refused(act: Callable[[object, object], object], other: object) -> None:
+    with pytest.raises(Refused, match=f"compares or combines charge with a {type(other).__name__}"):
+        list(explore(lambda p: act(p.number("charge", 0.0, 1.0), other)))
+
+
+def flags_of(act: Callable[[Any], object]) -> list[object]:
+    """What becomes of the ego's novelty flags, cell by cell."""
+
+    def run(path: Path) -> object:
+        me = FleetOfRanges(path, 1, 0, (0,), 0.1).view().me
+        assert me is not None
+        return act(me.novelty_flags)
+
+    return [found for _, found in explore(run)]
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda n: n + 1, lambda n: 300 - n, lambda n: n | 1, lambda n: ~n, lambda n: n >> 6, lambda n: 1 << n, hash, bool,
+        int, lambda n: n == 77, lambda n: n != 77, lambda n: n in {3, 200}, lambda n: n < 128, lambda n: f"{n:08b}", str,
+        lambda n: n.bit_count(), lambda n: list(range(256))[n], lambda n: isinstance(n, int), lambda n: n & ~n,
+        lambda n: divmod(n, 7),
+    ],
+)  # fmt: skip
+def test_novelty_flags_are_every_byte(act: Callable[[Any], object]) -> None:
+    assert set(flags_of(act)) == {act(n) for n in range(256)}
+
+
+def test_novelty_flags_fork_by_the_bits_that_are_asked_for() -> None:
+    assert sorted(flags_of(lambda n: n & 128)) == [0, 128]  # type: ignore[type-var]
+    assert sorted(flags_of(lambda n: 3 & n)) == [0, 1, 2, 3]  # type: ignore[type-var]
+    assert sorted(flags_of(lambda n: (n & 5, n & 4))) == [(0, 0), (1, 0), (4, 4), (5, 4)]  # type: ignore[type-var]
+
+
+def test_flags_of_two_drones_are_compared() -> None:
+    def run(path: Path) -> tuple[int, int, bool]:
+        view = FleetOfRanges(path, 2, 0, (0, 1), 0.1).view()
+        mine, other = (view.descriptors[i].novelty_flags for i in (0, 1))
+        if mine & 254 or other & 254:
+            return 0, 0, True
+        return mine & 1, other & 1, mine == other
+
+    assert {found for _, found in explore(run)} == {(0, 0, True), (0, 1, False), (1, 0, False), (1, 1, True)}
+
+
+def test_two_axes_are_not_compared() -> None:
+    with pytest.raises(Refused, match="compares or combines two inputs, a and b"):
+        list(explore(lambda p: p.number("a", 0.0, 1.0) < p.number("b", 0.0, 1.0)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_places_realise_every_order(n: int) -> None:
+    import itertools
+
+    from policies_examples import fleet_of
+
+    view = fleet_of(n + 1)
+    for order in itertools.permutations(range(1, n + 1)):
+        at = _places(0, order)
+        placed = {i: d._replace(position_m=at[i]) for i, d in view.descriptors.items()}
+        assert peers_by_overlap(view._replace(descriptors=placed)) == list(order)
