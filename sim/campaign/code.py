@@ -1,4 +1,4 @@
-"""Which code a run is of: a digest of the sources and libraries that decide what comes out."""
+"""Which code a run is of: a digest of the sources, shipped weights and libraries that decide what comes out."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ from sim.sortie import VERSION
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 ROOMS = ("scenarios", "radio", "policies", "perception", "fleet", "sim")
-LIBRARIES = ("numpy", "scipy", "simpy", "networkx", "torch")
+SUFFIXES = (".py", ".json", ".safetensors")
+"""Sources, and what is learned and shipped beside them."""
+LIBRARIES = ("numpy", "scipy", "simpy", "networkx", "numba", "torch")
 LOOKS = (
     "sim/cli*.py", "sim/playback*.py", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py", "sim/expect.py",
-    "sim/golden.py", "sim/compare.py", "sim/paper.py", "sim/campaign/*.py", "perception/study/*.py",
+    "sim/golden.py", "sim/compare.py", "sim/paper.py", "sim/campaign/*.py", "perception/study/*", "scenarios/library/*",
+    "scenarios/schema.json",
 )  # fmt: skip
-"""Only look at runs, or drive them: a change there leaves results as they are."""
+"""Only look at runs, drive them, or reach them in their tasks: a change there leaves results as they are."""
 DECIDES = ("sim/campaign/work.py", "sim/campaign/plan.py", "sim/campaign/spread.py")
 """The exceptions: these say what is flown, and how."""
 
 
 @functools.cache
 def code_version() -> str:
-    """The version and 16 hex digits of SHA-256 over the rooms' sources and the versions of the libraries beneath."""
+    """The version and 16 hex digits of SHA-256 over the rooms' sources and weights and the versions of the libraries beneath."""
     digest = hashlib.sha256()
     for room in ROOMS:
-        for path in sorted((ROOT / room).rglob("*.py")):
+        for path in sorted(p for p in (ROOT / room).rglob("*") if p.suffix in SUFFIXES):
             name = path.relative_to(ROOT).as_posix()
             if name in DECIDES or not any(fnmatch(name, look) for look in LOOKS):
                 digest.update(f"{name}\0".encode())
