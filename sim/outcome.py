@@ -80,7 +80,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "shield_interventions": totals["shield_interventions"],
             "invariant_violations": totals["invariant_violations"],
         },
-        "switches": len(changes) / (links * minutes) if links else None,
+        "switches": sum(len(c["peers"]) for c in changes) / (links * minutes) if links else None,
         "transitions": changes,
         "phases": [_phase(record, both, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
         "distrusted_by": _distrusted_by(tables["trust"]),
