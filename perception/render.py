@@ -113,14 +113,15 @@ class Window:
     def with_cars(self, cars: Cars) -> Iterator[None]:
         """The window with `cars` in it, for the time of the block."""
         spans, _ = self._spans(cars)
-        scenery, coarse = saved(self.height, self.colour, spans), self.coarse.copy()
+        scenery, coarse, top_m = saved(self.height, self.colour, spans), self.coarse.copy(), self.top_m
         self._stamp(cars)
         raised(self.height, self.coarse, COARSE, spans)
+        self.top_m = max(top_m, float(cars.height_m.max(initial=0.0)))  # a field may hold nothing as high
         try:
             yield
         finally:
             restore(self.height, self.colour, spans, *scenery)
-            self.coarse[...] = coarse
+            self.coarse[...], self.top_m = coarse, top_m
 
     def _spans(self, cars: Cars) -> tuple[NDArray[np.int64], Floats]:
         """Rows and columns [n, 4] that cars may cover, none for those that are not whole in the window; and their middles [n, 2], pixels."""

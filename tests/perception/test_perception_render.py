@@ -66,7 +66,7 @@ def test_cameras_are_right_handed_and_look_where_they_should() -> None:
         (10.0, 5.0, 0.0, 0.0, 0.0),
         (10.0, 5.0, 0.0, 0.0, 0.2),
         (60.0, -12.0, 0.0, 0.0, 0.0),
-        (60.0, -12.0, 0.0, 0.1, -0.1),
+        (60.0, -20.0, 0.0, 0.1, -0.1),  # aside: from right behind it the bonnet hides behind the cabin
         (-15.0, 70.0, 0.4, -0.1, 0.05),
         (-70.0, 20.0, 2.4, 0.0, 0.1),
     ],
@@ -137,6 +137,16 @@ def test_a_building_hides_the_car_behind_it_from_one_side_only() -> None:
     views = Renderer(only_target(kerb, middle, town), 1).render([behind, in_front])
     assert red(views[0]).sum() == 0
     assert red(views[1]).sum() > 10
+
+
+def test_a_car_stands_up_where_nothing_else_does() -> None:
+    """Its roof is lit, not the side of something; and things that are higher, anywhere, do not change how it looks."""
+    renderer, c = Renderer(only_target(8.0, 3.0), 1), capture()
+    bare = renderer.render([c])[0]
+    assert bare[..., 0][red(bare)].max() > 200
+    assert renderer._window is not None
+    renderer._window.top_m = 20.0
+    assert np.array_equal(renderer.render([c])[0], bare)
 
 
 def test_rendering_leaves_the_scenery_as_it_was_and_repeats_itself() -> None:
