@@ -170,7 +170,7 @@ class TorchDetector:
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
         self._encode([capture])
-        return len(self._look_alone(capture).result().inside(roi))
+        return len(self._sendable(self._look_alone(capture).result()).inside(roi))
 
     def camera_views(self, capture: Capture) -> Bytes:
         """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
@@ -312,14 +312,19 @@ class TorchDetector:
     def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
         """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
         if share.representation in MAPS:
-            lies = self._lies(share, now)
-            out = known[share.capture].in_part[_part(share)].result()
-            said = Told(self._place(out, lies), share.weight, lies, share.roi, share.rho < 1.0)
+            lies, part = self._lies(share, now), _part(share)
+            out = known[share.capture].in_part[part].result()
+            cut = share.representation != "raw" and _is_ranked(share)
+            said = Told(self._place(out, lies), share.weight, lies, part[1], cut)
         else:
             alone = known[share.capture].boxes
             assert alone is not None  # noqa: S101 (asked for with the job)
             said = told(share, alone.result())
-        return replace(said, boxes=sendable(said.boxes)) if self._fusion.shares == "boxes" else said
+        return replace(said, boxes=self._sendable(said.boxes))
+
+    def _sendable(self, boxes: Boxes) -> Boxes:
+        """What of a drone's boxes it sends: in late fusion those that are sure."""
+        return sendable(boxes) if self._fusion.shares == "boxes" else boxes
 
     def _head_in_part(self, share: Share, known: Known) -> None:
         """The head's output from what was sent of a map, worked out once for a capture and a budget."""
@@ -339,7 +344,7 @@ class TorchDetector:
 
 
 def _part(share: Share) -> tuple[float, Disc | None, tuple[int, ...]]:
-    return share.rho, share.roi, share.missing
+    return (1.0, None, ()) if share.representation == "raw" else (share.rho, share.roi, share.missing)
 
 
 def _is_ranked(share: Share) -> bool:

@@ -68,7 +68,7 @@ class RecordedDetector:
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many recorded detections the drone would send."""
-        return len(self._alone(capture, self._pose(capture)).inside(roi))
+        return len(self._sendable(self._alone(capture, self._pose(capture))).inside(roi))
 
     def camera_views(self, capture: Capture) -> NDArray[np.uint8]:
         """There are none.
@@ -109,7 +109,11 @@ class RecordedDetector:
 
     def _told(self, share: Share) -> Told:
         said = told(share, self._alone(share.capture, self._pose(share.capture)))
-        return replace(said, boxes=sendable(said.boxes)) if self._config.fusion == "late" else said
+        return replace(said, boxes=self._sendable(said.boxes))
+
+    def _sendable(self, boxes: Boxes) -> Boxes:
+        """What of a drone's boxes it sends: in late fusion those that are sure."""
+        return sendable(boxes) if self._config.fusion == "late" else boxes
 
     def _alone(self, capture: Capture, pose: tuple[float, float, float]) -> Boxes:
         local = self._recording.boxes(self._frame(capture), capture.drone)

@@ -58,6 +58,33 @@ def test_late_fusion_sends_what_is_sure() -> None:
     assert sendable(Boxes.placed(rows, (0.0, 0.0, 0.0))).score.tolist() == pytest.approx([0.8, 0.3])
 
 
+def test_late_fusion_pays_for_the_boxes_that_it_sends(scene: SceneModel, fleet: list[Capture]) -> None:
+    late, other = (TorchDetector(scene, Perception(fusion=fusion), seed=1) for fusion in ("late", "disconet"))
+    alone = late.detect([(fleet[1], [])])[0]
+    for roi in (None, (10.0, 20.0, 40.0)):
+        assert late.count_boxes(fleet[1], roi) == len(sendable(alone).inside(roi))
+        assert other.count_boxes(fleet[1], roi) == len(alone.inside(roi)) > late.count_boxes(fleet[1], roi)
+
+
+def test_averaged_late_fusion_knows_who_kept_something_back(scene: SceneModel, fleet: list[Capture]) -> None:
+    """A raw map is whole whatever its directive's budget; a map that was lost on the way says nothing of any place."""
+    late, peer = TorchDetector(scene, Perception(fusion="late", join="average"), seed=1), fleet[1]
+    region, lost = (10.0, 20.0, 30.0), tuple(range(4096))
+    single, whole, raw, aimed, nothing = late.detect(
+        [
+            (fleet[0], []),
+            (fleet[0], shares([peer])),
+            (fleet[0], shares([peer], "raw", rho=0.0)),
+            (fleet[0], [Share(peer, "raw", 0.0, region, 1.0)]),
+            (fleet[0], [Share(peer, "features", 1.0, None, 1.0, lost)]),
+        ]
+    )
+    assert same(raw, whole)
+    assert same(aimed, whole)
+    assert not same(whole, single)
+    assert same(nothing, single)
+
+
 def test_a_late_map_lies_where_its_sender_was_or_is(scene: SceneModel, fleet: list[Capture]) -> None:
     now = fleet[:2]
     then = earlier(fleet[1], 0.5, 10.0)
