@@ -142,7 +142,7 @@ def fused(
         part = say[0].numpy()
     try:
         found = np.asarray(fuse(np.concatenate(agents), part, weight), np.float64)
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # the user's own code can raise anything; torch raises RuntimeError
         raise RecordingError(f"{recording.path}: the fusion failed, {type(error).__name__}: {error}") from error
     if found.ndim != 2 or found.shape[1] != 6 or not np.isfinite(found).all():
         raise RecordingError(

@@ -324,8 +324,8 @@ def write_recording(
         RecordingError: what is to be written is no recording, or a Zarr folder of that name exists.
     """
     path = Path(path)
-    each = [np.asarray(b, np.float64).reshape(-1, 6) for frame in boxes for b in frame]
-    cars = [np.asarray(c, np.float64).reshape(-1, 5) for c in truth]
+    each = [_table(path, f"boxes of frame {f}", b, 6) for f, frame in enumerate(boxes) for b in frame]
+    cars = [_table(path, f"truth of frame {f}", c, 5) for f, c in enumerate(truth)]
     small: dict[str, NDArray[Any]] = {
         "format": np.array(FORMAT), "cell_m": np.array(float(cell_m)), "t_s": np.asarray(t_s), "pose": np.asarray(pose),
         "boxes": np.concatenate([np.zeros((0, 6)), *each]), "boxes_offset": np.cumsum([0, *map(len, each)]),
@@ -333,7 +333,10 @@ def write_recording(
     }  # fmt: skip
     small |= {k: np.asarray(v) for k, v in (("est_pose", est_pose), ("scene", scene)) if v is not None}
     large = {} if confidence is None else {"confidence": np.asarray(confidence, np.float16)}
-    checked(path, small, large)
+    drones = checked(path, small, large).drones
+    for f, frame in enumerate(boxes):  # in sum they are as many as they must be
+        if len(frame) != drones:
+            raise RecordingError(f"{path}: boxes of frame {f} are of {len(frame)} drones, must be of {drones}")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npz":
         if features is not None:
@@ -345,6 +348,14 @@ def write_recording(
         return path
     _to_zarr(path, small, large, features)
     return path
+
+
+def _table(path: Path, name: str, values: ArrayLike, width: int) -> Floats:
+    """Rows of so many numbers; whatever is empty has none."""
+    table = np.asarray(values, np.float64)
+    if table.size and (table.ndim != 2 or table.shape[1] != width):
+        raise RecordingError(f"{path}: {name} have shape {list(table.shape)}, must be [any, {width}]")
+    return table.reshape(-1, width)
 
 
 def _to_zarr(

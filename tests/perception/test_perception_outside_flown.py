@@ -36,6 +36,10 @@ def wrong(agents, takes_part, weight):
 
 def raises(agents, takes_part, weight):
     raise ValueError("no such layer")
+
+def torn(agents, takes_part, weight):
+    import torch
+    return torch.from_numpy(agents) @ torch.zeros(3, 3)
 """
 WHOLE = dict(features=None)
 """Features left out: the radio's own grid is taken."""
@@ -101,6 +105,7 @@ def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Pa
     [
         ("wrong", r"the fusion gave shape \[3, 5\], must be finite boxes \[m, 6\]"),
         ("raises", "the fusion failed, ValueError: no such layer"),
+        ("torn", "the fusion failed, RuntimeError: "),
         ("missing", "no function 'missing' in it"),
     ],
 )
@@ -120,8 +125,8 @@ def test_a_fusion_file_that_does_not_load_is_told(tmp_path: Path) -> None:
         load_fusion(f"{tmp_path / 'g.py'}:f")
 
 
-def flown(tmp_path: Path, **settings: Any) -> RecordedDetector:
-    path = small(tmp_path / "flown.npz", features=None)
+def flown(tmp_path: Path, boxes: Any = None, **settings: Any) -> RecordedDetector:
+    path = small(tmp_path / "flown.npz", features=None, **({} if boxes is None else {"boxes": boxes}))
     config = Perception(detector="recorded", recording=str(path), **settings)
     detector = make_detector(only_target(0, 0), config, 1)
     assert isinstance(detector, RecordedDetector)
@@ -156,6 +161,8 @@ def test_what_was_delivered_decides_what_an_ego_sees(tmp_path: Path) -> None:
     assert len(detector.truth(0.0, a)) == 2
     assert detector.count_boxes(a, None) == 1
     assert detector.count_boxes(a, (50.0, 0.0, 10.0)) == 0
+    unsure = flown(tmp_path, fusion="late", boxes=[[[(8, 0, 4.5, 1.9, 0.1, 0.2)], []]] * 2)
+    assert (len(unsure.detect([(a, [])])[0]), unsure.count_boxes(a, None)) == (1, 0)  # late fusion does not send it
     with pytest.raises(ValueError, match="a recording holds no images"):
         detector.camera_views(a)
 

@@ -176,6 +176,21 @@ def test_writing_zarr_is_whole_or_not_at_all(tmp_path: Path) -> None:
         small(tmp_path / "r")
 
 
+def test_rows_of_another_width_or_of_another_drone_are_not_written(tmp_path: Path) -> None:
+    """Six rows of seven numbers are as many numbers as seven of six; one drone's boxes and three are as many as two and two."""
+    box, cars = np.array([(8, 0, 4.5, 1.9, 0.1, 0.9)]), np.ones((5, 6))
+    for changes, told in (
+        (dict(boxes=[[box, np.full((6, 7), 0.5)], [box, box]]), "boxes of frame 0 have shape [6, 7], must be [any, 6]"),
+        (dict(boxes=[[box, box], [box, box[0]]]), "boxes of frame 1 have shape [6], must be [any, 6]"),
+        (dict(truth=[cars[:, :5], cars]), "truth of frame 1 have shape [5, 6], must be [any, 5]"),
+        (dict(boxes=[[box], [box, box, box]]), "boxes of frame 0 are of 1 drones, must be of 2"),
+    ):
+        with pytest.raises(RecordingError, match=f"^{re.escape(f'{tmp_path}/x.npz: {told}')}$"):
+            small(tmp_path / "x.npz", features=None, **changes)
+    assert not list(tmp_path.iterdir())
+    small(tmp_path / "x.npz", features=None, boxes=[[box, []], [[], box]])
+
+
 def test_grids_that_cells_do_not_divide_are_told(tmp_path: Path) -> None:
     rec = open_recording(small(tmp_path / "x.npz", features=np.zeros((2, 2, 3, 50, 50))))
     with pytest.raises(RecordingError, match="features has a grid of 50 × 50, must be square and a multiple of 64"):
