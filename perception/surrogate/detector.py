@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from perception import budget
 from perception.errors import InputError
 from perception.geometry import FULL
 from perception.joining import Heard, joined_many, told
@@ -129,9 +130,16 @@ class SurrogateDetector:
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
-        x, y, radius = (*capture.position_m[:2], 2 * FULL.half_extent_m / np.sqrt(np.pi)) if roi is None else roi
-        cars = self._scene.cars_near(capture.t_s, x, y, min(radius, FULL.half_extent_m * 1.13))
-        part = min(1.0, np.pi * radius**2 / (2 * FULL.half_extent_m) ** 2)
+        half = FULL.half_extent_m
+        x, y, radius = (*capture.position_m[:2], 2 * half / np.sqrt(np.pi)) if roi is None else roi
+        if roi is not None and np.hypot(x - capture.position_m[0], y - capture.position_m[1]) + radius > half:
+            # a disc that leaves the drone's square, or may: what lies beyond is not seen
+            looks = self._eyes.look(Fleet.of([capture]), bare=True)
+            cars = int(np.count_nonzero(np.hypot(*(looks.world_m - (x, y)).T) <= radius))
+            part = budget.cells_sent(1.0, roi, *capture.est_pose) / budget.CELLS
+        else:
+            cars = self._scene.cars_near(capture.t_s, x, y, radius)
+            part = np.pi * radius**2 / (2 * half) ** 2
         return round(cars * self._found + part * self._alarms_alone)
 
     def camera_views(self, capture: Capture) -> NDArray[np.uint8]:

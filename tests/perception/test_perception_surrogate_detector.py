@@ -243,6 +243,19 @@ def test_counts_grow_with_the_disc_and_shrink_with_the_threshold(
     assert SurrogateDetector(scene, Perception(score_threshold=0.7), seed=3).count_boxes(ego, None) < counts[2]
 
 
+def test_a_disc_beyond_the_square_holds_no_boxes_to_send(detector: SurrogateDetector) -> None:
+    """A drone tells nothing of what it does not see: half of a disc on the square's edge, nothing of one beyond it."""
+    ego, radius = capture(10.0, 20.0, yaw=0.3), 30.0
+    ahead = np.array([np.cos(0.3), np.sin(0.3)])
+    inside, edge, beyond = (
+        detector.count_boxes(ego, (*(ego.position_m[:2] + far * ahead), radius)) for far in (70.0, 102.4, 140.0)
+    )
+    assert 0 < edge < inside
+    assert beyond == 0
+    whole = detector.count_boxes(ego, (10.0, 20.0, 500.0))
+    assert whole == pytest.approx(detector.count_boxes(ego, None), rel=0.15)  # a disc as large as the square
+
+
 def test_it_renders_nothing(detector: SurrogateDetector) -> None:
     with pytest.raises(
         ValueError, match=r"^the surrogate renders nothing: fly with perception.detector = torch to see camera views$"
