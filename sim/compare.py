@@ -90,7 +90,7 @@ def _gain(record: SortieRecord, first: SortieRecord | None) -> dict[str, tuple[f
         return gains
     for name, mission in (("full_scene", False), ("mission", True)):
         theirs, ours, groups = pair_up([first], [record], mission=mission)
-        if groups:
+        if all(any(m.truths for m in arm) for arm in (theirs, ours)):  # where there was nothing to find there is no AP
             d = bootstrap(theirs, ours, groups)
             gains[name] = (d.delta, d.low, d.high)
     return gains

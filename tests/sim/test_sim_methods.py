@@ -25,6 +25,21 @@ def test_every_method_flies_in_a_comparison() -> None:
     assert sent["who2com"] < sent["disconet"]
 
 
+@pytest.mark.filterwarnings("error")
+def test_where_there_is_nothing_to_find_there_is_no_gain() -> None:
+    """Not a gain of NaN, which JSON has no word for."""
+    bare = [
+        "perception.detector=surrogate",
+        "duration_s=2",
+        "mission.target=null",
+        "mission.phases=[{at_s: 0, phase: search}]",
+    ]
+    bare += [f"perception.scene.{name}=0" for name in ("parked_density", "moving_cars_per_km")]
+    rows = compare([(name, example(f"policy.name={name}", "policy.params={}", *bare)) for name in ("silence", "all-4")])
+    assert [r.outcome["ap50"]["scored_fusions"] for r in rows] == [20, 20]
+    assert [r.gain for r in rows] == [{"full_scene": None, "mission": None}] * 2
+
+
 def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
     plain, asking = (
         run_sortie(example("policy.name=where2comm", f"policy.params={{rho: 0.02, rounds: {rounds}}}"))
