@@ -6,7 +6,7 @@ A sortie is flown by the surrogate, and again with the same traffic and the torc
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -149,17 +149,21 @@ def means(levels: Sequence[Level]) -> Iterator[Mean]:
     """Of every policy, then of every policy against every earlier one."""
     policies = list(dict.fromkeys(v.policy for v in levels))
     for region in REGIONS:
-        ap = {p: _table([v for v in levels if (v.policy, v.region) == (p, region)]) for p in policies}
+        ap = {p: {v.context: v for v in levels if (v.policy, v.region) == (p, region)} for p in policies}
         for p in policies:
-            if len(ap[p]):
-                yield _mean(p, region, ap[p])
+            if ap[p]:
+                yield _mean(p, region, _table(ap[p].values()))
         for k, p in enumerate(policies):
             for earlier in policies[:k]:
-                if len(ap[p]):
-                    yield _mean(f"{p} − {earlier}", region, ap[p] - ap[earlier])
+                both = [
+                    c for c in ap[p] if c in ap[earlier]
+                ]  # drones that look from elsewhere may find none to look for
+                if both:
+                    its, theirs = (_table([ap[name][c] for c in both]) for name in (p, earlier))
+                    yield _mean(f"{p} − {earlier}", region, its - theirs)
 
 
-def _table(levels: Sequence[Level]) -> np.ndarray:
+def _table(levels: Iterable[Level]) -> np.ndarray:
     return np.array([(v.torch, v.surrogate) for v in levels])
 
 

@@ -77,7 +77,7 @@ class Evaluation:
         Raises:
             ValueError: below the floor, where boxes were not kept.
         """
-        if tau < self.settings.floor:
+        if not tau >= self.settings.floor:  # NaN is neither
             raise ValueError(f"tau is {tau}, must be at least the floor {self.settings.floor}")
         cut = {key: [m.at(tau) for m in several] for key, several in self.units.items()}
         return replace(self, units=cut, settings=replace(self.settings, floor=tau))

@@ -152,6 +152,8 @@ def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluati
             assert one.hit.tolist() == other.hit.tolist()
             assert one.score.tolist() == other.score.tolist()
     assert cut.ap(FULL_SHARING) < whole.ap(FULL_SHARING)
+    with pytest.raises(ValueError, match=r"tau is nan, must be at least the floor 0.01"):
+        whole.at(float("nan"))
     with pytest.raises(ValueError, match=r"tau is 0.2, must be at least the floor 0.3"):
         cut.at(0.2)
 

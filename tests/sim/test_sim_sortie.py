@@ -302,7 +302,9 @@ def test_a_switch_is_counted_on_every_link_that_it_concerns() -> None:
     entries = [t for t in o["transitions"] if t["from"] == "nothing"]
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
     assert len(entries) < sum(len(t["peers"]) for t in entries) == links
-    assert o["switches"] == pytest.approx(sum(len(t["peers"]) for t in o["transitions"]) / links / (o["duration_s"] / 60))
+    assert o["switches"] == pytest.approx(
+        sum(len(t["peers"]) for t in o["transitions"]) / links / (o["duration_s"] / 60)
+    )
 
 
 def test_duty_cycle_rests_the_computer() -> None:
