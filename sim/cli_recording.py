@@ -41,9 +41,12 @@ def evaluate(
 ) -> None:
     """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
     from perception.harness.condition import Condition
+    from perception.harness.evaluation import FLOOR
     from perception.outside.instrument import evaluate_recording
 
     try:
+        if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
+            raise ValueError(f"tau is {tau:g}, must be {FLOOR:g} to 1")
         asked = None if conditions is None else [Condition.parse(label) for label in conditions.split()]
         with bars() as bar:
             found = evaluate_recording(

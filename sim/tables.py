@@ -125,8 +125,8 @@ def comparison_markdown(rows: Sequence[Compared], command: str) -> str:
     """The same for a README, between its markers, with why the figures differ."""
     first = rows[0].outcome
     head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, seed {first['seed']}"
-    rate_hz = first["ap50"]["sample_rate_hz"]
-    if rate_hz is not None:
+    if first["ap50"]["scored_fusions"]:
+        rate_hz = first["ap50"]["sample_rate_hz"]
         head += f", accuracy scored at {rate_hz:g} Hz, gains over {rows[0].policy} in AP points, paired, 95 %"
     lines = [f"{head}.", "", f"| | {' | '.join(r.policy for r in rows)} |", f"|---|{'---|' * len(rows)}"]
     lines += [f"| {name.strip()} | {' | '.join(cells)} |" for name, cells in _side_by_side(rows).items()]

@@ -26,6 +26,9 @@ class Bootstrap:
         disc: which of the evaluation's regions answers for the mission.
         by: what is resampled: frames, or whole scenes.
         draws: resamples, and as many random splits into halves.
+
+    Raises:
+        ValueError: an evaluation in another convention than `rotated`, which resamples know nothing of.
     """
 
     def __init__(
@@ -39,6 +42,8 @@ class Bootstrap:
         draws: int = DRAWS,
         seed: int = 0,
     ) -> None:
+        if (convention := evaluation.settings.convention) != "rotated":
+            raise ValueError(f"the evaluation's convention is {convention!r}, must be 'rotated' to be resampled")
         self._evaluation, self._unsent, self._cells_by = evaluation, unsent, cells_by
         self._disc, self._by = disc, by
         self._draws, self._seed = draws, seed

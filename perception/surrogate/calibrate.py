@@ -48,8 +48,10 @@ def calibrate(
         weights: the detector's; None takes the shipped ones.
 
     Raises:
-        ValueError: weights that do not fit, or too few scenes.
+        ValueError: weights that do not fit, too few scenes, or an `out` that ends as its card does.
     """
+    if out.suffix == ".md":
+        raise ValueError(f"out is {out}, must not end in .md, as its card does")
     if scenes < 2 or held_out < 2:
         raise ValueError(f"{scenes} scenes and {held_out} held out, must be at least 2 each")
     tell = progress or (lambda stage, done, of: None)

@@ -14,6 +14,7 @@ from perception.harness import selection
 from perception.harness.condition import FULL_SHARING, SINGLE, Condition
 from perception.harness.contract import Exchange
 from perception.harness.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
+from perception.harness.scores import Bootstrap
 from perception.types import Boxes
 
 BEST = Condition(0.1, "best-2", roi=True)
@@ -139,6 +140,15 @@ def test_bytes_of_a_fleet_frame(whole: Evaluation) -> None:
     assert whole.payload_bytes[BEST].tolist() == [1638 * 160] * 25
     assert whole.index_bytes[BEST].tolist() == [2 * 512] * 25
     assert whole.cells[SINGLE].tolist() == [0] * 25
+
+
+def test_what_is_resampled_is_in_our_convention(frames: MadeFrames) -> None:
+    """Intervals of another AP than the one beside them would look like any others."""
+    found = evaluate(MadeInstrument(), frames, [FULL_SHARING], convention="uav3d")
+    with pytest.raises(
+        ValueError, match=r"^the evaluation's convention is 'uav3d', must be 'rotated' to be resampled$"
+    ):
+        Bootstrap(found, "zero")
 
 
 def test_more_cells_find_more(whole: Evaluation) -> None:

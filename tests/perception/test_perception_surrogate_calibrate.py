@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from perception.surrogate import collect as collecting
+from perception.surrogate.calibrate import calibrate
 from perception.surrogate.collect import Asked, captures_of, collect, read
 from perception.surrogate.features import square
 from perception.surrogate.judge import IN_DISC, judge
@@ -110,6 +112,12 @@ class Told:
 
     def ranks(self, capture: Capture) -> np.ndarray:
         return np.full((2, 64, 64), capture.drone, np.float32)
+
+
+def test_a_calibration_that_its_card_would_replace_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+    out = tmp_path / "mine.md"
+    with pytest.raises(ValueError, match=f"^{re.escape(f'out is {out}, must not end in .md, as its card does')}$"):
+        calibrate(out, work=tmp_path, scenes=2, held_out=2)
 
 
 def test_answers_are_kept_and_not_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -297,6 +297,7 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
     assert readme.endswith("<!-- compare:end -->\n\nSee below.\n")
     assert "| | worked | all-4(rho=0.1) | silence |" in readme
     assert "- **silence**: sent nothing" in readme
+    assert "accuracy" not in readme  # no detector flew
     assert "old" not in readme
     assert "sent nothing; every drone saw with its own eyes only" in done.stdout
     kept = json.loads((tmp_path / "c.json").read_text())

@@ -46,6 +46,15 @@ def test_wrong_questions_are_told(tmp_path: Path) -> None:
     assert "condition is 'most@2', must be like" in str(done.exception)
 
 
+@pytest.mark.parametrize("tau", ["0.001", "nan", "1.5"])
+def test_a_threshold_that_cannot_be_is_told_before_anything_is_evaluated(
+    tau: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("perception.outside.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated"))
+    done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--tau", tau])
+    assert str(done.exception) == f"tau is {tau}, must be 0.01 to 1"
+
+
 def test_sharing_gains_over_silence_on_a_recording(tmp_path: Path) -> None:
     """The made model sees 45 m far, so that peers know cars that the ego does not; and the same flight twice is the same."""
     path = record_flight(example(*SHORT), tmp_path / "flight.npz", features=False)
