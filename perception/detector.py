@@ -99,7 +99,7 @@ class TorchDetector:
     Args:
         scene: what there is to see.
         config: the scenario's `perception` section.
-        seed: the sortie's seed (sensor noise follows from it).
+        seed, replication: the sortie's (sensor noise follows from them).
         weights: a safetensors file; None takes the one shipped for `perception.fusion`.
 
     Raises:
@@ -110,7 +110,9 @@ class TorchDetector:
     are handed in, and what a task waits for is settled, and handed in, before it is. The numbers do not depend on it.
     """
 
-    def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None) -> None:
+    def __init__(
+        self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
+    ) -> None:
         self._scene, self._config = scene, config
         self._fusion = FUSIONS[config.fusion]
         path = shipped(config.fusion) if weights is None else weights
@@ -125,7 +127,7 @@ class TorchDetector:
             )
         keep_freed()
         self._net = folded(net)
-        self._renderer = Renderer(scene, seed)
+        self._renderer = Renderer(scene, seed, replication)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
         self._pool = ThreadPoolExecutor(
             torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)

@@ -85,7 +85,8 @@ def make_detector(scene: SceneModel, config: Perception, seed: int, replication:
 def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
     from perception.detector import TorchDetector
 
-    return TorchDetector(scene, config, seed=seed, weights=None if config.weights is None else Path(config.weights))
+    weights = None if config.weights is None else Path(config.weights)
+    return TorchDetector(scene, config, seed, weights, replication)
 
 
 def _recorded(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:

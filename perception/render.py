@@ -156,9 +156,9 @@ def _grown(blocks: FloatMap, reach: int) -> FloatMap:
 class Renderer:
     """Renders captures of one scene; keeps the rasters of the last window."""
 
-    def __init__(self, scene: SceneModel, seed: int) -> None:
+    def __init__(self, scene: SceneModel, seed: int, replication: int = 0) -> None:
         self.scene = scene
-        self.seed = seed
+        self.key = seed, replication
         self._window: Window | None = None
         self._span: tuple[range, range] = (range(0), range(0))
 
@@ -185,7 +185,7 @@ class Renderer:
                     eye = tuple(np.float32(v) for v in (*window.pixel(*c.position_m[:2]), c.position_m[2]))
                     top_m = min(window.top_m, c.position_m[2] - 1.0)
                     rasters = (window.height, window.coarse, window.far, window.colour)
-                    see(_RAYS, turn, eye, RES, top_m, *rasters, gain, _noise(self.seed, c), out[i].reshape(-1, 3))
+                    see(_RAYS, turn, eye, RES, top_m, *rasters, gain, _noise(*self.key, c), out[i].reshape(-1, 3))
 
                 for _ in each(one, here):
                     pass
@@ -208,7 +208,7 @@ class Renderer:
         return self._window
 
 
-def _noise(seed: int, capture: Capture) -> Bytes:
+def _noise(seed: int, replication: int, capture: Capture) -> Bytes:
     """Uniform sensor noise, uint8 [rays, 3] of 0 … 15 levels (8 is none), keyed by drone and millisecond."""
-    rng = stream(seed, 0, (capture.drone, max(round(capture.t_s * 1e3), 0)), "camera.noise")
+    rng = stream(seed, replication, (capture.drone, max(round(capture.t_s * 1e3), 0)), "camera.noise")
     return np.asarray(np.frombuffer(rng.bytes(_RAYS.size), np.uint8) & np.uint8(15)).reshape(_RAYS.shape)

@@ -116,9 +116,9 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
     last: list[tuple[object, Detector]] = []
 
     def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-        asked = scene.made_of, config, seed
+        asked = scene.made_of, config, seed, replication
         if not last or last[0][0] != asked:
-            last[:] = [(asked, TorchDetector(scene, config, seed, weights))]
+            last[:] = [(asked, TorchDetector(scene, config, seed, weights, replication))]
         return Asked(last[0][1], ours(scene, config, seed, replication))
 
     return make

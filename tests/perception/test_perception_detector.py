@@ -12,6 +12,7 @@ from perception_examples import capture, cross
 from perception import render
 from perception.ap import match
 from perception.detector import TorchDetector, ground_truth
+from perception.detectors import make_detector
 from perception.joining import told
 from perception.scene import SceneModel
 from perception.types import Boxes, Capture, Share
@@ -136,6 +137,18 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
 
 
+def test_a_replication_has_camera_noise_of_its_own(
+    scene: SceneModel, detector: TorchDetector, fleet: list[Capture]
+) -> None:
+    other = make_detector(scene, Perception(), 1, 1)
+    assert other is not None
+    first, second = (d.camera_views(fleet[0]).astype(int) for d in (detector, other))
+    assert 0 < np.abs(first - second).max() <= 15  # the scene is the same
+    again = make_detector(scene, Perception(), 1, 1)
+    assert again is not None
+    assert np.array_equal(again.camera_views(fleet[0]), second)
+
+
 def test_a_late_share_is_rendered_as_it_was(detector: TorchDetector, fleet: list[Capture]) -> None:
     now = [(fleet[0], [share(c) for c in fleet[1:]])]
     late = [(fleet[0], [share(c._replace(t_s=c.t_s - 2.0)) for c in fleet[1:]])]
@@ -184,10 +197,10 @@ def test_a_moment_that_fails_leaves_nothing_behind(
     whole = [len(b) for b in TorchDetector(scene, Perception(), seed=1).detect(jobs)]
     noise = render._noise
 
-    def fails(seed: int, capture: Capture) -> np.ndarray:
+    def fails(seed: int, replication: int, capture: Capture) -> np.ndarray:
         if capture is fleet[0]:
             raise MemoryError("planted")
-        return noise(seed, capture)
+        return noise(seed, replication, capture)
 
     monkeypatch.setattr(render, "_noise", fails)
     with pytest.raises(MemoryError, match="planted"):
