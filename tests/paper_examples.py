@@ -60,7 +60,11 @@ def papers_world(condition: Condition, region: str) -> float:
     return curve[condition.rho] if condition.rule in ("all", "none") else two[condition.rho]
 
 
-ELSEWHERE = {"descriptor_bytes": Measured(180.0), "policy_ms_p50": Measured(0.08, note="a machine")}
+ELSEWHERE = {
+    "descriptor_bytes": Measured(180.0),
+    "policy_ms_p50": Measured(0.08, note="a machine"),
+    "x86_policy_ms_p50": Measured(0.08, note="a machine"),
+}
 FACTS = {
     "command": "sortie paper", "frames": 3, "scenes": 3, "seed": 0, "weights": "made", "fingerprint": "0123456789abcdef",
     "cells_by": "confidence", "tau": 0.1, "draws": DRAWS, "version": "0", "cpu_s": 1.0, "machine": "a machine",

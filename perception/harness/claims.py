@@ -248,7 +248,7 @@ OVERHEAD = (
     Claim("plane.deadline", "overhead, 7", "The 100 ms deadline over a decision's median", "×", Paper(1000.0, digits=0), Elsewhere("deadline_over_p50"), verdict.at_least),
     Claim("plane.core", "overhead, 8", "Of one core, the ROS 2 prototype uses", "%", Paper(9.0, digits=0), Elsewhere("ros2_core_percent"), verdict.at_most),
     Claim("plane.x86.data", "overhead, 9", "Data plane in an x86 container", "MB/s", Paper(62.0, digits=0), Elsewhere("x86_container_mb_per_s"), verdict.same_order),
-    Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("policy_ms_p50"), verdict.at_most),
+    Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("x86_policy_ms_p50"), verdict.at_most),
     Claim("plane.roi", "overhead, 11", "A phase change shrinks feature payloads", "×", Paper(10.0, digits=0), Elsewhere("roi_shrinks"), verdict.same_order, headline=True),
     Claim("plane.battery", "overhead, 12", "Battery decay moves agent 1 down the rate ladder, rungs met", "of 3", Paper(3.0, digits=0), Elsewhere("battery_rungs"), verdict.exact),
     Claim("plane.link", "overhead, 12", "A link drop at 60 s leaves agent 2 with detections, after", "s", Paper(0.1), Elsewhere("link_drop_s"), verdict.at_most, headline=True),

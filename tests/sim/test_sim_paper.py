@@ -101,7 +101,9 @@ def test_a_file_that_no_live_flight_wrote_is_named(text: str, tmp_path: Path) ->
         plane.measured_live(tmp_path / "gone.json")
 
 
-def test_latency_is_of_a_tick_of_the_whole_fleet() -> None:
+@pytest.mark.parametrize(("machine", "answers"), [("x86_64", True), ("AMD64", True), ("aarch64", False)])
+def test_latency_is_of_a_tick_of_the_whole_fleet(machine: str, answers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plane.platform, "machine", lambda: machine)
     scenario, views = example(), []
 
     def watched(view):  # type: ignore[no-untyped-def]
@@ -113,6 +115,8 @@ def test_latency_is_of_a_tick_of_the_whole_fleet() -> None:
     assert 0 < got["policy_ms_p50"].value <= got["policy_ms_p99"].value
     assert f"{len(views) // 5} ticks" in got["policy_ms_p50"].note
     assert got["deadline_over_p50"].value == pytest.approx(100 / got["policy_ms_p50"].value)
+    assert got.get("x86_policy_ms_p50") == (got["policy_ms_p50"] if answers else None)
+    assert set(got) <= {c.measure.name for c in OVERHEAD if isinstance(c.measure, Elsewhere)}
 
 
 VARIED = [
