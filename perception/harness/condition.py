@@ -98,7 +98,7 @@ class Condition:
         """
         others = drones - 1
         out = self
-        if out.k == others:
+        if out.k and out.k == others:
             out = replace(out, peers=f"all-{others}")
         if out.k and out.rho * others >= out.k:
             out = replace(out, allocation="uniform", cells_by="confidence", roi=False)

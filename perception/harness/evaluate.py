@@ -133,9 +133,9 @@ def frame_keys(frames: FleetFrames) -> list[tuple[int, int]]:
 
 
 def frame_hash(frames: FleetFrames, f: int, key: tuple[int, int]) -> str:
-    """A frame by its content and its key; `images` count where there are any."""
+    """A frame by its content and its key; `images` count where there are any, and which of a recording it is (`index`)."""
     digest = hashlib.blake2b(repr(key).encode(), digest_size=16)
-    for name in ("true_pose", "est_pose", "cars", "images"):
+    for name in ("true_pose", "est_pose", "cars", "images", "index"):
         if hasattr(frames, name):
             digest.update(np.ascontiguousarray(getattr(frames, name)[f]).tobytes())
     return digest.hexdigest()

@@ -15,6 +15,7 @@ from recording_examples import small
 from perception.detectors import DETECTORS, make_detector
 from perception.harness.condition import SINGLE, Condition
 from perception.harness.contract import Exchange
+from perception.harness.evaluate import evaluate
 from perception.outside.detector import RecordedDetector
 from perception.outside.exchange import load_fusion
 from perception.outside.instrument import RecordedInstrument, evaluate_recording, frames_of
@@ -85,6 +86,26 @@ def test_the_harness_evaluates_a_recording_with_its_own_bytes(tmp_path: Path) ->
     assert found.payload_bytes[full].tolist() == [4096 * 3 * 2] * 4
     assert found.index_bytes[few].tolist() == [2] * 4
     assert evaluate_recording(path).conditions[-1] == full
+
+
+def test_frames_that_stand_still_are_told_apart_where_they_are_kept(tmp_path: Path) -> None:
+    """Of two frames with the same poses and cars the second finds nothing; each is evaluated alone, into one store."""
+    pose, car = np.zeros((2, 1, 3)), np.array([(8, 0, 4.5, 1.9, 0.1)])
+    boxes = [[np.append(car, [[0.9]], axis=1)], [np.zeros((0, 6))]]
+    rec = open_recording(small(tmp_path / "r.npz", pose=pose, boxes=boxes, truth=[car, car], features=None))
+    aps = [
+        evaluate(RecordedInstrument(rec), frames_of(rec, [f]), [SINGLE], egos=1, store=tmp_path / "store").ap(SINGLE)
+        for f in (0, 1, 0)
+    ]
+    assert aps == [1.0, 0.0, 1.0]
+
+
+def test_one_drone_alone_is_evaluated(tmp_path: Path) -> None:
+    car = np.array([(8, 0, 4.5, 1.9, 0.1)])
+    box = np.append(car, [[0.9]], axis=1)
+    one = dict(pose=np.zeros((2, 1, 3)), boxes=[[box], [box]], truth=[car, car], features=None)
+    found = evaluate_recording(small(tmp_path / "r.npz", **one))
+    assert (found.conditions, found.ap(SINGLE)) == ((SINGLE,), 1.0)
 
 
 def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Path, fusion: str) -> None:
