@@ -155,9 +155,8 @@ def means(levels: Sequence[Level]) -> Iterator[Mean]:
                 yield _mean(p, region, _table(ap[p].values()))
         for k, p in enumerate(policies):
             for earlier in policies[:k]:
-                both = [
-                    c for c in ap[p] if c in ap[earlier]
-                ]  # drones that look from elsewhere may find none to look for
+                # drones that look from elsewhere may find none to look for
+                both = [c for c in ap[p] if c in ap[earlier]]
                 if both:
                     its, theirs = (_table([ap[name][c] for c in both]) for name in (p, earlier))
                     yield _mean(f"{p} − {earlier}", region, its - theirs)
