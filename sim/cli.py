@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from fleet.motion import MotionError
 from fleet.wire import DescriptorTooLarge
@@ -45,7 +46,20 @@ from sim.named import policy_overrides
 from sim.sortie import VERSION, run_sortie
 from sim.watchers import Watcher, Watchers
 
+
+class _Commands(TyperGroup):
+    """Says that a command was interrupted, before typer ends it without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            err.print("interrupted; what was not finished was not written")
+            raise typer.Exit(130) from None
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -69,15 +83,12 @@ PolicyOption = Annotated[
 
 
 def main() -> None:
-    """Entry point of the `sortie` command."""
+    """The `sortie` command, once it is imported (sim.__main__)."""
     try:
         app()
     except USER_ERRORS as error:
         err.print(f"[red]error:[/red] {_plain(error)}", soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        err.print("interrupted; nothing was written")
-        sys.exit(130)
 
 
 def _plain(error: BaseException) -> str:
