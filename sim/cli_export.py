@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +15,11 @@ from sim.folders import RunError, ensure_folder
 BAG, TLOG = "bag", "sortie.tlog"
 BEGIN = "2026-01-01T00:00:00"
 """When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
+FIRST, LAST = datetime(1970, 1, 1, tzinfo=UTC), datetime(2038, 1, 1, tzinfo=UTC)
+"""What a bag's stamps can tell, whole seconds in 32 bits, and any sortie that begins before the end besides."""
+
+SIGNED_FROM_US = (datetime(2015, 1, 1, tzinfo=UTC) - FIRST) // timedelta(microseconds=1)
+"""Where the time in MAVLink's signatures begins."""
 
 
 def export(
@@ -40,22 +45,27 @@ def export(
         raise typer.BadParameter("name one format: --mcap or --tlog")
     if key is not None and not tlog:
         raise typer.BadParameter("--key signs --tlog alone")
-    began_s = int(moment(begin).timestamp())
+    if origin is not None and not tlog:
+        raise typer.BadParameter("--origin places --tlog alone: a bag is in metres")
+    began_us = (moment(begin) - FIRST) // timedelta(microseconds=1)
     if tlog:
         from sim.telemetry import ORIGIN, parse_origin, read_key, save_tlog
 
+        if key is not None and began_us < SIGNED_FROM_US:
+            raise RunError(f"begin is {begin!r}, must be from 2015 on with --key: signatures count from there")
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
         where = ORIGIN if origin is None else parse_origin(origin)
-        frames = save_tlog(rundir.load(run), path, began_s * 1_000_000, where, secret)
+        frames = save_tlog(rundir.load(run), path, began_us, where, secret)
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
         return
     path = out_path or run / BAG
-    ensure_folder(path, "metadata.yaml", "bag")
+    path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
+    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", ".DS_Store"})
     record = rundir.load(run)
     try:
         from sim.bag import write_bag
 
-        counts = write_bag(record, path, began_s * 1_000_000_000)
+        counts = write_bag(record, path, began_us * 1000)
     except ImportError as error:
         raise RunError("rosbags is missing: pip install 'sortie-sim[ros2]'") from error
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)
@@ -65,10 +75,13 @@ def moment(text: str) -> datetime:
     """A time as ISO 8601; UTC where it names no zone.
 
     Raises:
-        RunError: it is none, naming it.
+        RunError: it is none, or one that stamps cannot tell, naming it.
     """
     try:
         when = datetime.fromisoformat(text)
     except ValueError:
         raise RunError(f"begin is {text!r}, must be a time as in {BEGIN}") from None
-    return when if when.tzinfo is not None else when.replace(tzinfo=UTC)
+    when = when if when.tzinfo is not None else when.replace(tzinfo=UTC)
+    if not FIRST <= when < LAST:
+        raise RunError(f"begin is {text!r}, must be from {FIRST.year} on and before {LAST.year}")
+    return when

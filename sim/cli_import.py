@@ -20,6 +20,8 @@ from sim.folders import RunError, ensure_folder, replacing, write_text
 Array = np.ndarray[Any, Any]
 
 TRACE, SCENARIO = "trace.parquet", "scenario.yaml"
+MADE = "made by `sortie import`"
+"""By which its scenarios are known."""
 FULL_CELL_V = 4.25
 LONGEST_S = 7200.0
 LOWEST_M = 2.0
@@ -48,7 +50,9 @@ def import_log(
     from fleet.logtrace import context_trace, write_trace
 
     folder = out_dir or Path(slug(log))
-    ensure_folder(folder, SCENARIO, "flight")
+    ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO, ".DS_Store"})
+    if (folder / SCENARIO).is_file() and MADE not in (folder / SCENARIO).read_text("utf-8", "replace"):
+        raise RunError(f"{folder}: its {SCENARIO} is none that sortie import wrote; choose another folder or move it")
     with user_errors():
         flight = read_log(log)
         until = flight.duration_s if until_s is None else until_s
@@ -111,7 +115,7 @@ def scenario_text(
             battery.append(f"capacity_wh: {capacity_ah * cells * MEAN_CELL_V:.1f}")
     if "soc" in columns:
         battery.append("landing_soc: 0")
-    return f"""# A real flight, made by `sortie import` from the {source}.
+    return f"""# A real flight, {MADE} from the {source}.
 # The trace holds {told(columns)}; what it lacks is the models'.
 
 name: {name}

@@ -95,6 +95,25 @@ def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "short.bin"]
 
 
+def test_a_flight_replaces_a_flight_and_no_file_that_it_did_not_write(tmp_path: Path) -> None:
+    log, out = tmp_path / "short.bin", tmp_path / "out"
+    log.write_bytes(examples.dataflash())
+    command = ["import", str(log), "--out", str(out)]
+    for _ in range(2):
+        assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
+    (out / "run").mkdir()
+    (out / "notes.txt").write_text("keep")
+    with pytest.raises(RunError, match=r"out: holds notes\.txt and 1 more, which no flight wrote"):
+        CliRunner().invoke(app, command, catch_exceptions=False)
+    assert (out / "notes.txt").read_text() == "keep"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "scenario.yaml").write_text("name: mine\n")
+    with pytest.raises(RunError, match=r"mine: its scenario\.yaml is none that sortie import wrote"):
+        CliRunner().invoke(app, ["import", str(log), "--out", str(mine)], catch_exceptions=False)
+    assert (mine / "scenario.yaml").read_text() == "name: mine\n"
+
+
 @needs_logs
 @pytest.mark.parametrize(
     ("name", "seconds", "lacks"),

@@ -116,6 +116,16 @@ def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path
     assert lines[0]["data"]["lat"] == pytest.approx(52.5e7, abs=5_000)
 
 
+def test_a_log_is_signed_from_2015_on(record: SortieRecord, tmp_path: Path) -> None:
+    run, key = tmp_path / "run", tmp_path / "key"
+    rundir.save(record, run)
+    key.write_text("ab" * 32)
+    command = ["export", str(run), "--tlog", "--key", str(key), "--begin"]
+    said = CliRunner().invoke(app, [*command, "2014-12-31"])
+    assert str(said.exception).startswith("begin is '2014-12-31', must be from 2015 on with --key")
+    assert CliRunner().invoke(app, [*command, "2015-01-01"]).exit_code == 0
+
+
 # --- live ------------------------------------------------------------------------------------------
 
 

@@ -177,10 +177,49 @@ def test_the_command_writes_the_bag_into_the_run(record: SortieRecord, tmp_path:
     assert first.log_time == 1_795_248_000_000_000_000  # 2026-11-21 08:00 UTC
 
 
+def test_a_bag_begins_at_a_fraction_of_a_second_too(record: SortieRecord, tmp_path: Path) -> None:
+    rundir.save(record, tmp_path / "run")
+    arguments = ["export", str(tmp_path / "run"), "--mcap", "--begin", "2026-11-21T08:00:00.25"]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    with (tmp_path / "run" / "bag" / "bag.mcap").open("rb") as file:
+        _, _, first = next(iter(make_reader(file).iter_messages()))
+    assert first.log_time == 1_795_248_000_250_000_000
+
+
+def test_a_bag_may_be_the_folder_one_stands_in(
+    record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rundir.save(record, tmp_path / "run")
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    said = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--mcap", "--out", "."])
+    assert said.exit_code == 0, said.exception
+    assert sorted(p.name for p in here.iterdir()) == ["here.mcap", "metadata.yaml"]
+
+
+def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_path: Path) -> None:
+    rundir.save(record, tmp_path / "run")
+    mine = tmp_path / "mine"  # a bag of somebody else's, with a note
+    mine.mkdir()
+    for name in ("metadata.yaml", "mine_0.mcap", "notes.txt"):
+        (mine / name).write_text(name)
+    said = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--mcap", "--out", str(mine)])
+    assert str(said.exception) == (
+        f"{mine}: holds mine_0.mcap and 1 more, which no bag wrote; choose another folder or move it"
+    )
+    assert {p.name: p.read_text() for p in mine.iterdir()} == {
+        name: name for name in ("metadata.yaml", "mine_0.mcap", "notes.txt")
+    }
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--mcap", "--begin", "noon"], r"begin is 'noon', must be a time as in 2026-01-01T00:00:00"),
+        (["--mcap", "--begin", "1969-12-31"], r"begin is '1969-12-31', must be from 1970 on and before 2038"),
+        (["--tlog", "--begin", "1969-12-31T23:59+00:00"], r"must be from 1970 on and before 2038"),
+        (["--mcap", "--begin", "2038-01-01"], r"begin is '2038-01-01', must be from 1970 on and before 2038"),
         (["--mcap", "--out", "."], r"holds files but no metadata\.yaml"),
     ],
 )
@@ -192,3 +231,4 @@ def test_what_a_user_gets_wrong_is_named(
     said = CliRunner().invoke(app, ["export", "run", *arguments])
     assert re.search(message, str(said.exception))
     assert CliRunner().invoke(app, ["export", "run"]).exit_code == 2  # no format named
+    assert CliRunner().invoke(app, ["export", "run", "--mcap", "--origin", "1,2"]).exit_code == 2
