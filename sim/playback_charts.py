@@ -80,6 +80,7 @@ class Charts:
         self._accuracy(seconds, seen)
         self._phases(new["mission"])
         self._decisions(new["directives"])
+        self._down(states)
         self._events(new["events"])
 
     def _seconds(self, known_s: float) -> list[tuple[float, float]]:
@@ -198,15 +199,26 @@ class Charts:
     def _lane(self, t_s: float, drone: int) -> None:
         """Show what the drone sends on its best link."""
         levels = [level for (sender, _), level in self._carried.items() if sender == drone]
-        best = max(levels, key=lambda level: RUNGS.index(level.split(" ")[0]))
-        if self._lanes.get(drone) == best:
+        self._show(t_s, drone, max(levels, key=lambda level: RUNGS.index(level.split(" ")[0])))
+
+    def _down(self, states: pa.Table) -> None:
+        """Who is down sends nothing, whatever was last decided."""
+        down = ~states["airborne"].to_numpy()
+        drones, first = np.unique(states["drone"].to_numpy()[down], return_index=True)
+        for drone, t_s in zip(drones.tolist(), states["t_s"].to_numpy()[down][first].tolist(), strict=True):
+            if drone in self._lanes:
+                self._show(t_s, drone, "nothing")
+
+    def _show(self, t_s: float, drone: int, level: str) -> None:
+        """Let a drone's lane show a level from now on."""
+        if self._lanes.get(drone) == level:
             return
-        self._lanes[drone] = best
+        self._lanes[drone] = level
         path, colours = f"lanes/drone_{drone}", self._lane_colours[drone]
-        if best not in colours:
-            colours[best] = _level_colour(best)
+        if level not in colours:
+            colours[level] = _level_colour(level)
             self._canvas.static(path, rr.StateConfiguration(values=list(colours), colors=list(colours.values())))
-        self._state(path, t_s, best)
+        self._state(path, t_s, level)
 
     def _state(self, path: str, t_s: float, state: str) -> None:
         self._canvas.columns(path, np.array([t_s]), rr.StateChange.columns(state=[state]))

@@ -104,7 +104,10 @@ class Links:
         return out
 
     def _recent_mbps(self, t_s: Floats, transmissions: pa.Table) -> Floats:
-        """Traffic [frame, sender, receiver] handed to the radio and settled in the second before the frame, Mb/s."""
+        """Traffic [frame, sender, receiver] handed to the radio and settled in the second before the frame, Mb/s.
+
+        The second is as many whole frames as come nearest to it, one at least.
+        """
         n, window = self._n, max(1, round(RECENT_S * self._rate_hz))
         names = ("t_done_s", "drone", "peer", "payload_bytes")
         rows = np.column_stack([transmissions[k].to_numpy().astype(float) for k in names])
@@ -121,4 +124,4 @@ class Links:
         np.add.at(bins, (frame[now], rows[now, 1].astype(int), rows[now, 2].astype(int)), rows[now, 3])
         total = np.cumsum(np.concatenate([np.zeros((1, n, n)), bins]), axis=0)
         self._recent = rows[frame >= len(t_s)]
-        return np.asarray((total[window:-1] - total[: len(t_s)]) * 8e-6 / RECENT_S)
+        return np.asarray((total[window:-1] - total[: len(t_s)]) * 8e-6 * self._rate_hz / window)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perception.ap import average_precision
 from sim.folders import RunError
 from sim.outcome import matched, transitions
-from sim.record import SortieRecord
+from sim.record import HANDSHAKE, SortieRecord
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 DRONES = ("#2f6fd0", "#d9780f", "#8a4fd0", "#0f9a8b", "#d0407a", "#9a8a12", "#4f88b8", "#b5603c", "#6a9a3a", "#85756d")
 """Colours of drones, on white."""
 SENT = {"features": "#3f9a52", "detections": "#d08a1d", "tracks": "#4f7fd0", "raw": "#b04fb0", "nothing": "#d5d7db"}
+HANDSHAKES = "#a89a3c"
 FATES = {"lost": "#d02f45", "expired": "#8a90a0"}
 MISSION, EVENT = "#d02fae", "#a8830d"
 WINDOW_S = 5.0
@@ -123,7 +124,11 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
         if kind != since[change["drone"]][1]:
             close(change["drone"], change["t_s"])
             since[change["drone"]] = (change["t_s"], kind)
+    down = _down_s(record)
     for drone in range(n):
+        if drone in down:  # who is down sends nothing, whatever was last decided
+            close(drone, down[drone])
+            since[drone] = (down[drone], "nothing")
         close(drone, end_s)
     axes.set_yticks(range(n), [f"drone {i}" for i in range(n)])
     axes.set_ylim(n - 0.4, -1.3)
@@ -133,13 +138,27 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
     axes.legend(ncols=len(rungs), loc="upper right")
 
 
+def _down_s(record: SortieRecord) -> dict[int, float]:
+    """When each drone that came down did."""
+    states = record.tables["states"]
+    down = ~states["airborne"].to_numpy()
+    drones, first = np.unique(states["drone"].to_numpy()[down], return_index=True)
+    return dict(zip(drones.tolist(), _column(states, "t_s")[down][first].tolist(), strict=True))
+
+
+def _edges(record: SortieRecord) -> Floats:
+    """Begin and end of every second; the last one ends with the sortie."""
+    end_s = record.scenario.duration_s
+    return np.append(np.arange(0.0, end_s - 1e-9), end_s)
+
+
 def _accuracy(axes: Axes, record: SortieRecord) -> None:
     for mission, label, ink in ((False, "full scene", "#2f6fd0"), (True, "mission disc", MISSION)):
         found = matched(record, mission=mission)
         t_s = np.array([t for t, _ in found])
         frames = list(found.values())
         points = []
-        for end_s in np.arange(1.0, record.scenario.duration_s + 0.5):
+        for end_s in _edges(record)[1:]:
             within = [frames[k] for k in np.flatnonzero((t_s >= end_s - WINDOW_S) & (t_s < end_s))]
             if within:
                 points.append((end_s, average_precision(within)))
@@ -156,13 +175,14 @@ def _traffic(axes: Axes, record: SortieRecord) -> None:
     kinds = np.array(
         [f"{r} {s}" for r, s in zip(sent["representation"].to_pylist(), sent["status"].to_pylist(), strict=True)]
     )
-    edges = np.arange(0.0, record.scenario.duration_s + 1.0)
+    edges = _edges(record)
     for kind in sorted(set(kinds.tolist())):
         representation, fate = kind.split(" ")
         if fate == "in_flight":
             continue
-        mbps, _ = np.histogram(done[kinds == kind], edges, weights=8e-6 * size[kinds == kind])
-        axes.plot(edges[1:], mbps, color=FATES.get(fate) or SENT[representation], label=kind, linewidth=1.4)
+        megabits, _ = np.histogram(done[kinds == kind], edges, weights=8e-6 * size[kinds == kind])
+        ink = FATES.get(fate) or {**SENT, HANDSHAKE: HANDSHAKES}[representation]
+        axes.plot(edges[1:], megabits / np.diff(edges), color=ink, label=kind, linewidth=1.4)
     if axes.get_lines():
         axes.legend(loc="upper right", ncols=3)
     axes.set_ylim(bottom=0.0)
@@ -197,8 +217,9 @@ def _battery(axes: Axes, record: SortieRecord) -> None:
 def _age(axes: Axes, record: SortieRecord) -> None:
     table = record.tables["ages"]
     t_s, age_s = _column(table, "t_s"), _column(table, "age_s")
-    seconds = np.floor(t_s)
-    points = [(s + 1.0, 1e3 * np.percentile(age_s[seconds == s], 99)) for s in np.unique(seconds)]
+    edges = _edges(record)
+    second = np.searchsorted(edges, t_s, side="right") - 1
+    points = [(edges[s + 1], 1e3 * np.percentile(age_s[second == s], 99)) for s in np.unique(second)]
     if points:
         axes.plot(*np.array(points).T, color="#555555", linewidth=1.4)
     axes.set_ylim(bottom=0.0)

@@ -257,6 +257,23 @@ def test_a_link_is_as_wide_as_its_traffic_and_as_green_as_its_goodput(rows: Rows
             assert radius == -0.75
 
 
+@pytest.mark.parametrize(("rate_hz", "frame"), [(0.5, 3), (1.5, 6)])
+def test_a_link_is_as_wide_at_rates_that_do_not_divide_a_second(rate_hz: float, frame: int, tmp_path: Path) -> None:
+    """Mb/s over as many whole frames as come nearest to a second: 2 s at 0.5 Hz, 1.33 s at 1.5 Hz."""
+    slow = run_sortie(example("duration_s=8", f"context.rate_hz={rate_hz}", "policy.dwell_s=0"), "all-4")
+    save_rrd(slow, tmp_path / "slow.rrd")
+    rows, t_s, window_s = read(tmp_path / "slow.rrd"), frame / rate_hz, max(1, round(rate_hz)) / rate_hz
+    recent: dict[tuple[int, int], float] = defaultdict(float)
+    for t in slow.tables["transmissions"].to_pylist():
+        if t_s - window_s <= t["t_done_s"] < t_s:
+            recent[t["drone"], t["peer"]] += t["payload_bytes"] * 8e-6 / window_s
+    n = slow.scenario.fleet.drones
+    expected = [recent[i, j] for i in range(n) for j in range(n) if i != j]
+    assert min(expected) > 0
+    radii = next(v for _, f, v in rows["/world/links"]["Arrows3D:radii"] if f == frame)
+    assert radii == pytest.approx([-(1.5 + math.log2(1.0 + mbps)) for mbps in expected], rel=1e-5)
+
+
 def test_a_link_that_is_all_but_gone_is_crossed_out(rows: Rows, record: SortieRecord) -> None:
     n, descriptors = record.scenario.fleet.drones, record.tables["descriptors"].to_pylist()
     drawn = {frame: strips for _, frame, strips in rows["/world/broken"]["LineStrips3D:strips"]}
@@ -490,6 +507,9 @@ def test_a_lane_shows_the_best_that_a_drone_sends(rows: Rows) -> None:
     states = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_2"]["StateChange:state"]]
     assert any(v.startswith("features") for t_s, v in states if t_s < 4.0)
     assert next(v for t_s, v in states if t_s > 4.0).startswith("detections at 2 Hz")
+    *_, before, last = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_3"]["StateChange:state"]]
+    assert before[1].startswith("features")
+    assert last == (6.0, "nothing")  # it was lost then, and nothing was decided on it any more
 
 
 # --- live ------------------------------------------------------------------------------------------

@@ -8,11 +8,15 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow.compute as pc
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sim import rundir
+from sim import report_figures, rundir
 from sim.cli import app
 from sim.folders import RunError
 from sim.outcome import outcome
@@ -139,6 +143,47 @@ def test_a_table_without_rows_leaves_every_figure_whole(
     record = run_sortie(example("duration_s=2", "perception.detector=surrogate", *sets), policy)
     assert [name for name in empty if record.tables[name].num_rows] == []
     assert Page(page(record)).count["svg"] == 7
+
+
+def drawn(draw: Any, record: SortieRecord) -> Any:
+    axes = Figure().add_subplot()
+    draw(axes, record)
+    return axes
+
+
+def test_handshakes_are_traffic_too() -> None:
+    record = run_sortie(example("duration_s=2"), "who2com")
+    assert "handshake delivered" in page(record)
+    assert {line.get_label() for line in drawn(report_figures._traffic, record).get_lines()} >= {"handshake delivered"}
+
+
+def test_a_last_second_that_is_short_is_one_in_every_figure() -> None:
+    """2.25 s: the last quarter of a second has its own rate, accuracy and age, at the end of the sortie."""
+    record = run_sortie(example("duration_s=2.25", "perception.detector=surrogate", "perception.sample_rate_hz=10"))
+    ends = [1.0, 2.0, 2.25]
+    sent = record.tables["transmissions"].to_pylist()
+    for line in drawn(report_figures._traffic, record).get_lines():
+        t_s, mbps = line.get_data()
+        assert t_s.tolist() == ends
+        kind = [r for r in sent if f"{r['representation']} {r['status']}" == line.get_label()]
+        late = sum(r["payload_bytes"] for r in kind if r["t_done_s"] >= 2.0)
+        assert mbps[-1] == pytest.approx(late * 8e-6 / 0.25)
+    for draw in (report_figures._accuracy, report_figures._age):
+        line = drawn(draw, record).get_lines()[0]
+        assert line.get_xdata().tolist() == ends
+    last = record.tables["ages"].filter(pc.greater_equal(record.tables["ages"]["t_s"], 2.0))["age_s"].to_numpy()
+    assert line.get_ydata()[-1] == pytest.approx(1e3 * np.percentile(last, 99))
+
+
+def test_a_lane_says_nothing_of_a_drone_that_is_down() -> None:
+    record = run_sortie(example("duration_s=6", "events=[{kind: drone_lost, at_s: 4, drone: 2}]"))
+    lanes: dict[int, list[tuple[float, float, str]]] = {i: [] for i in range(record.scenario.fleet.drones)}
+    for bar in drawn(report_figures._lanes, record).collections:
+        box = bar.get_datalim(bar.axes.transData)
+        lanes[round((box.y0 + box.y1) / 2)].append((box.x0, box.x1, to_hex(bar.get_facecolor()[0])))
+    assert lanes[2][-2][1:] == (4.0, report_figures.SENT["features"])
+    assert lanes[2][-1] == (4.0, 6.0, report_figures.SENT["nothing"])
+    assert lanes[0][-1][1:] == (6.0, report_figures.SENT["features"])
 
 
 def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
