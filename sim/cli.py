@@ -41,7 +41,7 @@ from sim import (
 )
 from sim.compare import compare as compare_policies
 from sim.console import bars, err, out
-from sim.folders import RunError, put_between, write_text
+from sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 from sim.named import policy_overrides
 from sim.sortie import VERSION, run_sortie
 from sim.watchers import Watcher, Watchers
@@ -76,7 +76,7 @@ ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a lib
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.battery.initial_soc=0.5")
 ]
-SeedOption = Annotated[int | None, typer.Option(help="Seed of every random draw; left out, the scenario's.", min=0)]
+SeedOption = Annotated[int | None, typer.Option(help="Of every draw; left out, its own.", min=0, max=2**63 - 1)]
 PolicyOption = Annotated[
     str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
 ]
@@ -175,9 +175,14 @@ def compare(
     """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
     contexts = load_contexts(scenario)
     if contexts is not None:
+        cli_contexts.refuse({"seed": seed, "own-fusion": own_fusion or None, "recording": recording, "readme": readme})
         chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
         return cli_contexts.compare_contexts(contexts, chosen, set_ or [], out_file, by_torch=by_torch)
+    if by_torch:
+        raise RunError(f"--by-torch goes with a set of contexts; for {scenario}: --set perception.detector=torch")
     flown = [(p, _load(scenario, set_, p)) for p in _split_policies(policies)]
+    ensure_files(out_file, recording)
+    ensure_between(readme, tables.COMPARE_BEGIN, tables.COMPARE_END)
     if own_fusion:
         flown = [(p, _with_own_fusion(s)) for p, s in flown]
     with bars() as bar:
@@ -190,7 +195,8 @@ def compare(
         _write_json(out_file, {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows})
         out.print(f"kept in [bold]{out_file}[/bold]")
     if readme is not None:
-        section = tables.comparison_markdown(rows, f"sortie compare {scenario} --policies {policies}")
+        command = tables.compare_command(scenario, policies, seed, set_ or [], own_fusion=own_fusion)
+        section = tables.comparison_markdown(rows, command)
         put_between(readme, section, tables.COMPARE_BEGIN, tables.COMPARE_END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
@@ -240,6 +246,8 @@ def view(
     """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
     from sim.playback import open_viewer, save_rrd
 
+    if at_s and picture is None:
+        raise RunError("--at goes with --picture: the viewer has a time line of its own")
     path = run / rundir.RECORDING
     if not path.is_file():
         save_rrd(rundir.load(run), path)

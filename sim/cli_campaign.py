@@ -106,7 +106,7 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
 
     if folder is None or run is None:
         raise RunError("--from-campaign DIR and --run ID go together")
-    if any(others):
+    if any(other is not None and other != [] for other in others):
         raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
     row, plan = find_row(folder, run), read_plan(folder)
     if code_version() != plan.code:

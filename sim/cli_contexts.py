@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,21 @@ from policies.registry import resolve
 from scenarios.contexts import Contexts
 from sim.console import bars, out
 from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
-from sim.folders import write_text
+from sim.folders import RunError, ensure_files, write_text
 from sim.in_flight import torch_answers
 from sim.tables import size
+
+
+def refuse(options: Mapping[str, object]) -> None:
+    """Options of `sortie compare` that say nothing over a set of contexts, by name; None is not given.
+
+    Raises:
+        RunError: the first that is given.
+    """
+    for name, given in options.items():
+        if given is not None:
+            own = ": its file has its seeds" if name == "seed" else ""
+            raise RunError(f"--{name} goes with a scenario, not with a set of contexts{own}")
 
 
 def compare_contexts(
@@ -29,6 +41,7 @@ def compare_contexts(
     """Fly every policy in every context, print AP by context and the sums, keep both as JSON."""
     for policy in policies:
         resolve(policy)
+    ensure_files(out_file)
     contexts = contexts.model_copy(update={"set": (*contexts.set, *sets)})
     with bars() as bar:
         each = {p: bar(p, len(contexts.contexts)) for p in policies}
@@ -101,6 +114,7 @@ def learn(
     """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""
     from sim.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
+    ensure_files(out_file)
     with bars() as bar:
         lessons = fly_lessons(seed, contexts, by_torch=by_torch, workers=workers, progress=bar("contexts", contexts))
     save(out_file, lessons, seed, by_torch=by_torch)

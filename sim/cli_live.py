@@ -12,12 +12,14 @@ from rich.table import Table
 
 from scenarios.load import load
 from sim.console import err, out, stages, user_errors
-from sim.folders import RunError, write_text
+from sim.folders import RunError, ensure_files, write_text
 from sim.named import policy_overrides
 
 if TYPE_CHECKING:
     from sim.live.result import LiveResult
 
+MAX_DOMAIN = 230
+"""Of DDS: above, ports would run out."""
 SHOWN = 20
 """So many changes are printed; `--out` keeps all of them."""
 
@@ -36,7 +38,7 @@ def live(
         str | None, typer.Option(metavar="DRONE@SECONDS", help="Kill a drone's process at the scenario's time: 2@70")
     ] = None,
     domain: Annotated[
-        int | None, typer.Option(help="DDS domain; left out, ROS_DOMAIN_ID or 0.", min=0, max=230)
+        int | None, typer.Option(help="DDS domain; left out, ROS_DOMAIN_ID or 0.", min=0, max=MAX_DOMAIN)
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
@@ -52,6 +54,8 @@ def live(
         number = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain
     except ValueError as error:
         raise RunError(f"ROS_DOMAIN_ID is {os.environ['ROS_DOMAIN_ID']!r}, must be a number") from error
+    if not 0 <= number <= MAX_DOMAIN:
+        raise RunError(f"ROS_DOMAIN_ID is {number}, must be 0 to {MAX_DOMAIN}")
     killed = None if kill is None else _kill(kill)
     flown = load(scenario, set_ or [])
     if policy is not None:
@@ -59,9 +63,7 @@ def live(
     with user_errors():
         from sim.live.session import fly_live
 
-        if out_file is not None:
-            out_file.parent.mkdir(parents=True, exist_ok=True)
-
+    ensure_files(out_file)
     with stages() as report:
         result = fly_live(
             flown,

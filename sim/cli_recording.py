@@ -10,7 +10,7 @@ from rich.table import Table
 
 from perception.outside.recorded import open_recording
 from sim.console import bars, out
-from sim.folders import RunError
+from sim.folders import RunError, ensure_files
 
 app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")
 
@@ -44,6 +44,7 @@ def evaluate(
     from perception.harness.evaluation import FLOOR
     from perception.outside.instrument import evaluate_recording
 
+    ensure_files(save)
     try:
         if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
             raise ValueError(f"tau is {tau:g}, must be {FLOOR:g} to 1")

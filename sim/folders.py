@@ -35,11 +35,30 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
     if written and path.is_dir() and (others := _others(path, written)):
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
-    there = next(p for p in path.absolute().parents if p.exists())
-    if not there.is_dir():
-        raise RunError(f"{path}: cannot make its folder: {there} is a file")
-    if not os.access(there, os.W_OK):
-        raise RunError(f"{path}: its folder {there} is not writable")
+    _ensure_place(path)
+
+
+def ensure_files(*paths: Path | None) -> None:
+    """Refuse paths of files that could not be written, before anything is flown or measured; None is no file.
+
+    Raises:
+        RunError: one is a folder, or cannot be made.
+    """
+    for path in filter(None, paths):
+        if path.is_dir():
+            raise RunError(f"{path}: is a folder, must be a file")
+        _ensure_place(path)
+
+
+def ensure_between(path: Path | None, begin: str, end: str) -> None:
+    """Refuse a file that `put_between` could not put a section into, before it is made; None is none.
+
+    Raises:
+        RunError: no such file, or one without the markers.
+    """
+    if path is not None:
+        _put_between(path, begin + end, begin, end)
+        _ensure_place(path)
 
 
 @contextmanager
@@ -113,11 +132,25 @@ def put_between(path: Path, section: str, begin: str, end: str) -> None:
     Raises:
         RunError: no such file, or one without the markers.
     """
+    write_text(path, _put_between(path, section, begin, end))
+
+
+def _put_between(path: Path, section: str, begin: str, end: str) -> str:
     try:
-        text = put_into(path.read_text(encoding="utf-8"), section, begin, end)
-    except (OSError, ValueError) as error:
+        return put_into(path.read_text(encoding="utf-8"), section, begin, end)
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:
         raise RunError(f"{path}: {error}") from error
-    write_text(path, text)
+
+
+def _ensure_place(path: Path) -> None:
+    """Refuse a path whose folder cannot be made or written to."""
+    there = next(p for p in path.absolute().parents if p.exists())
+    if not there.is_dir():
+        raise RunError(f"{path}: cannot make its folder: {there} is a file")
+    if not os.access(there, os.W_OK):
+        raise RunError(f"{path}: its folder {there} is not writable")
 
 
 def _others(folder: Path, written: Collection[str], within: str = "") -> list[str]:

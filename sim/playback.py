@@ -102,6 +102,7 @@ def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]
     """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails."""
     partial = partial_file(path)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
         recording = rr.RecordingStream(APPLICATION)
         recording.save(partial, default_blueprint=layout)
@@ -112,7 +113,8 @@ def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def scene_of(record: SortieRecord) -> SceneModel:

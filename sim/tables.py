@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import pstats
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -132,6 +133,16 @@ def comparison_markdown(rows: Sequence[Compared], command: str) -> str:
     lines += [f"| {name.strip()} | {' | '.join(cells)} |" for name, cells in _side_by_side(rows).items()]
     why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(rows)]
     return "\n".join([COMPARE_BEGIN, "", *lines, "", *(f"- {line}" for line in why), "", COMPARE_END])
+
+
+def compare_command(
+    scenario: str, policies: str, seed: int | None, overrides: Sequence[str], *, own_fusion: bool
+) -> str:
+    """The command that gives the same comparison again."""
+    said = ["sortie", "compare", scenario, "--policies", policies]
+    said += [] if seed is None else ["--seed", str(seed)]
+    said += [x for override in overrides for x in ("--set", override)]
+    return shlex.join(said + ["--own-fusion"] * own_fusion)
 
 
 def _side_by_side(rows: Sequence[Compared]) -> dict[str, list[str]]:

@@ -581,8 +581,9 @@ def test_small_and_large_fleets_are_drawn(drones: int, tmp_path: Path) -> None:
 
 
 def test_a_path_that_cannot_be_written_is_one_clear_error(record: SortieRecord, tmp_path: Path) -> None:
-    path = tmp_path / "nowhere" / "sortie.rrd"
-    with pytest.raises(RunError, match=r"nowhere/sortie\.rrd: cannot be written: No such file or directory$"):
+    (tmp_path / "file").write_text("mine")
+    path = tmp_path / "file" / "sortie.rrd"
+    with pytest.raises(RunError, match=r"file/sortie\.rrd: cannot be written: File exists$"):
         save_rrd(record, path)
 
 

@@ -1,0 +1,95 @@
+"""Options of commands: honoured or refused, and refused before anything flies."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from sim_examples import BASE
+
+from sim.cli import main
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "example.yaml"
+    path.write_text(BASE)
+    return path
+
+
+def command(*arguments: object) -> int:
+    """The command in this process; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("view", ".", "--at", "3"), "--at goes with --picture"),
+        (("compare", "example.yaml", "--policies", "silence", "--by-torch"), "--by-torch goes with a set of contexts"),
+        (
+            ("compare", "contexts", "--policies", "silence", "--seed", "0"),
+            "--seed goes with a scenario, not with a set",
+        ),
+        (("compare", "contexts", "--policies", "silence", "--own-fusion"), "--own-fusion goes with a scenario"),
+        (("compare", "contexts", "--policies", "silence", "--recording", "c.rrd"), "--recording goes with a scenario"),
+        (("compare", "contexts", "--policies", "silence", "--readme", "c.md"), "--readme goes with a scenario"),
+        (("compare", "contexts", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
+        (("compare", "example.yaml", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
+        (
+            ("compare", "example.yaml", "--policies", "silence", "--recording", "example.yaml/c.rrd"),
+            "example.yaml/c.rrd: cannot make its folder",
+        ),
+        (("compare", "example.yaml", "--policies", "silence", "--readme", "c.md"), "c.md: No such file or directory"),
+        (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),
+        (("learn", "--out", "."), ".: is a folder, must be a file"),
+        (("live", "example.yaml", "--out", "."), ".: is a folder, must be a file"),
+        (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
+    ],
+)
+def test_what_cannot_be_honoured_is_refused_before_anything_flies(
+    scenario: Path,
+    arguments: tuple[str, ...],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(scenario.parent)
+    assert command(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert [p.name for p in scenario.parent.iterdir()] == ["example.yaml"], "nothing was left behind"
+
+
+def test_a_seed_is_one_that_a_scenario_takes(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("fly", scenario, "--seed", 2**63) == 2
+    assert "Invalid value for '--seed'" in capsys.readouterr().err
+
+
+def test_a_domain_out_of_range_is_one_line(
+    scenario: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for domain in ("231", "-1"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+        assert command("live", scenario) == 2
+        assert capsys.readouterr().err == f"error: ROS_DOMAIN_ID is {domain}, must be 0 to 230\n"
+
+
+def test_a_comparison_in_a_readme_says_how_it_was_made(scenario: Path, tmp_path: Path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text("<!-- compare:begin --><!-- compare:end -->")
+    made = ("--policies", "silence,all-4(rho=0.1)", "--seed", 3, "--set", "duration_s=1", "--set", "fleet.drones=2")
+    assert command("compare", scenario, *made, "--readme", readme, "--recording", tmp_path / "new" / "c.rrd") == 0
+    said = f"sortie compare {scenario} --policies 'silence,all-4(rho=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
+    assert f"`{said}`: 1 s, 2 drones, seed 3." in readme.read_text()
+    assert (tmp_path / "new" / "c.rrd").is_file()
