@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +21,7 @@ from sim.console import bars, out
 from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
 from sim.folders import RunError, ensure_files, write_text
 from sim.in_flight import torch_answers
-from sim.tables import size
+from sim.tables import number, size
 
 
 def refuse(options: Mapping[str, object]) -> None:
@@ -47,9 +48,11 @@ def compare_contexts(
         each = {p: bar(p, len(contexts.contexts)) for p in policies}
         detector_of = torch_answers() if by_torch else make_detector
         cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k), detector_of=detector_of)
-    rows = summarise(cells)
     for table in _by_context(contexts, policies, cells, out.width):
         out.print(table)
+    if blind := list(dict.fromkeys(c.context for c in cells if math.isnan(c.ap))):
+        out.print(f"no car was to be seen in {', '.join(blind)}: no accuracy counts what was flown there")
+    rows = summarise(cells)
     fixed = best_fixed(rows)
     table = _figures(
         "all contexts", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
@@ -67,7 +70,10 @@ def compare_contexts(
         "the best fixed policy of each context; data and energy of a sortie; missed: payloads past their deadline[/dim]"
     )
     if out_file is not None:
-        found = {"summary": [asdict(r) for r in rows], "cells": [asdict(c) for c in cells]}
+        found = {
+            "summary": [asdict(r) for r in rows],
+            "cells": [{**asdict(c), "ap": None if math.isnan(c.ap) else c.ap} for c in cells],
+        }
         write_text(out_file, json.dumps(found, indent=1) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
 
@@ -84,10 +90,8 @@ def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cel
         table = _figures("AP@0.5; of the mission where the fleet tracks", "context", "rho", *few)
         for c in contexts.contexts:
             best = max(at[p, c.name] for p in policies)
-            figures = (at[p, c.name] for p in few)
-            table.add_row(
-                c.name, f"{c.rho:g}", *(f"[bold]{a:.3f}[/bold]" if a == best else f"{a:.3f}" for a in figures)
-            )
+            figures = ((number(at[p, c.name]), at[p, c.name] == best) for p in few)
+            table.add_row(c.name, f"{c.rho:g}", *(f"[bold]{a}[/bold]" if is_ else a for a, is_ in figures))
         yield table
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from policies.registry import POLICIES, parameters, resolve
 from scenarios.contexts import Context, Contexts
 from scenarios.load import load
 from scenarios.schema import Scenario
+from sim.folders import RunError
 from sim.outcome import matched, outcome
 from sim.sortie import DetectorOf, run_sortie
 
@@ -66,9 +67,12 @@ def fly_all(
         detector_of: as `run_sortie` takes it.
 
     Raises:
-        ScenarioError, PolicyError: a context or policy that cannot be flown, before anything is.
+        ScenarioError, PolicyError, RunError: a context or policy that cannot be flown or scored, before anything is.
     """
     planned = [(p, c, [scenario_of(contexts, c, p)] * len(contexts.seeds)) for p in policies for c in contexts.contexts]
+    for _, context, (scenario, *_) in planned:
+        if scenario.perception.detector == "none":
+            raise RunError(f"context {context.name}: perception.detector is none, contexts are compared by accuracy")
     cells: list[Cell] = []
     for k, (policy, context, scenarios) in enumerate(planned):
         cells.append(_fly(policy, context, scenarios, contexts.seeds, detector_of))
@@ -106,22 +110,31 @@ def _fly(
 
 
 def summarise(cells: Sequence[Cell]) -> list[Summary]:
-    """Every policy's means over the contexts, against the best fixed policy flown and each context's best fixed one."""
+    """Every policy's means over the contexts, against the best fixed policy flown and each context's best fixed one.
+
+    Accuracy is of the contexts in which every policy has one: where no car was to be seen, there is none.
+
+    Raises:
+        RunError: there is no such context.
+    """
     policies = list(dict.fromkeys(c.policy for c in cells))
     contexts = list(dict.fromkeys(c.context for c in cells))
     at = {(c.policy, c.context): c for c in cells}
     ap = {p: np.array([at[p, c].ap for c in contexts]) for p in policies}
-    fixed = [p for p in policies if p in FIXED] or policies[:1]
-    best = max(fixed, key=lambda p: float(np.nanmean(ap[p])))
-    oracle = np.nanmean(np.max([ap[p] for p in fixed], axis=0))
+    known = np.isfinite(list(ap.values())).all(axis=0)
+    if not known.any():
+        raise RunError("no context has an accuracy under every policy: there was no car to be seen, or nothing scored")
+    ap = {p: a[known] for p, a in ap.items()}
+    best = _best_fixed({p: float(a.mean()) for p, a in ap.items()})
+    oracle = np.max([ap[p] for p in _fixed(policies)], axis=0).mean()
     rows = []
     for p in policies:
         mine = [at[p, c] for c in contexts]
         low, high = paired_interval(ap[p] - ap[best])
-        mean = float(np.nanmean(ap[p]))
+        mean = float(ap[p].mean())
         rows.append(
             Summary(
-                p, mean, (mean - float(np.nanmean(ap[best])), low, high), mean / float(oracle),
+                p, mean, (mean - float(ap[best].mean()), low, high), mean / float(oracle),
                 float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
                 float(np.mean([c.miss_rate for c in mine])),
             )
@@ -131,7 +144,16 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
 
 def best_fixed(rows: Sequence[Summary]) -> str:
     """The fixed policy that the gains are over."""
-    return next(r.policy for r in rows if r.gain == (0.0, 0.0, 0.0))
+    return _best_fixed({r.policy: r.ap for r in rows})
+
+
+def _best_fixed(ap: Mapping[str, float]) -> str:
+    return max(_fixed(list(ap)), key=lambda p: ap[p])
+
+
+def _fixed(policies: Sequence[str]) -> list[str]:
+    """Those that do the same whatever the context; the first of all where none does."""
+    return [p for p in policies if p in FIXED] or list(policies[:1])
 
 
 def paired_interval(differences: np.ndarray, seed: int = 0) -> tuple[float, float]:

@@ -21,7 +21,7 @@ COMPARE_BEGIN, COMPARE_END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
 def number(value: Any, form: str = ".3f", unit: str = "") -> str:
     """A figure with its unit; a dash where there is none."""
-    return "–" if value is None else f"{value:{form}}{unit and ' ' + unit}"
+    return "–" if value is None or value != value else f"{value:{form}}{unit and ' ' + unit}"
 
 
 def size(count: float) -> str:

@@ -23,6 +23,7 @@ from scenarios.schema import Perception
 from sim import cli_contexts, learn
 from sim.cli import main
 from sim.contexts import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
+from sim.folders import RunError
 from sim.in_flight import torch_answers
 from sim.learn import Lesson, draw_context, fit, save
 
@@ -92,6 +93,34 @@ def test_gains_are_over_the_best_fixed_policy_and_the_oracle_takes_the_best_of_e
     assert by_name["learned"].gain[1:] == pytest.approx((0.1, 0.1)), "the same gain in every context"
     assert by_name["learned"].of_oracle == pytest.approx(1.2 / 1.0)
     assert by_name["best-2"].gain[1] < 0 < by_name["best-2"].gain[2]
+
+
+def test_gains_are_over_a_fixed_policy_also_where_another_is_as_good() -> None:
+    rows = summarise([cell(p, f"c{k}", a) for p in ("adaptive", "all-4") for k, a in enumerate((0.4, 0.2))])
+    assert best_fixed(rows) == "all-4"
+
+
+def test_a_context_without_a_car_counts_for_nothing() -> None:
+    """Its accuracy is undefined; before, the interval was too, and the best fixed policy was not found."""
+    nan = float("nan")
+    ap = {"all-4": (0.4, nan, 0.2), "best-2": (0.2, nan, nan), "boxes": (0.5, nan, 0.9)}
+    rows = summarise([cell(p, f"c{k}", a) for p, values in ap.items() for k, a in enumerate(values)])
+    assert [(r.policy, r.ap) for r in rows] == [("all-4", 0.4), ("best-2", 0.2), ("boxes", 0.5)]
+    assert best_fixed(rows) == "all-4"
+    assert rows[2].gain == pytest.approx((0.1, 0.1, 0.1))
+    with pytest.raises(RunError, match="no context has an accuracy under every policy"):
+        summarise([cell("all-4", "c0", nan), cell("boxes", "c0", nan)])
+
+
+def test_contexts_without_a_detector_are_refused_before_anything_flies(tmp_path: Path) -> None:
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL.replace("detector=surrogate", "detector=none"))
+    contexts = load_contexts(path)
+    assert contexts is not None
+    with pytest.raises(
+        RunError, match=r"context poor: perception\.detector is none, contexts are compared by accuracy"
+    ):
+        fly_all(contexts, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
 
 
 def test_the_interval_of_a_known_mean() -> None:
