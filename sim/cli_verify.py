@@ -54,6 +54,7 @@ def verify(
     section = _section(policy)
     decide = resolve(section.name, section.params)
     rules = _invariants(section.name, decide, invariants)
+    _ensure_own(out_dir / slug(policy))
     try:
         broken = _try(policy, section, decide, rules, drones, views, out_dir)
     except SystemExit as stop:  # or a policy that ends the program would pass
@@ -160,6 +161,18 @@ def _counterexamples(
             invariant = "" if v.name in {p.name for p in PLANE} else v.name
             older = (v.raised_age_s or raised_ages(decide, view)) if v.name == aged.name else None
             yield v.name, view, shown(v.name, v.what, view=view, invariant=invariant, raised_age_s=older)
+
+
+def _ensure_own(folder: Path) -> None:
+    """Refuse a folder that holds something else than counterexamples, before they are replaced by new ones."""
+    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+        view = file.with_suffix(".json")  # a scenario lies beside its view
+        if (
+            file.suffix not in (".json", ".yaml")
+            or not view.is_file()
+            or '"ego": ' not in view.read_text("utf-8", "replace")[:20]
+        ):
+            raise RunError(f"{folder}: holds {file.name}, which is no counterexample; name another --out or move it")
 
 
 def _keep(folder: Path, found: Iterable[tuple[str, FleetView, Scenario]]) -> None:

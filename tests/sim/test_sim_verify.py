@@ -58,6 +58,28 @@ def faulty(tmp_path: Path) -> Path:
     return path
 
 
+def test_counterexamples_replace_counterexamples_and_nothing_else(
+    faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
+    (folder,) = out.iterdir()
+    before = sorted(p.name for p in folder.iterdir())
+    assert {p.suffix for p in folder.iterdir()} == {".json", ".yaml"}
+    (folder / "notes.txt").write_text("keep")
+    capsys.readouterr()
+    assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 2
+    said = f"error: {folder}: holds notes.txt, which is no counterexample; name another --out or move it\n"
+    assert capsys.readouterr().err == said
+    assert sorted(p.name for p in folder.iterdir()) == sorted([*before, "notes.txt"])
+    mine = tmp_path / "worked" / "mine.json"
+    mine.parent.mkdir()
+    mine.write_text("[]")
+    assert sortie("verify", "worked", *QUICK, "--out", tmp_path) == 2  # its folder would be tmp_path/worked
+    assert mine.read_text() == "[]"
+
+
 def test_the_worked_policy_passes_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert sortie("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
