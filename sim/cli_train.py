@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from sim.console import out, stages, user_errors
+from sim.folders import ensure_files
 
 
 class Exchange(StrEnum):
@@ -57,6 +58,7 @@ def train(
     Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
     """
     from perception.bench.dataset import Benchmark  # here: torch takes a second to import
+    from perception.fusion.registry import FUSIONS
     from perception.geometry import Geometry
     from perception.model import ModelConfig
     from perception.training.recipe import Recipe
@@ -65,15 +67,23 @@ def train(
     from sim.playback_training import TrainingLog
 
     half_extent_m = float(range_.value)
-    recipe = Recipe(
-        steps=steps,
-        seed=seed,
-        scenes=scenes,
-        peak_lr=peak_lr,
-        cell_dropout=cell_dropout,
-        unsent=unsent.value,
-        warm_start=warm_start.name if warm_start else "",
-    )
+    with user_errors():  # before scenes are rendered, which takes minutes
+        recipe = Recipe(
+            steps=steps,
+            seed=seed,
+            scenes=scenes,
+            peak_lr=peak_lr,
+            cell_dropout=cell_dropout,
+            unsent=unsent.value,
+            warm_start=warm_start.name if warm_start else "",
+        )
+        if fusion not in FUSIONS:
+            raise ValueError(f"fusion is {fusion!r}, must be one of {', '.join(FUSIONS)}")
+        if (device or "cpu").partition(":")[0] not in ("cpu", "cuda"):
+            raise ValueError(f"device is {device!r}, must be cpu or cuda")
+        if warm_start is not None and not warm_start.is_file():
+            raise ValueError(f"{warm_start}: no such weights")
+        ensure_files(out_file)
     config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value)
     curves = TrainingLog(out_file.parent / "training.rrd", out_file.stem)
     with stages() as progress, user_errors():

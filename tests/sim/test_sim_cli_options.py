@@ -51,6 +51,11 @@ def command(*arguments: object) -> int:
         (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),
         (("learn", "--out", "."), ".: is a folder, must be a file"),
         (("live", "example.yaml", "--out", "."), ".: is a folder, must be a file"),
+        (("train", "--fusion", "mean"), "fusion is 'mean', must be one of"),
+        (("train", "--peak-lr", "nan"), "peak_lr is nan, must be above 0 and at most 1"),
+        (("train", "--device", "tpu"), "device is 'tpu', must be cpu or cuda"),
+        (("train", "--warm-start", "w.safetensors"), "w.safetensors: no such weights"),
+        (("train", "--out", "."), ".: is a folder, must be a file"),
         (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
     ],
 )
