@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from typer.core import TyperGroup
 
 from fleet.motion import MotionError
@@ -87,12 +88,8 @@ def main() -> None:
     try:
         app()
     except USER_ERRORS as error:
-        err.print(f"[red]error:[/red] {_plain(error)}", soft_wrap=True)
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
-
-
-def _plain(error: BaseException) -> str:
-    return str(error).replace("[", r"\[")
 
 
 @app.command()
@@ -140,11 +137,14 @@ def fly(
 
         save_rrd(record, folder / rundir.RECORDING)
 
+    instead = rundir.in_place_of(path, record.fingerprint)
     result = rundir.save(record, path, save_recording if recording else None)
     out.print(tables.outcome_table(result))
     out.print(tables.transitions_table(result))
     report(result)
-    out.print(f"kept in [bold]{path}[/bold]" + (f", see it with: sortie view {path}" if recording else ""))
+    out.print(
+        f"kept in [bold]{path}[/bold]{escape(instead)}" + (f", see it with: sortie view {path}" if recording else "")
+    )
     if expected is not None:
         same = "is" if record.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")

@@ -27,7 +27,7 @@ WRITTEN = frozenset(
 
 
 def default_path(scenario: Scenario, seed: int | None, replication: int) -> Path:
-    """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it, since it comes out the same."""
+    """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it; with other settings it is told."""
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
     rep = f"-rep{replication}" if replication else ""
     return Path("runs") / f"{scenario.name}-{policy}-seed{scenario.seed if seed is None else seed}{rep}"
@@ -75,6 +75,16 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
         if also is not None:
             also(partial)
     return result
+
+
+def in_place_of(path: Path, fingerprint: str) -> str:
+    """What to say of the run that another one with this fingerprint is about to replace; empty where nothing is lost."""
+    try:
+        old = json.loads((path / OUTCOME).read_text())
+        said = f", in place of a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
+        return "" if old["fingerprint"] == fingerprint else said
+    except (OSError, ValueError, TypeError, LookupError):
+        return ""  # none, or one that nobody can read
 
 
 def _is_of_the_run(page: Path) -> bool:

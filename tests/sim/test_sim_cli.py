@@ -204,6 +204,16 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     assert (kept["policy"], kept["seed"]) == ("best-2", 7)
 
 
+def test_a_run_that_another_replaces_is_told(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    fly = ("fly", scenario, "--no-recording", "--out", tmp_path / "run", "--set", "duration_s=0.5")
+    for more, told in (((), False), ((), False), (("--seed", 7), True), (("--set", "name=other"), True)):
+        assert command(*fly, *more) == 0
+        assert ("in place of a run of example under worked, seed" in capsys.readouterr().out) is told
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
