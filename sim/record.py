@@ -89,7 +89,8 @@ ABOUT = {
     "detections": "A box that an ego detected, ENU.",
     "truths": "A car within an ego's range at a scored fusion, ENU.",
     "mission": "The mission in a frame; NaN where there is no region or target.",
-    "medium": "The channel in a second, and how many drones have a usable link.",
+    "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "
+    "drones have a usable link. What follows the last row is in `medium_busy_fraction` alone.",
     "topology": "Once a second where payloads are relayed: whether all drones reach all, who is outside the largest such "
     "group, and the link that limits the worst-off pair (−1 and NaN where there is none).",
     "energy": "What a drone spent on a cause.",

@@ -108,6 +108,9 @@ def load(path: Path) -> SortieRecord:
         about = json.loads((path / RECORD).read_text())
         scenario = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
         tables = {name: pq.read_table(path / f"{name}.parquet") for name in TABLES}
+        for name, columns in TABLES.items():
+            if lacking := [c for c in columns if c not in tables[name].column_names]:
+                raise ValueError(f"{name}.parquet has no column {lacking[0]}; another version's, perhaps: fly it again")
         return SortieRecord(scenario=scenario, tables=tables, **about)
     except (OSError, ValueError, TypeError, ScenarioError) as error:
         raise RunError(f"{path}: the run is damaged: {error}") from error

@@ -189,6 +189,15 @@ def test_a_damaged_run_says_so(tmp_path: Path) -> None:
 # --- commands ------------------------------------------------------------------------------------
 
 
+def test_a_run_of_another_version_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    rundir.save(run_sortie(example("duration_s=0.1")), path)
+    table = pq.read_table(path / "transmissions.parquet").drop_columns(["hops"])
+    pq.write_table(table, path / "transmissions.parquet")
+    with pytest.raises(RunError, match=r"run: the run is damaged: transmissions\.parquet has no column hops; another"):
+        rundir.load(path)
+
+
 def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path) -> None:
     done = sortie("fly", scenario, "--set", "fleet.battery.initial_soc=0.5", "--no-recording", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
