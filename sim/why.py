@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pyarrow.compute as pc
@@ -29,7 +30,7 @@ def why(metric: str, record: SortieRecord, result: dict[str, Any]) -> str:
     return "; ".join(f for f in facts if f)
 
 
-def _most(counts: dict[str, float]) -> list[tuple[str, float]]:
+def _most(counts: Mapping[str, float]) -> list[tuple[str, float]]:
     return sorted(((k, v) for k, v in counts.items() if v), key=lambda item: -item[1])[:FEW]
 
 
@@ -59,8 +60,8 @@ def _descriptors(result: dict[str, Any]) -> str:
 def _decisions(record: SortieRecord) -> str:
     table = record.tables["directives"]
     counts = {str(v["values"]): int(v["counts"]) for v in pc.value_counts(table["reason"]).to_pylist()}
-    shown = ", ".join(f"{reason!r} ×{n}" for reason, n in _most({k: float(v) for k, v in counts.items() if k}))
-    return f"decided because of {shown.replace('.0', '')}" if shown else ""
+    shown = ", ".join(f"{reason!r} ×{n}" for reason, n in _most({k: v for k, v in counts.items() if k}))
+    return f"decided because of {shown}" if shown else ""
 
 
 def _events(record: SortieRecord) -> str:
