@@ -229,7 +229,7 @@ def check(
         if checked.written:
             out.print(checked.written, soft_wrap=True, markup=False)
         if checked.failed:
-            out.print(f"see it with: {checked.replay}", soft_wrap=True)
+            out.print(f"see it with: {checked.replay}", soft_wrap=True, markup=False)
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
         raise typer.Exit(1)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from sim.compare import Compared
@@ -106,7 +107,7 @@ def transitions_table(result: dict[str, Any]) -> Table:
     for column in ("t (s)", "who", "what", "why"):
         table.add_column(column, justify="right" if column == "t (s)" else "left")
     for t_s, who, what, why in rows[:MAX_TRANSITIONS]:
-        table.add_row(f"{t_s:.2f}", who, what, why)
+        table.add_row(f"{t_s:.2f}", who, what, escape(why))  # a policy's own words, in which brackets are brackets
     return table
 
 
@@ -194,8 +195,9 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for column in ("", "expected", "got", "because"):
         table.add_column(column)
     for v in verdicts:
-        because = v.because + (f"\n[dim]the record: {v.why}[/dim]" if v.why else "")
-        table.add_row("[green]ok[/green]" if v.holds else "[red]FAILED[/red]", v.expected, v.got, because)
+        because = escape(v.because) + (f"\n[dim]the record: {escape(v.why)}[/dim]" if v.why else "")
+        verdict = "[green]ok[/green]" if v.holds else "[red]FAILED[/red]"
+        table.add_row(verdict, escape(v.expected), escape(v.got), because)
     return table
 
 

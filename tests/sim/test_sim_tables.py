@@ -1,0 +1,38 @@
+"""What users and policies wrote is printed as they wrote it."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+from rich.table import Table
+from sim_examples import example
+
+from policies.contract import Directive, FleetView, Representation
+from sim.expect import Verdict
+from sim.outcome import outcome
+from sim.sortie import run_sortie
+from sim.tables import transitions_table, verdict_table
+
+REASON = "as in [roi] and [/roi]"
+"""Which the terminal's markup would swallow, or stumble over."""
+
+
+def printed(table: Table) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_brackets_in_a_policys_reason_are_brackets() -> None:
+    def decide(view: FleetView) -> list[Directive]:
+        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=2.0, reason=REASON) for p in view.peers]
+
+    assert REASON in printed(transitions_table(outcome(run_sortie(example("duration_s=1"), decide))))
+
+
+def test_brackets_in_an_expectation_are_brackets() -> None:
+    verdict = Verdict(f"expected {REASON}", f"got {REASON}", False, f"because {REASON}", why=f"the record {REASON}")
+    said = printed(verdict_table("mine", [verdict]))
+    for text in (f"expected {REASON}", f"got {REASON}", f"because {REASON}", f"the record {REASON}"):
+        assert text in said
