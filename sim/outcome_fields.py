@@ -121,7 +121,9 @@ class Outcome(TypedDict):
     drones: Annotated[dict[str, Drone], "Each at the end."]
     energy_j: Annotated[dict[str, float], "By cause, and `total`; hover outweighs the radio about a hundredfold."]
     policies: Annotated[Policies, "Who decided, and how often it was put right."]
-    switches: Annotated[float | None, "Changes of what a link carries, per link and minute."]
+    switches: Annotated[
+        float | None, "Changes of what a link carries, per link and minute; links that change alike count each."
+    ]
     transitions: Annotated[list[Transition], "Each change of what links carry."]
     phases: Annotated[list[Phase], "By mission phase."]
     distrusted_by: Annotated[

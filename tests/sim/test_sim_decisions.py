@@ -14,7 +14,7 @@ import pytest
 from sim_examples import example
 
 from policies.contract import Directive, Disc, FleetView, Policy, Representation
-from sim.outcome import outcome
+from sim.outcome import describe, outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 
@@ -159,3 +159,18 @@ def test_a_link_that_hovers_about_a_threshold_steps_down_once_and_stays(tmp_path
 
     assert climbs(0.25) == 1  # after take-off
     assert climbs(0.0) > 3
+
+
+def test_switches_count_links_also_where_several_change_alike() -> None:
+    """Four links of each of five drones begin in one decision: an entry a drone in the log, and twenty switches."""
+    record = flown()
+    result = outcome(record)
+    carried: dict[tuple[int, int], str] = {}
+    changed = 0
+    for row in record.tables["directives"].to_pylist():
+        link, now = (row["drone"], row["peer"]), describe(row)
+        changed += carried.get(link, "nothing") != now
+        carried[link] = now
+    assert len(result["transitions"]) == 5
+    assert changed == 20
+    assert result["switches"] == pytest.approx(changed / 20 / (record.scenario.duration_s / 60))
