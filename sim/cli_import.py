@@ -36,10 +36,13 @@ def import_log(
     rate: Annotated[float, typer.Option(help="Rows a second of the trace.", min=0.1, max=1000)] = 10.0,
     from_s: Annotated[float, typer.Option("--from", help="Begin, seconds of the log.", min=0)] = 0.0,
     until_s: Annotated[
-        float | None, typer.Option("--until", help="End, seconds of the log; left out, its end.")
+        float | None, typer.Option("--until", help="End, seconds of the log; left out, its end.", min=0)
     ] = None,
     lift: Annotated[
-        float | None, typer.Option(help="Metres added to every height; left out, the lowest point flies at 2 m.")
+        float | None,
+        typer.Option(
+            help="Metres added to every height; left out, the lowest point flies at 2 m.", min=-10_000, max=10_000
+        ),
     ] = None,
 ) -> None:
     """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it as one drone.

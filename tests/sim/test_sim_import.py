@@ -95,6 +95,18 @@ def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "short.bin"]
 
 
+@pytest.mark.parametrize("option", ["--lift", "--until", "--from"])
+@pytest.mark.parametrize("value", ["nan", "-inf"])
+def test_an_option_that_is_no_figure_writes_nothing(option: str, value: str, tmp_path: Path) -> None:
+    """`--lift nan` left the trace without heights, and the scenario flew its own route."""
+    log = tmp_path / "short.bin"
+    log.write_bytes(examples.dataflash())
+    done = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out"), f"{option}={value}"])
+    assert done.exit_code == 2
+    assert f"Invalid value for '{option}'" in done.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_flight_replaces_a_flight_and_no_file_that_it_did_not_write(tmp_path: Path) -> None:
     log, out = tmp_path / "short.bin", tmp_path / "out"
     log.write_bytes(examples.dataflash())
