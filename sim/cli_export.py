@@ -60,7 +60,7 @@ def export(
         return
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
-    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", ".DS_Store"})
+    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap"})
     record = rundir.load(run)
     try:
         from sim.bag import write_bag

@@ -53,7 +53,7 @@ def import_log(
     from fleet.logtrace import context_trace, write_trace
 
     folder = out_dir or Path(slug(log))
-    ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO, ".DS_Store"})
+    ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO})
     if (folder / SCENARIO).is_file() and MADE not in (folder / SCENARIO).read_text("utf-8", "replace"):
         raise RunError(f"{folder}: its {SCENARIO} is none that sortie import wrote; choose another folder or move it")
     with user_errors():

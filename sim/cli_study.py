@@ -90,7 +90,7 @@ def study_report(
     plan = read_plan()
     drawn: list[tuple[str, str]] = []
     with user_errors():
-        ensure_folder(out_dir, TABLE, "report")
+        ensure_folder(out_dir, TABLE, "report", {REPORT, TABLE, *figures.CAPTIONS})
         rows = _read_rows(table)
         with replacing(out_dir) as folder:
             _write_table(to_table(rows), folder / TABLE)

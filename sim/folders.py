@@ -160,7 +160,7 @@ def _others(folder: Path, written: Collection[str], within: str = "") -> list[st
         name = within + entry.name
         if entry.is_dir() and any(w.startswith(f"{name}/") for w in written):
             found += _others(entry, written, f"{name}/")
-        elif entry.is_dir() or name not in written:
+        elif entry.is_dir() or (name not in written and entry.name != ".DS_Store"):  # a desktop that looked in
             found.append(name)
     return found
 

@@ -128,7 +128,7 @@ def ensure_writable(path: Path) -> None:
     Raises:
         RunError: naming the path.
     """
-    ensure_folder(path, TABLE, "report")
+    ensure_folder(path, TABLE, "report", {REPORT, TABLE, POINTS, VARIED, *FIGURES})
 
 
 def write(result: Result, path: Path) -> list[Path]:

@@ -21,7 +21,6 @@ PAGE = "report.html"
 WRITTEN = frozenset(
     {OUTCOME, SCENARIO, RECORD, RECORDING, *(f"{name}.parquet" for name in TABLES)}
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
-    | {".DS_Store"}  # a desktop that looked in
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
 

@@ -98,3 +98,14 @@ def test_a_comparison_in_a_readme_says_how_it_was_made(scenario: Path, tmp_path:
     said = f"sortie compare {scenario} --policies 'silence,all-4(rho=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
     assert f"`{said}`: 1 s, 2 drones, seed 3." in readme.read_text()
     assert (tmp_path / "new" / "c.rrd").is_file()
+
+
+def test_a_study_replaces_no_file_that_it_did_not_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "study"
+    out.mkdir()
+    for name in ("study.parquet", "README.md", "contrasts.png", "notes.txt"):
+        (out / name).write_text(name)
+    assert command("study", "report", out / "study.parquet", "--out", out) == 2
+    said = capsys.readouterr().err
+    assert said == f"error: {out}: holds notes.txt, which no report wrote; choose another folder or move it\n"
+    assert (out / "notes.txt").read_text() == "notes.txt"

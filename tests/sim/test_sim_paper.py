@@ -203,6 +203,14 @@ def test_a_folder_that_is_no_report_is_not_replaced(tmp_path: Path) -> None:
         paper.ensure_writable(tmp_path)
     with pytest.raises(RunError, match=r"thesis\.tex: is a file, a report needs a folder"):
         paper.ensure_writable(tmp_path / "thesis.tex")
+    report = tmp_path / "report"
+    report.mkdir()
+    for name in (paper.REPORT, paper.TABLE, paper.POINTS, paper.VARIED, *paper.FIGURES):
+        (report / name).write_text("made")
+    paper.ensure_writable(report)
+    (report / "thesis.tex").write_text("years of work")
+    with pytest.raises(RunError, match=r"report: holds thesis\.tex, which no report wrote"):
+        paper.ensure_writable(report)
 
 
 def test_a_readme_without_the_markers_says_so(result: paper.Result, tmp_path: Path) -> None:
