@@ -94,11 +94,10 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
         return Verdict(expected, error.args[0], False, expectation.because, name)
     holds = True
     if expectation.equals is not None:
-        holds = got == expectation.equals or (
-            isinstance(got, int | float)
-            and isinstance(expectation.equals, int | float)
-            and abs(got - expectation.equals) <= max(TOLERANCE, slack)
-        )
+        truths = [isinstance(x, bool) for x in (got, expectation.equals)]  # which are numbers to Python, and not here
+        holds = got == expectation.equals and truths[0] == truths[1]
+        if not any(truths) and isinstance(got, int | float) and isinstance(expectation.equals, int | float):
+            holds = abs(got - expectation.equals) <= max(TOLERANCE, slack)
     if expectation.at_least is not None or expectation.at_most is not None:
         number = isinstance(got, int | float) and not isinstance(got, bool)
         holds = (

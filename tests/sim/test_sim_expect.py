@@ -1,0 +1,32 @@
+"""What an outcome is held to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from sim_examples import example
+
+from scenarios.schema import Expectation
+from sim.expect import check
+from sim.outcome import outcome
+from sim.sortie import run_sortie
+
+
+@pytest.mark.parametrize(
+    ("metric", "equals", "holds"),
+    [
+        ("drones.0.airborne", True, True),
+        ("drones.0.airborne", 1.0, False),
+        ("replication", 0.0, True),
+        ("replication", False, False),
+        ("scenario", "example", True),
+        ("duration_s", "0.5", False),
+        ("duration_s", 0.5, True),
+    ],
+)
+def test_a_truth_is_no_number(metric: str, equals: Any, holds: bool) -> None:
+    record = run_sortie(example("duration_s=0.5"))
+    held = record.scenario.model_copy(update={"expect": (Expectation(metric=metric, equals=equals),)})
+    (verdict,) = check(held, record, outcome(record))
+    assert verdict.holds is holds
