@@ -393,8 +393,8 @@ class Medium(Generic[J, F]):
         self._waiting = [f for f in sent if f.fire_s > fire + SLOT_S / 2]
         sent = [f for f in sent if f.fire_s <= fire + SLOT_S / 2]
         for f in self._waiting:
-            if f.fire_s < inf:  # it had counted down to the moment the winner sent
-                f.slots = max(1, round((f.fire_s - fire) / SLOT_S))
+            if f.fire_s < inf:  # it had counted down to the moment the winner sent, if its AIFS was over by then
+                f.slots = min(f.slots, max(1, round((f.fire_s - fire) / SLOT_S)))
             f.fire_s = now + AIFS_CONTEXT_S + f.slots * SLOT_S
             self._context_from_s = now
         self._plan_context(now)

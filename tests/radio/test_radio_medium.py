@@ -199,6 +199,21 @@ def test_equal_counters_collide() -> None:
     assert [(s, c) for _, s, c in b.heard] == [(0, True), (1, True), (2, False)]
 
 
+@pytest.mark.parametrize("slots", [0, 3])
+def test_a_frame_whose_aifs_the_winner_cuts_short_keeps_its_counter(slots: int) -> None:
+    """A frame that begins to contend 1 µs before the winner sends is as one that begins 1 µs after."""
+    for late_s in (-1e-6, 1e-6):
+        b = Bench()
+        b.medium.announce(GroupFrame(0, 400e-6, 5), 0.0)
+        fires_s = AIFS_CONTEXT_S + 5 * SLOT_S
+        b.at(fires_s + late_s)
+        b.medium.announce(GroupFrame(1, 400e-6, slots), 0.0)
+        b.run()
+        first = fires_s + 400e-6
+        second = first + AIFS_CONTEXT_S + slots * SLOT_S + 400e-6
+        assert b.heard == [(pytest.approx(first), 0, False), (pytest.approx(second), 1, False)]
+
+
 def test_a_dropped_context_frame_frees_the_air() -> None:
     b = Bench()
     b.medium.announce(GroupFrame(0, 400e-6, 0), 0.0)
