@@ -245,6 +245,7 @@ class Air:
         for s in [s for s in self._in_flight.values() if s.sender == drone]:
             if s.number in self._in_flight:  # no earlier one's callback has settled it
                 if s.live:
+                    self._book(s)  # what it had put on the air; the medium's accounts are of now
                     self.medium.withdraw(s)
                 self._close(s, _LOST, "sender_gone")
         self.medium.retune()

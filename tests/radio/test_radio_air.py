@@ -210,6 +210,21 @@ def test_a_silenced_drone_neither_sends_nor_hears() -> None:
     }
 
 
+def test_what_a_silenced_drone_had_put_on_the_air_is_counted() -> None:
+    def wire_bytes(end: Callable[[Flight], object]) -> int:
+        f = Flight(STILL, 2)
+        f.air.advance()
+        f.send(0, 1, 600_000)
+        f.env.timeout(0.01).callbacks.append(lambda _: end(f))
+        f.env.run(until=0.02)
+        assert f.rows[0].airtime_s == pytest.approx(0.01)
+        assert f.air.counters.data_wire_bytes == sum(r.wire_bytes for r in f.rows)
+        return f.rows[0].wire_bytes
+
+    silenced = wire_bytes(lambda f: f.air.silence(0))
+    assert silenced == wire_bytes(lambda f: f.send(0, 1, 1)) > 100_000  # as one that is replaced then
+
+
 def test_what_is_in_flight_at_the_end_is_told() -> None:
     f = Flight(STILL, 2)
     f.air.advance()
