@@ -120,12 +120,11 @@ class Air:
 
         Silenced drones have none: their neighbours hear that they are gone.
         """
-        known_db = self.channel.before.square_db
-        if self._overrides is not None:
-            known_db = self._overrides.known_snr_db(known_db)
-        mbps = self._service.link_mbps(known_db)
-        if self._overrides is not None:
-            mbps = self._overrides.mbps(mbps)
+        known_db, given = self.channel.before.square_db, self._overrides
+        if given is None:
+            mbps = self._service.link_mbps(known_db)
+        else:
+            mbps = given.mbps(self._service.link_mbps(given.known_snr_db(known_db), given.loss))
         gone = sorted(self._gone)
         mbps[gone], mbps[:, gone] = 0.0, 0.0
         return mbps

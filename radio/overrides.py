@@ -103,6 +103,11 @@ class Overrides:
         known = np.array(self._known_rows)
         return np.where(np.isnan(known), modelled_db, known)
 
+    @property
+    def loss(self) -> FloatArray:
+        """[N, N]: the trace's loss in this frame, NaN where it has none."""
+        return self._given.loss
+
     def mbps(self, modelled: FloatArray) -> FloatArray:
         """[N, N]: the trace's goodput where it has one, else the model's."""
         return np.where(np.isnan(self._given.goodput_mbps), modelled, self._given.goodput_mbps)

@@ -326,8 +326,11 @@ class Service:
         payload = s.payload_bytes if s.left == s.fragments else self.repair_payload(s)
         return payload + s.left * frame_bytes(0, fragmented=s.fragments > 1 and not s.piece_bytes)
 
-    def link_mbps(self, snr_db: FloatArray) -> FloatArray:
-        """Payload rate of full A-MPDUs alone on the channel at a mean SNR, losses paid; 0 where there is no link or NaN."""
+    def link_mbps(self, snr_db: FloatArray, loss: FloatArray | None = None) -> FloatArray:
+        """Payload rate of full A-MPDUs alone on the channel at a mean SNR, losses paid; 0 where there is no link or NaN.
+
+        Args: `loss` of a try, in place of the PER, where it is not NaN; such a link is there whatever its SNR (`begin`).
+        """
         if self._mbps_at is None:
             table = self._table
             self._mbps_at = np.array(
@@ -338,7 +341,12 @@ class Service:
                 ]
             )
         at = np.array([self._table.index(snr) for snr in np.nan_to_num(snr_db, nan=-1e9).ravel().tolist()], np.intp)
-        return np.asarray(self._mbps_at[at].reshape(snr_db.shape))
+        mbps = np.asarray(self._mbps_at[at].reshape(snr_db.shape))
+        if loss is not None:
+            for link in zip(*np.nonzero(~np.isnan(loss)), strict=True):
+                mcs = max(0, self._table.mcs[self._table.index(snr_db[link])])
+                mbps[link] = self._quality(mcs, float(loss[link]))[2]
+        return mbps
 
     def _demand(self, payload_bytes: int, mcs: int, reliable: bool, piece_bytes: int) -> Exchanges:
         c, rate = self._config, self._rates[mcs]

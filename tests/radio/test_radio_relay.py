@@ -105,6 +105,21 @@ def test_far_ends_of_a_row_are_reached_over_its_middle() -> None:
     assert came[2] > 0.9
 
 
+def test_routes_know_a_traced_loss(tmp_path: Path) -> None:
+    """0 → 1 loses all at a perfect SNR, 0 → 2 half; 0 → 3, by the models out of everyone's range, nothing."""
+    at_m = np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0], [0.0, 20.0, 60.0], [2e6, 0.0, 60.0]])
+    links = trace(tmp_path, "0,0,1,,1,", "0,0,2,,0.5,", "0,0,3,,0,")
+    flight = Hover(Radio(trace=links, relay_max_hops=2, shadowing_sigma_db=0.0, retry_limit=20), at_m)
+    flight.fly(3.0, lambda frame: [flight.send(0, j, 20_000) for j in (1, 2, 3)])
+    mbps = flight.air.link_mbps()
+    assert mbps[0, 1] == 0.0
+    assert mbps[0, 2] == pytest.approx(0.5 * mbps[2, 0], rel=0.01)  # each frame goes twice
+    assert mbps[0, 3] > 0.0
+    assert {(r.receiver, r.hops, r.status) for r in flight.rows} == {
+        (1, 2, Status.DELIVERED), (2, 1, Status.DELIVERED), (3, 1, Status.DELIVERED),
+    }  # fmt: skip
+
+
 def test_a_lost_relay_is_left(tmp_path: Path) -> None:
     flight = Hover(traced(tmp_path, relay_max_hops=2), LINE_M)
 

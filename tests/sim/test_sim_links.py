@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pyarrow.compute as pc
 import pytest
 from sim_examples import example
@@ -47,6 +49,16 @@ def test_the_topology_is_told_where_payloads_are_relayed() -> None:
     assert all(r["connected"] and r["cut_drones"] == [] and r["bottleneck_mbps"] > 20 for r in rows[:3])
     assert all(not r["connected"] and r["cut_drones"] == [1] for r in rows[4:])
     assert run_sortie(example()).tables["topology"].num_rows == 0
+
+
+@pytest.mark.parametrize("quality", ["loss,1", "goodput_mbps,0", "snr_db,-30"])
+def test_links_that_a_trace_cuts_are_not_usable(quality: str, tmp_path: Path) -> None:
+    name, value = quality.split(",")
+    links = [f"0,{i},{j},{value}" for i in range(5) for j in range(5) if i != j and 1 in (i, j)]
+    (tmp_path / "links.csv").write_text("\n".join([f"t_s,sender,receiver,{name}", *links]) + "\n")
+    record = run_sortie(example(f"radio.trace={tmp_path / 'links.csv'}", "radio.relay_max_hops=3"))
+    assert set(record.tables["medium"]["connected_drones"].to_pylist()) == {4}
+    assert [cut for cut in record.tables["topology"]["cut_drones"].to_pylist() if cut != [1]] == []
 
 
 def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:
