@@ -50,8 +50,7 @@ class _Begin:
         env = world.env
         match event:
             case LinkDrop():
-                whom = f"{event.drone}" + ("" if event.peer is None else f"–{event.peer}")
-                world.note(event.drone, "link_drop", f"links of {whom} lose {event.loss_db:g} dB")
+                world.note(event.drone, "link_drop", f"links of {_ends(event)} lose {event.loss_db:g} dB")
                 world.add_loss(event.drone, event.peer, event.loss_db)
                 if event.until_s is not None:
                     at(env, event.until_s, self._end_link_drop)
@@ -96,7 +95,7 @@ class _Begin:
         event = self.event
         assert isinstance(event, LinkDrop)  # noqa: S101
         self.world.add_loss(event.drone, event.peer, -event.loss_db)
-        self.world.note(event.drone, "link_back", f"links of {event.drone} are back")
+        self.world.note(event.drone, "link_back", f"links of {_ends(event)} are back")
 
     def _end_jam(self) -> None:
         del self.world.jammers[self.index]
@@ -132,6 +131,10 @@ class _Begin:
                 return rng.bytes(len(genuine))
             case "oversized":
                 return genuine + bytes(OVERSIZED_BYTES)
+
+
+def _ends(drop: LinkDrop) -> str:
+    return f"{drop.drone}" if drop.peer is None else f"{drop.drone}–{drop.peer}"
 
 
 def _empty_handed(descriptor_bytes: bytes) -> bytes:

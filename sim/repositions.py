@@ -176,4 +176,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--duration-s", type=float, default=60.0)
     args = parser.parse_args()
+    if args.seeds < 2:  # intervals are over sorties
+        parser.error(f"argument --seeds: {args.seeds}, must be at least 2")
+    if not args.duration_s > TRACKING_FROM_S:
+        parser.error(
+            f"argument --duration-s: {args.duration_s:g}, must be above {TRACKING_FROM_S:g}, when tracking begins"
+        )
     sys.stdout.write(table(list(measure(range(1, args.seeds + 1), args.duration_s))))

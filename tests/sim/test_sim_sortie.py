@@ -277,6 +277,13 @@ def test_jam_and_link_drop_end_when_they_should(base: SortieRecord) -> None:
         assert len(outcome(hit)["events"]) == 2
 
 
+def test_the_end_of_a_link_drop_names_the_link() -> None:
+    drop = "{kind: link_drop, drone: 2, at_s: 1, until_s: 2"
+    for peer, whom in (("", "2"), (", peer: 4", "2–4")):
+        events = outcome(run_sortie(example("duration_s=3", f"events=[{drop}{peer}}}]")))["events"]
+        assert [e["text"] for e in events] == [f"links of {whom} lose 30 dB", f"links of {whom} are back"]
+
+
 # --- policies ------------------------------------------------------------------------------------
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -157,3 +159,17 @@ def test_nearer_the_region_more_is_found_in_it() -> None:
     settings = (*LONG, "duration_s=30", "perception.detector=surrogate", "fleet.viewpoints.speed_mps=8")
     stays, moves = (outcome(run_sortie(example(*settings), policy)) for policy in (share, vantage))
     assert moves["ap50"]["mission"] > stays["ap50"]["mission"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seeds", "1"], "argument --seeds: 1, must be at least 2"),
+        (["--duration-s", "5"], "argument --duration-s: 5, must be above 5, when tracking begins"),
+    ],
+)
+def test_gains_that_cannot_be_measured_are_refused(arguments: list[str], message: str) -> None:
+    """One sortie has no interval, and one that ends before it tracks has no accuracy: it was NaN."""
+    ran = subprocess.run([sys.executable, "-m", "sim.repositions", *arguments], capture_output=True, text=True)
+    assert ran.returncode == 2
+    assert ran.stderr.endswith(f"error: {message}\n")
