@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from perception.ap import Matched, average_precision, judge
 from perception.types import Boxes
+from radio.transmission import Status
+from sim.outcome_fields import REASONS
 from sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
@@ -213,10 +215,13 @@ def _distrusted_by(trust: pa.Table) -> dict[str, int]:
 
 
 def _miss_rate(sent: pa.Table) -> float | None:
-    """Payloads that missed their deadline or were replaced before it, over those whose fate is known."""
-    fates = _counts(sent["status"])
-    known = sent.num_rows - fates.get("in_flight", 0)
-    return _ratio(fates.get("expired", 0), known)
+    """Payloads that missed their deadline or were replaced before it, over those whose fate is known.
+
+    One of tiles that was cut short is one, whatever of it had come: it is `partial`, with the reason of an expired one.
+    """
+    known = sent.num_rows - _counts(sent["status"]).get(Status.IN_FLIGHT, 0)
+    reasons = _counts(sent["reason"])
+    return _ratio(sum(reasons.get(reason, 0) for reason in REASONS[Status.EXPIRED]), known)
 
 
 def _drones(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, dict[str, Any]]:

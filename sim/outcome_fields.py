@@ -110,7 +110,8 @@ class Outcome(TypedDict):
     context_share: Annotated[float | None, "Context bytes over all bytes."]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
     deadline_miss_rate: Annotated[
-        float | None, "Payloads that expired or were replaced before delivery, over those whose fate is known."
+        float | None,
+        "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known.",
     ]
     payload_fates: Annotated[dict[str, int], "Counts by status and reason."]
     medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy."]

@@ -41,6 +41,17 @@ def test_parts_are_fused_where_samples_are_lost(tiled: SortieRecord) -> None:
     assert outcome(tiled)["ap50"]["full_scene"] > outcome(whole)["ap50"]["full_scene"]
 
 
+def test_a_payload_that_its_deadline_cuts_short_has_missed_it(tiled: SortieRecord) -> None:
+    result = outcome(run_sortie(example("policy.name=all-4", "policy.params={rho: 1.0}", "radio.framing=tiles")))
+    fates = result["payload_fates"]
+    cut = sum(fates.get(f"partial/{r}", 0) for r in ("replaced", "deadline_in_service", "deadline_queued"))
+    assert cut > 100
+    known = sum(fates.values()) - fates["in_flight"]
+    late = sum(n for fate, n in fates.items() if fate.startswith("expired/"))
+    assert result["deadline_miss_rate"] == pytest.approx((late + cut) / known)
+    assert outcome(tiled)["deadline_miss_rate"] < 0.01  # fragments are lost, deadlines are not missed
+
+
 def test_the_topology_is_told_where_payloads_are_relayed() -> None:
     cut = "events=[{kind: link_drop, at_s: 3, drone: 1, loss_db: 60}]"
     record = run_sortie(example(cut, "radio.relay_max_hops=3"))
