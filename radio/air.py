@@ -37,7 +37,7 @@ from scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample asks some ten times
 _SERVED, _DEADLINE_QUEUED = End.SERVED, End.DEADLINE_QUEUED
-_DELIVERED, _LOST, _EXPIRED, _PARTIAL = Status.DELIVERED, Status.LOST, Status.EXPIRED, Status.PARTIAL
+_DELIVERED, _LOST, _EXPIRED = Status.DELIVERED, Status.LOST, Status.EXPIRED
 _WINDOW_S = 1e-3
 """A goodput measurement that is still going on counts once it is this old."""
 
@@ -342,12 +342,11 @@ class Air:
         c = self.counters
         c.data_wire_bytes += row.wire_bytes
         c.data_delivered_bytes += row.arrived_bytes
-        if row.status is _PARTIAL:
-            c.data_lost_bytes += s.payload_bytes - row.arrived_bytes
-        elif status is _LOST:
-            c.data_lost_bytes += s.payload_bytes
+        rest_bytes = s.payload_bytes - row.arrived_bytes
+        if status is _LOST:
+            c.data_lost_bytes += rest_bytes
         elif status is _EXPIRED:
-            c.data_expired_bytes += s.payload_bytes
+            c.data_expired_bytes += rest_bytes
         s.on_done(row)
 
     # --- what senders know -----------------------------------------------------------------------

@@ -29,8 +29,10 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     data_sent = _sum(sent["payload_bytes"])
     by_status = {s: _sum(sent.filter(pc.equal(sent["status"], s))["payload_bytes"]) for s in DATA_STATUSES}
     partial = sent.filter(pc.equal(sent["status"], "partial"))
-    by_status["delivered"] += _sum(partial["arrived_bytes"])  # what the rest of them came to is lost
-    by_status["lost"] += _sum(partial["payload_bytes"]) - _sum(partial["arrived_bytes"])
+    by_status["delivered"] += _sum(partial["arrived_bytes"])
+    rest = pc.subtract(partial["payload_bytes"], partial["arrived_bytes"])
+    for status in (Status.LOST, Status.EXPIRED):  # the rest of them came to what their reasons are of
+        by_status[status] += _sum(rest.filter(pc.is_in(partial["reason"], pa.array(REASONS[status]))))
     context_bytes = totals["context_descriptor_bytes"] + totals["context_directive_bytes"]
     scenario = record.scenario
     minutes = scenario.duration_s / 60.0

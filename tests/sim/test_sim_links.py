@@ -42,7 +42,8 @@ def test_parts_are_fused_where_samples_are_lost(tiled: SortieRecord) -> None:
 
 
 def test_a_payload_that_its_deadline_cuts_short_has_missed_it(tiled: SortieRecord) -> None:
-    result = outcome(run_sortie(example("policy.name=all-4", "policy.params={rho: 1.0}", "radio.framing=tiles")))
+    record = run_sortie(example("policy.name=all-4", "policy.params={rho: 1.0}", "radio.framing=tiles"))
+    result = outcome(record)
     fates = result["payload_fates"]
     cut = sum(fates.get(f"partial/{r}", 0) for r in ("replaced", "deadline_in_service", "deadline_queued"))
     assert cut > 100
@@ -50,6 +51,11 @@ def test_a_payload_that_its_deadline_cuts_short_has_missed_it(tiled: SortieRecor
     late = sum(n for fate, n in fates.items() if fate.startswith("expired/"))
     assert result["deadline_miss_rate"] == pytest.approx((late + cut) / known)
     assert outcome(tiled)["deadline_miss_rate"] < 0.01  # fragments are lost, deadlines are not missed
+    sent = record.tables["transmissions"].to_pylist()
+    rest = [r for r in sent if r["reason"] in ("replaced", "deadline_in_service", "deadline_queued")]
+    expired = sum(r["payload_bytes"] - r["arrived_bytes"] for r in rest)
+    assert expired == result["bytes"]["data_expired"] == record.totals["data_expired_bytes"]
+    assert result["bytes"]["data_lost"] == record.totals["data_lost_bytes"] == 0  # nothing was, on so good a link
 
 
 def test_the_topology_is_told_where_payloads_are_relayed() -> None:
