@@ -60,6 +60,7 @@ class _Begin:
                 if event.until_s is not None:
                     at(env, event.until_s, self._end_jam)
             case DroneLost():
+                world.drain()  # what it has spent up to now
                 if world.agents[event.drone].airborne:
                     world.remove(event.drone, "drone_lost", "fell silent")
             case BatteryFault():

@@ -256,6 +256,16 @@ def test_a_drone_lands_at_its_landing_charge() -> None:
     assert not [r for r in record.tables["descriptors"].to_pylist() if r["drone"] == 3 and r["t_s"] > silent_from_s]
 
 
+@pytest.mark.parametrize(("rate_hz", "at_s"), [(10, 2.0), (10, 2.05), (0.5, 2.0), (0.5, 3.0)])
+def test_a_lost_drone_has_spent_what_it_flew(rate_hz: float, at_s: float) -> None:
+    lost = f"events=[{{kind: drone_lost, drone: 3, at_s: {at_s}}}]"
+    spent_j = [
+        outcome(run_sortie(example(f"context.rate_hz={rate_hz}", *more)))["drones"]["3"]["energy_j"]
+        for more in ((lost,), ("events=[]", f"duration_s={at_s}"))
+    ]
+    assert spent_j[0] == pytest.approx(spent_j[1], rel=1e-3)
+
+
 def test_a_battery_fault_takes_its_energy_and_is_in_the_ledger() -> None:
     o = outcome(run_sortie(example("events=[{kind: battery_fault, drone: 1, at_s: 2.0, lost_fraction: 0.5}]")))
     assert o["energy_j"]["fault"] > 0.4 * 130 * 3600 * 0.9
