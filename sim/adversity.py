@@ -30,10 +30,16 @@ def group_key(seed: int) -> bytes:
 def schedule(scenario: Scenario, world: World, ether: Ether, *, seed: int, replication: int) -> None:
     """Put every event of the scenario on the clock; call once, before anything else is scheduled.
 
-    Events come before the frame that begins at the same instant.
+    Events come before the frame that begins at the same instant, and so do their ends: from now, the clock says all of
+    their times to the last digit.
     """
-    for index, event in enumerate(scenario.events):
-        at(world.env, event.at_s, _Begin(scenario, world, ether, event, index, seed, replication))
+    begins = [_Begin(scenario, world, ether, e, index, seed, replication) for index, e in enumerate(scenario.events)]
+    for begin in begins:
+        at(world.env, begin.event.at_s, begin)
+    for begin in begins:
+        event = begin.event
+        if isinstance(event, LinkDrop | Jam | Lie) and event.until_s is not None:
+            at(world.env, event.until_s, begin.end)
 
 
 class _Begin:
@@ -52,13 +58,9 @@ class _Begin:
             case LinkDrop():
                 world.note(event.drone, "link_drop", f"links of {_ends(event)} lose {event.loss_db:g} dB")
                 world.add_loss(event.drone, event.peer, event.loss_db)
-                if event.until_s is not None:
-                    at(env, event.until_s, self._end_link_drop)
             case Jam():
                 world.note(-1, "jam", f"a jammer of {event.power_dbm:g} dBm at {event.position_m}")
                 world.jammers[self.index] = (event.position_m, event.power_dbm)
-                if event.until_s is not None:
-                    at(env, event.until_s, self._end_jam)
             case DroneLost():
                 world.drain()  # what it has spent up to now
                 if world.agents[event.drone].airborne:
@@ -83,24 +85,20 @@ class _Begin:
                 world.note(event.drone, "lie", f"claims {event.claim} {event.about}")
                 lie = partial(falsified, about=event.about, claim=event.claim)
                 world.agents[event.drone].lies[self.index] = lie
-                if event.until_s is not None:
-                    at(env, event.until_s, self._end_lie)
 
-    def _end_lie(self) -> None:
-        event = self.event
-        assert isinstance(event, Lie)  # noqa: S101
-        del self.world.agents[event.drone].lies[self.index]
-        self.world.note(event.drone, "lie_over", "tells the truth again")
-
-    def _end_link_drop(self) -> None:
-        event = self.event
-        assert isinstance(event, LinkDrop)  # noqa: S101
-        self.world.add_loss(event.drone, event.peer, -event.loss_db)
-        self.world.note(event.drone, "link_back", f"links of {_ends(event)} are back")
-
-    def _end_jam(self) -> None:
-        del self.world.jammers[self.index]
-        self.world.note(-1, "jam_over", "the jammer is off")
+    def end(self) -> None:
+        """What lasts is over."""
+        world, event = self.world, self.event
+        match event:
+            case LinkDrop():
+                world.add_loss(event.drone, event.peer, -event.loss_db)
+                world.note(event.drone, "link_back", f"links of {_ends(event)} are back")
+            case Jam():
+                del world.jammers[self.index]
+                world.note(-1, "jam_over", "the jammer is off")
+            case Lie():
+                del world.agents[event.drone].lies[self.index]
+                world.note(event.drone, "lie_over", "tells the truth again")
 
     def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
         """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""

@@ -287,6 +287,23 @@ def test_jam_and_link_drop_end_when_they_should(base: SortieRecord) -> None:
         assert len(outcome(hit)["events"]) == 2
 
 
+@pytest.mark.parametrize(("begin_s", "end_s"), [(2.4, 6.7), (6.65, 6.7)])
+def test_what_ends_with_a_frame_ends_before_it(begin_s: float, end_s: float) -> None:
+    """2.4 + (6.7 − 2.4) is a digit above 6.7, and at 6.65 the frame of 6.7 stands on the clock already."""
+    drop = f"events=[{{kind: link_drop, drone: 2, at_s: {begin_s}, until_s: {end_s}, loss_db: 15}}]"
+    flown = [run_sortie(example("duration_s=7", events)) for events in ("events=[]", drop)]
+    assert [e["t_s"] for e in flown[1].tables["events"].to_pylist()] == [begin_s, end_s]
+    clear_db, after_db = (
+        {
+            (row["peer"], row["snr_db"])
+            for row in record.tables["transmissions"].to_pylist()
+            if row["drone"] == 2 and end_s < row["t_sent_s"] < end_s + 0.1
+        }
+        for record in flown
+    )
+    assert after_db == clear_db != set()
+
+
 def test_the_end_of_a_link_drop_names_the_link() -> None:
     drop = "{kind: link_drop, drone: 2, at_s: 1, until_s: 2"
     for peer, whom in (("", "2"), (", peer: 4", "2–4")):
