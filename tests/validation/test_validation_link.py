@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import link
 import pytest
+import simpy
 
+from radio.airtime import BLOCK_ACK_S, Exchanges
+from radio.contention import DIFS_S, SIFS_S, SLOT_S
+from radio.jobs import GroupFrame, Job
+from radio.medium import Medium
 from scenarios.schema import Radio
 
 
@@ -17,6 +22,25 @@ def test_propagation_is_within_its_closed_forms() -> None:
     assert all(row["largest difference, dB"] < 0.05 for row in link.friis())
     assert all(abs(row["slope beyond, dB a decade (40)"] - 40) < 0.1 for row in link.two_rays())
     assert all(abs(row["standard errors off"]) < 4 for row in link.outage(500))
+
+
+def test_unequal_senders_share_as_the_medium_shares() -> None:
+    """Two jobs of a thousand exchanges each, one eight times as long as the other, side by side for 0.2 s."""
+    around_s = SIFS_S + BLOCK_ACK_S + DIFS_S + SLOT_S
+    asked = [Exchanges(1000, 1000 * s, 1000 * (s + around_s)) for s in (4e-3, 0.5e-3)]
+    env = simpy.Environment()
+    medium = Medium[Job, GroupFrame](
+        env, 2, lambda job, _: job.demand(asked[job.sender]), lambda *_: None, lambda *_: None
+    )
+    jobs = [Job(i, i, 10.0) for i in range(2)]
+    for job in jobs:
+        medium.submit(job)
+    env.run(until=0.2)
+    medium.sync()
+    slow, fast = (1.0 - job.remaining for job in jobs)
+    told = {row["model"]: row["fast over slow, bits"] for row in link.unequal()}
+    assert told["fluid (equal time)"] == pytest.approx(fast / slow, abs=0.006)
+    assert told["CSMA/CA"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_hundred_drones_cost_one_event_a_broadcast() -> None:
