@@ -16,7 +16,7 @@ SUFFIXES = (".py", ".json", ".safetensors")
 """Sources, and what is learned and shipped beside them."""
 LIBRARIES = ("numpy", "scipy", "simpy", "networkx", "numba", "torch")
 LOOKS = (
-    "sim/cli*.py", "sim/playback*.py", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py", "sim/expect.py",
+    "sim/cli/*", "sim/playback/*", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py", "sim/expect.py",
     "sim/golden.py", "sim/compare.py", "sim/paper.py", "sim/campaign/*.py", "perception/study/*", "scenarios/library/*",
     "scenarios/schema.json",
 )  # fmt: skip

@@ -13,7 +13,7 @@ from sim.campaign import code
 @pytest.fixture
 def rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("fleet/agent.py", "perception/weights/net.safetensors", "policies/learned.json", "sim/campaign/plan.py",
-                 "sim/cli_fly.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors",
+                 "sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors",
                  "scenarios/library/traces/links.json", "fleet/README.md"):  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("before")
@@ -35,7 +35,7 @@ def test_what_decides_a_run_changes_its_code_version(rooms: Path, name: str) -> 
 
 
 @pytest.mark.parametrize(
-    "name", ["sim/cli_fly.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors", "scenarios/library/traces/links.json", "fleet/README.md"]
+    "name", ["sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors", "scenarios/library/traces/links.json", "fleet/README.md"]
 )  # fmt: skip
 def test_what_only_looks_at_runs_does_not(rooms: Path, name: str) -> None:
     assert not changed(rooms, name, "after")

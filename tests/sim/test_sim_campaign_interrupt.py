@@ -23,7 +23,7 @@ pytest.importorskip("distributed")
 
 DRIVER = """
 import sys
-from sim.cli import main
+from sim.cli.app import main
 if __name__ == "__main__":
     sys.argv[:2] = ["sortie", "campaign"]
     main()

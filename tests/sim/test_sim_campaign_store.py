@@ -365,7 +365,7 @@ def test_polars_reads_it_with_one_line(tmp_path: Path) -> None:
 
 DRIVER = """
 import sys
-from sim.cli import main
+from sim.cli.app import main
 sys.argv = ["sortie", "campaign", sys.argv[1], "--workers", "0", "--out", sys.argv[2], "--no-report"]
 main()
 """

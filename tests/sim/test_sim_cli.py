@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from perception.surrogate.model import SHIPPED as CALIBRATION
 from sim import rundir
-from sim.cli import app, main
+from sim.cli.app import app, main
 from sim.expect import check
 from sim.folders import RunError
 from sim.outcome import outcome
@@ -49,7 +49,7 @@ def command(*arguments: object) -> int:
 def sortie(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """The real command in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-c", "from sim.cli import main; main()", *map(str, arguments)],
+        [sys.executable, "-c", "from sim.cli.app import main; main()", *map(str, arguments)],
         capture_output=True, text=True, cwd=cwd, check=False,
     )  # fmt: skip
 
@@ -161,7 +161,7 @@ def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
     def flown(*_: object, **__: object) -> None:
         raise AssertionError("flown")
 
-    monkeypatch.setattr("sim.cli.run_sortie", flown)
+    monkeypatch.setattr("sim.cli.fly.run_sortie", flown)
     assert command("fly", scenario, "--no-recording", "--out", path) == 2
     assert "run: holds mynotes.txt, which no run wrote; choose another folder or move it" in capsys.readouterr().err
 

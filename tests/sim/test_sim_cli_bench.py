@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from perception.bench.dataset import Benchmark
 from perception.bench.difficulty import DENSITIES, Split
 from perception.geometry import FULL, SMALL
-from sim.cli import app
-from sim.cli_bench import DensityName, RangeName, SplitName
+from sim.cli.app import app
+from sim.cli.bench import DensityName, RangeName, SplitName
 from sim.folders import RunError
 
 run = CliRunner()

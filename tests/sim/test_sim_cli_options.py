@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from sim_examples import BASE
 
-from sim.cli import main
+from sim.cli.app import main
 
 
 @pytest.fixture

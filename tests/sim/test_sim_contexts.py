@@ -20,8 +20,9 @@ from policies.registry import POLICIES
 from scenarios.contexts import Contexts
 from scenarios.load import ScenarioError, context_sets, library, load_contexts
 from scenarios.schema import Perception
-from sim import cli_contexts, learn
-from sim.cli import main
+from sim import learn
+from sim.cli import contexts as commands
+from sim.cli.app import main
 from sim.contexts import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
 from sim.folders import RunError
 from sim.in_flight import torch_answers
@@ -197,7 +198,7 @@ def test_the_tables_fit_a_narrow_terminal() -> None:
     contexts = held_out("contexts")
     policies = list(POLICIES)
     cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in contexts.contexts]
-    tables = list(cli_contexts._by_context(contexts, policies, cells, 80))
+    tables = list(commands._by_context(contexts, policies, cells, 80))
     assert [str(c.header) for t in tables for c in t.columns if c.header not in ("context", "rho")] == policies
     console = Console(width=80, record=True, file=io.StringIO())
     for table in tables:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from perception.detectors import DETECTORS
 from policies.conformance import conform
 from scenarios.load import load
-from sim.cli import app
+from sim.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = sorted((ROOT / "docs" / "guide").glob("*.md"))

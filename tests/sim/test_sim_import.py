@@ -15,7 +15,7 @@ from fleet.flightlog import read_log
 from fleet.logtrace import context_trace
 from fleet.traces import COLUMNS, read_traces
 from scenarios.load import load
-from sim.cli import app
+from sim.cli.app import app
 from sim.folders import RunError
 from sim.sortie import run_sortie
 

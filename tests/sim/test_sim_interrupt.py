@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from sim_examples import BASE
 
-import sim.cli
+from sim.cli import app, fly
 
 COMMAND = """
 import signal, sys
@@ -30,7 +30,7 @@ from {module} import {function}
 
 def entry_point() -> dict[str, str]:
     """Module and function of the command, as it is installed."""
-    text = (Path(sim.cli.__file__).parents[1] / "pyproject.toml").read_text("utf-8")
+    text = (Path(app.__file__).parents[2] / "pyproject.toml").read_text("utf-8")
     module, _, function = tomllib.loads(text)["project"]["scripts"]["sortie"].partition(":")
     return {"module": module, "function": function}
 
@@ -41,7 +41,7 @@ def started(name: str, before: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("name", ["sim.cli", "typer", "numpy", "scipy.special", "pyarrow", "fleet.motion"])
+@pytest.mark.parametrize("name", ["sim.cli.app", "typer", "numpy", "scipy.special", "pyarrow", "fleet.motion"])
 def test_while_the_command_is_still_imported(name: str) -> None:
     ended = started(name)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted; nothing was written\n")
@@ -62,10 +62,10 @@ def test_while_a_sortie_flies(
 
     scenario = tmp_path / "example.yaml"
     scenario.write_text(BASE)
-    monkeypatch.setattr(sim.cli, "run_sortie", flown)
+    monkeypatch.setattr(fly, "run_sortie", flown)
     monkeypatch.setattr(sys, "argv", ["sortie", "fly", str(scenario), "--out", str(tmp_path / "run")])
     with pytest.raises(SystemExit) as stop:
-        sim.cli.main()
+        app.app()
     assert stop.value.code == 130
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", "interrupted; what was not finished was not written\n")

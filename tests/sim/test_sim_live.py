@@ -21,7 +21,7 @@ from fleet.cdr import MalformedDatagram
 from fleet.staleness import LinkHealth
 from fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
 from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sim.cli import app
+from sim.cli.app import app
 from sim.folders import RunError
 from sim.live import messages
 from sim.live.bus import LOOPBACK, Bus

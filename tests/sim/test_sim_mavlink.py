@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 from fleet.mavlink import KEY_BYTES, Listener, Transmitter, answers
 from sim import rundir
-from sim.cli import app
+from sim.cli.app import app
 from sim.folders import RunError
 from sim.record import SortieRecord
 from sim.sortie import run_sortie

@@ -20,7 +20,7 @@ from fleet.wire import decode_descriptor, decode_directive
 from policies.contract import Descriptor
 from sim import rundir
 from sim.bag import descriptors, write_bag
-from sim.cli import app
+from sim.cli.app import app
 from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie

@@ -11,7 +11,7 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from policies.prior import METHODS
-from sim.cli import app
+from sim.cli.app import app
 from sim.compare import compare
 from sim.outcome import outcome
 from sim.sortie import run_sortie

@@ -23,7 +23,7 @@ from perception.types import Boxes
 from policies.registry import resolve
 from sim import paper, plane
 from sim.folders import RunError
-from sim.playback_frame import SHADES, save_frame
+from sim.playback.frame import SHADES, save_frame
 from sim.sortie import run_sortie
 
 ROOT = Path(__file__).resolve().parents[2]

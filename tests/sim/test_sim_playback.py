@@ -19,12 +19,13 @@ from sim_examples import example
 
 from perception.budget import CELL_M
 from scenarios.schema import Scenario
-from sim import playback
 from sim.folders import RunError
 from sim.outcome import accuracy, matched, outcome, transitions
-from sim.playback import LiveViewer, open_viewer, save_rrd, scene_of, to_file
-from sim.playback_canvas import goodput_colours
-from sim.playback_received import hatch
+from sim.playback import recording
+from sim.playback.canvas import goodput_colours
+from sim.playback.received import hatch
+from sim.playback.recording import save_rrd, scene_of
+from sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
 from sim.record import TABLES, SortieRecord
 from sim.sortie import run_sortie
 from sim.words import decision_in_words
@@ -592,7 +593,7 @@ def test_a_failed_save_leaves_nothing(record: SortieRecord, tmp_path: Path, monk
         raise OSError(28, "No space left on device")
 
     (tmp_path / "sortie.rrd").write_text("an older one")
-    monkeypatch.setattr(playback.Playback, "add", fail)
+    monkeypatch.setattr(recording.Playback, "add", fail)
     with pytest.raises(RunError, match=r"sortie\.rrd: cannot be written: No space left on device$"):
         save_rrd(record, tmp_path / "sortie.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["sortie.rrd"]
@@ -637,4 +638,4 @@ def test_a_viewer_that_fails_is_quoted(
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("DISPLAY", ":99")
     with pytest.raises(RunError, match=r"the viewer (failed|does not come up): winit: no window for you$"):
-        playback.to_new_viewer(rr.RecordingStream("test"), scenario()) if live else open_viewer(saved)
+        to_new_viewer(rr.RecordingStream("test"), scenario()) if live else open_viewer(saved)

@@ -9,8 +9,8 @@ import pytest
 from rerun.chunk import RrdReader
 from sim_examples import example
 
-from sim.playback import save_comparison, save_rrd
-from sim.playback_comparison import roots
+from sim.playback.comparison import roots
+from sim.playback.recording import save_comparison, save_rrd
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from sim_examples import example
 
-from sim import playback_picture
 from sim.folders import RunError
-from sim.playback import save_comparison, save_rrd
-from sim.playback_picture import take_picture
+from sim.playback import picture
+from sim.playback.picture import take_picture
+from sim.playback.recording import save_comparison, save_rrd
 from sim.sortie import run_sortie
 
 DRIVERS = list(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
@@ -83,14 +83,14 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     fake, pid = tmp_path / "rerun", tmp_path / "pid"
     fake.write_text(f"#!/bin/sh\nsleep 600 &\necho $! > {pid}.part\nmv {pid}.part {pid}\nwait\n")
     fake.chmod(0o755)
-    monkeypatch.setattr(playback_picture, "viewer_binary", lambda: str(fake))
+    monkeypatch.setattr(picture, "viewer_binary", lambda: str(fake))
 
     def never(port: int, viewer: subprocess.Popen[bytes]) -> bool:
         while not pid.exists():
             time.sleep(0.01)
         return False
 
-    monkeypatch.setattr(playback_picture, "listens", never)
+    monkeypatch.setattr(picture, "listens", never)
     with pytest.raises(RunError, match=r"it does not come up$"):
         take_picture(tmp_path / "there.rrd", tmp_path / "p.png", 0.0)
     until_s = time.monotonic() + 30.0  # killed at once, but somebody has to collect it
@@ -116,7 +116,7 @@ def test_what_cannot_be_pictured_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     fake = tmp_path / "rerun"
     fake.write_text("#!/bin/sh\necho 'wgpu: no suitable graphics adapter' >&2\nexit 3\n")
     fake.chmod(0o755)
-    monkeypatch.setattr(playback_picture, "viewer_binary", lambda: str(fake))
+    monkeypatch.setattr(picture, "viewer_binary", lambda: str(fake))
     with pytest.raises(RunError, match=re.escape("there.rrd: no Vulkan driver to render with (Debian: apt install")):
         take_picture(tmp_path / "there.rrd", tmp_path / "p.png", 0.0)
     assert not (tmp_path / "p.png").exists()

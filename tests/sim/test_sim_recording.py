@@ -11,7 +11,7 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from perception.outside.recorded import RecordingError
-from sim.cli import app
+from sim.cli.app import app
 from sim.compare import compare
 from sim.sortie import run_sortie
 

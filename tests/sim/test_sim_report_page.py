@@ -17,7 +17,7 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from sim import report_figures, rundir
-from sim.cli import app
+from sim.cli.app import app
 from sim.folders import RunError
 from sim.outcome import outcome
 from sim.record import SortieRecord

@@ -12,7 +12,7 @@ from policies.contract import TaskPhase
 from policies.registry import resolve
 from policies.views import draw_views, from_json, to_json
 from sim import console
-from sim.cli import main
+from sim.cli.app import main
 from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 
 FAULTY = '''

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from fleet.coverage import footprint_radius_m
 from fleet.formation import slots
 from scenarios.schema import Scenario
-from sim.playback_canvas import SIM_TIME, SPAN_M
+from sim.playback.canvas import SIM_TIME, SPAN_M
 
 SEEN = """
 **Boxes**: what drone {ego} makes of the scene: green, a car found; yellow, missed; red, a false alarm; the darker,

@@ -64,7 +64,7 @@ def train(
     from perception.training.recipe import Recipe
     from perception.training.train import train as train_detector
     from sim import tables
-    from sim.playback_training import TrainingLog
+    from sim.playback.training import TrainingLog
 
     half_extent_m = float(range_.value)
     with user_errors():  # before scenes are rendered, which takes minutes

@@ -1,8 +1,4 @@
-"""Playback in Rerun: a recording of the whole sortie, a viewer that follows it live, and the way to open either.
-
-Saved and streamed sorties go through the same `Playback`; it reads tables and changes none.
-Entity paths and colours: `sim.playback_scene`, `sim.playback_charts`; layout: `sim.playback_layout`.
-"""
+"""The Rerun viewer: started on a recording, or on a sortie while it flies."""
 
 from __future__ import annotations
 
@@ -15,114 +11,23 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import rerun as rr
-import rerun.blueprint as rrb
 
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
-from sim.folders import RunError, partial_file
-from sim.playback_canvas import Canvas, Floats
-from sim.playback_charts import Charts
-from sim.playback_comparison import comparison, roots
-from sim.playback_layout import blueprint, legend
-from sim.playback_scene import Drawing
-from sim.record import SortieRecord
-from sim.sightings import sightings
-
-APPLICATION = "sortie"
-START_TIMEOUT_S = 15.0
-"""How long a viewer may take until it listens."""
+from sim.folders import RunError
+from sim.playback.layout import blueprint
+from sim.playback.recording import APPLICATION, Playback
 
 Sink = Callable[[rr.RecordingStream, Scenario], None]
 """Connects a new recording to where it goes, with the layout for the scenario."""
-
-
-class Playback:
-    """Draws one sortie into a recording, all below `root`, from tables that come whole or second by second."""
-
-    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "") -> None:
-        canvas = Canvas(recording, scenario.context.rate_hz, root)
-        self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
-        self._disc_t_s: Floats = np.zeros(0)
-        self._discs: Floats = np.zeros((0, 3))
-        if not root:
-            recording.send_recording_name(f"{scenario.name} · {scenario.policy.name} · seed {scenario.seed}")
-        canvas.static("about", legend(scenario))
-        self._scene.begin()
-        self._charts.begin()
-
-    def add(self, known_s: float, new: Mapping[str, pa.Table]) -> None:
-        """Draw new rows of every table; all that happened before `known_s` is in them or came before."""
-        mission = new["mission"]
-        discs = np.column_stack([mission[f"region_{k}"].to_numpy() for k in ("x_m", "y_m", "radius_m")])
-        self._disc_t_s = np.concatenate([self._disc_t_s[-1:], mission["t_s"].to_numpy()])
-        self._discs = np.concatenate([self._discs[-1:], discs])
-        seen = list(sightings(new, self._disc_t_s, self._discs))
-        self._scene.add(known_s, new, seen)
-        self._charts.add(known_s, new, seen)
-
-
-def save_rrd(record: SortieRecord, path: Path) -> None:
-    """Save a sortie as a Rerun recording with its layout inside; written to a temporary name, then renamed.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
-    with _new_file(path, blueprint(record.scenario)) as recording:
-        Playback(recording, record.scenario, scene_of(record)).add(record.scenario.duration_s, record.tables)
-
-
-def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> None:
-    """Save sorties of one scenario side by side in one recording, each below its label's root (`roots`).
-
-    Args:
-        flown: each policy's label and its sortie; alike but for the policy.
-        path: the recording.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
-    labels = [label for label, _ in flown]
-    scenario = flown[0][1].scenario
-    with _new_file(path, comparison(scenario, labels)) as recording:
-        recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {scenario.seed}")
-        for root, (_, record) in zip(roots(labels), flown, strict=True):
-            playback = Playback(recording, record.scenario, scene_of(record), root)
-            playback.add(record.scenario.duration_s, record.tables)
-
-
-@contextmanager
-def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails."""
-    partial = partial_file(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
-        recording = rr.RecordingStream(APPLICATION)
-        recording.save(partial, default_blueprint=layout)
-        yield recording
-        recording.flush()
-        recording.disconnect()
-        partial.rename(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
-
-
-def scene_of(record: SortieRecord) -> SceneModel:
-    """The scene that the sortie flew over, made anew from its scenario and where it flew."""
-    states, scenario = record.tables["states"], record.scenario
-    x, y = states["x_m"].to_numpy(), states["y_m"].to_numpy()
-    bounds = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
-    return SceneModel(scenario.perception.scene, scenario.mission.target, bounds)
+START_TIMEOUT_S = 15.0
+"""How long a viewer may take until it listens."""
 
 
 class LiveViewer:

@@ -1,6 +1,6 @@
 """The plots, lanes and logs of a playback: what was carried, what it cost, and who decided what, and why.
 
-As in `sim.playback_scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
+As in `sim.playback.scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import rerun as rr
 
 from perception.ap import Matched, average_precision
 from scenarios.schema import Scenario
-from sim import playback_canvas as c
 from sim.outcome import transitions
-from sim.playback_canvas import Canvas, Floats, line
+from sim.playback import canvas as c
+from sim.playback.canvas import Canvas, Floats, line
 from sim.sightings import Sighting
 from sim.words import decision_in_words, event_in_words
 

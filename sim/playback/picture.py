@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.folders import RunError
-from sim.playback import end, listens, viewer_binary
-from sim.playback_canvas import SIM_TIME
+from sim.playback.canvas import SIM_TIME
+from sim.playback.viewer import end, listens, viewer_binary
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

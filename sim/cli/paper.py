@@ -168,8 +168,8 @@ def _safe(text: str) -> str:
 
 
 def _open_frame(picture: Picture, path: Path, out: Console, *, show: bool) -> None:
-    from sim.playback import open_viewer
-    from sim.playback_frame import save_frame
+    from sim.playback.frame import save_frame
+    from sim.playback.viewer import open_viewer
 
     save_frame(picture, path)
     out.print(

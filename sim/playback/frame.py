@@ -20,7 +20,7 @@ from perception.harness.picture import Picture, to_world
 from perception.render import CAMERAS
 from perception.types import Boxes
 from sim.folders import RunError, partial_file
-from sim.playback_canvas import MISSION, drone_colour
+from sim.playback.canvas import MISSION, drone_colour
 
 APPLICATION = "sortie-frame"
 TRUTH, FOUND = (150, 152, 158, 255), (80, 150, 255, 255)

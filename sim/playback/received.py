@@ -21,8 +21,8 @@ import rerun as rr
 from fleet.frames import yaw_rad
 from perception.budget import CELL_M, roi_mask
 from perception.geometry import CELLS
-from sim import playback_canvas as c
-from sim.playback_canvas import Canvas, Floats
+from sim.playback import canvas as c
+from sim.playback.canvas import Canvas, Floats
 
 STEP_S = 0.5
 """The hatching is drawn anew so often."""

@@ -1,0 +1,1 @@
+"""The `sortie` command, a file a group of its commands."""

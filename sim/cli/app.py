@@ -1,0 +1,93 @@
+"""The `sortie` command: its commands, each in a file of this folder, and what a user can mend told in one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from typer.core import TyperGroup
+
+from fleet.motion import MotionError
+from fleet.wire import DescriptorTooLarge
+from perception.errors import InputError
+from policies.contract import PolicyError
+from scenarios.load import ScenarioError
+from scenarios.traces import TraceError
+from sim.cli import (
+    bench,
+    calibrate,
+    campaign,
+    check,
+    compare,
+    contexts,
+    export,
+    fly,
+    import_log,
+    listing,
+    live,
+    paper,
+    recording,
+    report,
+    study,
+    train,
+    verify,
+    view,
+)
+from sim.console import err, out
+from sim.folders import RunError
+from sim.sortie import VERSION
+
+
+class _Commands(TyperGroup):
+    """Says that a command was interrupted, before typer ends it without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            err.print("interrupted; what was not finished was not written")
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Fly drone fleets that share what they see, and tell what they saw and what it cost.",
+)
+app.add_typer(bench.app, name="bench")
+app.add_typer(recording.app, name="recording")
+app.add_typer(campaign.app, name="campaign")
+app.add_typer(study.study, name="study")
+COMMANDS: dict[str, Callable[..., None]] = {
+    "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_,
+    "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": contexts.learn,
+    "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
+    "import": import_log.import_log, "live": live.live,
+}  # fmt: skip
+for name, command in COMMANDS.items():
+    app.command(name)(command)
+
+
+USER_ERRORS = (ScenarioError, PolicyError, MotionError, TraceError, DescriptorTooLarge, InputError, RunError)
+"""What a user can mend: one line and exit code 2, no traceback."""
+
+
+def main() -> None:
+    """The `sortie` command, once it is imported (sim.__main__)."""
+    try:
+        app()
+    except USER_ERRORS as error:
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
+        sys.exit(2)
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        out.print(VERSION)
+        raise typer.Exit

@@ -1,0 +1,40 @@
+"""`sortie check`: scenarios against their own expectations."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from scenarios.load import library, load
+from sim import tables
+from sim.cli.options import SetOption
+from sim.console import bars, err, out
+
+
+def check(
+    scenarios: Annotated[list[str], typer.Argument(help="Scenario files or names; all: the whole library.")],
+    set_: SetOption = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing.")
+    ] = False,
+) -> None:
+    """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
+    from sim.checking import check_scenario, flights
+
+    names = list(library()) if scenarios == ["all"] else scenarios
+    loaded = [(name, load(name, set_ or [])) for name in names]  # all of them, before the first one flies
+    failed = 0
+    for name, flown in loaded:
+        with bars() as bar:
+            watch = bar(flown.name, flown.duration_s * flights(flown))
+            checked = check_scenario(name, set_ or [], update=update, progress=watch)
+        failed += len(checked.failed)
+        out.print(tables.verdict_table(flown.name, checked.verdicts))
+        if checked.written:
+            out.print(checked.written, soft_wrap=True, markup=False)
+        if checked.failed:
+            out.print(f"see it with: {checked.replay}", soft_wrap=True, markup=False)
+    if failed:
+        err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
+        raise typer.Exit(1)

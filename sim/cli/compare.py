@@ -1,0 +1,100 @@
+"""`sortie compare`: policies side by side, on a scenario or over a set of contexts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from policies.contract import PolicyError
+from policies.registry import POLICIES
+from policies.registry import own_fusion as own_fusion_of
+from scenarios.load import load_contexts
+from scenarios.schema import Scenario
+from sim import tables
+from sim.cli.contexts import compare_contexts, refuse
+from sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
+from sim.compare import compare as compare_policies
+from sim.console import bars, out
+from sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+
+
+def compare(
+    scenario: ScenarioArgument,
+    policies: Annotated[
+        str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence; all: every one, over contexts.")
+    ],
+    seed: SeedOption = None,
+    set_: SetOption = None,
+    own_fusion: Annotated[
+        bool, typer.Option("--own-fusion", help="Prior methods fly with the fusion they were published with.")
+    ] = False,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
+    recording: Annotated[Path | None, typer.Option(help="Save all of them side by side as a Rerun recording.")] = None,
+    readme: Annotated[
+        Path | None, typer.Option(help="A Markdown file whose section between the comparison's markers is replaced.")
+    ] = None,
+    by_torch: Annotated[
+        bool, typer.Option("--by-torch", help="Contexts flown by the surrogate are scored by the torch detector.")
+    ] = False,
+) -> None:
+    """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
+    contexts = load_contexts(scenario)
+    if contexts is not None:
+        refuse({"seed": seed, "own-fusion": own_fusion or None, "recording": recording, "readme": readme})
+        chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
+        return compare_contexts(contexts, chosen, set_ or [], out_file, by_torch=by_torch)
+    if by_torch:
+        raise RunError(f"--by-torch goes with a set of contexts; for {scenario}: --set perception.detector=torch")
+    flown = [(p, loaded(scenario, set_, p)) for p in _split_policies(policies)]
+    ensure_files(out_file, recording)
+    ensure_between(readme, tables.COMPARE_BEGIN, tables.COMPARE_END)
+    if own_fusion:
+        flown = [(p, _with_own_fusion(s)) for p, s in flown]
+    with bars() as bar:
+        each = {label: bar(label, s.duration_s) for label, s in flown}
+        rows = compare_policies(flown, seed, progress=lambda label, t_s: each[label](t_s))
+    out.print(tables.comparison_table(rows))
+    for line in tables.explanations(rows):
+        out.print(line)
+    if out_file is not None:
+        told = {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows}
+        write_text(out_file, json.dumps(told, indent=2) + "\n")
+        out.print(f"kept in [bold]{out_file}[/bold]")
+    if readme is not None:
+        command = tables.compare_command(scenario, policies, seed, set_ or [], own_fusion=own_fusion)
+        section = tables.comparison_markdown(rows, command)
+        put_between(readme, section, tables.COMPARE_BEGIN, tables.COMPARE_END)
+        out.print(f"the comparison in [bold]{readme}[/bold] written")
+    if recording is not None:
+        from sim.playback.recording import save_comparison
+
+        save_comparison([(r.policy, r.record) for r in rows], recording)
+        out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
+
+
+def _with_own_fusion(scenario: Scenario) -> Scenario:
+    fusion = own_fusion_of(scenario.policy.name)
+    if fusion is None:
+        return scenario
+    perception = scenario.perception.model_copy(update={"fusion": fusion})
+    return scenario.model_copy(update={"perception": perception})
+
+
+def _split_policies(text: str) -> list[str]:
+    """Split at commas outside brackets."""
+    names, depth = [""], 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if letter == "," and depth == 0:
+            names.append("")
+        else:
+            names[-1] += letter
+    cleaned = [n.strip() for n in names if n.strip()]
+    if not cleaned:
+        raise PolicyError("no policy named, as in --policies worked,all-4,silence")
+    if len(set(cleaned)) < len(cleaned):
+        raise PolicyError(f"a policy is named twice: {', '.join(cleaned)}")
+    return cleaned

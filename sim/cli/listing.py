@@ -1,0 +1,46 @@
+"""`sortie list`: what there is to fly, and with what."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from perception.detectors import DETECTORS
+from policies.registry import POLICIES, parameters
+from scenarios.load import campaigns, library, load
+from scenarios.schema import json_schema
+from sim.console import out
+
+
+def list_(
+    what: Annotated[
+        str, typer.Argument(help="policies, scenarios, campaigns, detectors, fusions or schema (JSON Schema).")
+    ],
+) -> None:
+    """List what there is."""
+    if what == "policies":
+        for name, function in POLICIES.items():
+            defaults = ", ".join(f"{k}={v}" for k, v in parameters(function).items())
+            summary = (function.__doc__ or "").strip().splitlines()[0]
+            out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}", soft_wrap=True)
+    elif what == "scenarios":
+        for name, path in library().items():
+            out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
+    elif what == "campaigns":
+        from scenarios.load_campaign import load_campaign
+
+        for name in campaigns():
+            out.print(f"[bold]{name}[/bold]  {load_campaign(name).campaign.description}", soft_wrap=True)
+    elif what == "detectors":
+        for name, kind in DETECTORS.items():
+            out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
+    elif what == "fusions":
+        from perception.fusion.registry import FUSIONS  # here: torch takes a second to import
+
+        for name, fusion in FUSIONS.items():
+            out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)
+    elif what == "schema":
+        out.print_json(data=json_schema())
+    else:
+        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, campaigns, detectors, fusions or schema")

@@ -1,0 +1,35 @@
+"""What several commands ask for: a scenario, what to override of it, a policy, a seed."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from scenarios.load import load
+from scenarios.schema import Scenario
+from sim.console import err
+from sim.named import policy_overrides
+
+ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.battery.initial_soc=0.5")
+]
+SeedOption = Annotated[int | None, typer.Option(help="Of every draw; left out, its own.", min=0, max=2**63 - 1)]
+PolicyOption = Annotated[
+    str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
+]
+
+
+def loaded(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario:
+    """The scenario with `--set` and the policy put in; another policy than its own starts from its own defaults."""
+    overrides = list(set_ or [])
+    own = load(scenario, overrides)
+    if policy is None:
+        return own
+    flown = load(scenario, overrides + policy_overrides(policy, own.policy.name))
+    if own.policy.changes and not flown.policy.changes:
+        err.print(
+            f"{policy} flies to the end: the changes and commands of {own.name} are its own policy's", soft_wrap=True
+        )
+    return flown

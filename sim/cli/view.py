@@ -1,0 +1,38 @@
+"""`sortie view`: a run in the Rerun viewer, or a picture of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sim import rundir
+from sim.console import err, out
+from sim.folders import RunError
+
+
+def view(
+    run: Annotated[Path, typer.Argument(help="A run's folder.")],
+    picture: Annotated[
+        Path | None, typer.Option(help="Save a picture of the viewer here and open none; needs no screen.")
+    ] = None,
+    at_s: Annotated[float, typer.Option("--at", help="The picture's simulated time, s.", min=0)] = 0.0,
+) -> None:
+    """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
+    from sim.playback.recording import save_rrd
+    from sim.playback.viewer import open_viewer
+
+    if at_s and picture is None:
+        raise RunError("--at goes with --picture: the viewer has a time line of its own")
+    path = run / rundir.RECORDING
+    if not path.is_file():
+        save_rrd(rundir.load(run), path)
+    if picture is None:
+        open_viewer(path)
+        return
+    from sim.playback.picture import take_picture
+
+    for complaint in take_picture(path, picture, at_s):
+        err.print(complaint, soft_wrap=True)
+    out.print(f"kept in [bold]{picture}[/bold]", soft_wrap=True)
