@@ -58,6 +58,11 @@ class Form(NamedTuple):
         """The least difference of two charges that shows."""
         return 0.0 if self.number_bits == 32 else _step((0.0, 1.0), self.number_bits)
 
+    @property
+    def goodput_step_mbps(self) -> float:
+        """The least difference of two goodputs that shows."""
+        return 0.0 if self.number_bits == 32 else _step(_GOODPUT, self.number_bits)
+
 
 FULL = Form()
 

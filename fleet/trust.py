@@ -76,7 +76,7 @@ class Standing(NamedTuple):
     reason: str = ""
     """The latest doubt."""
     seconds: int = 0
-    """How often it was judged."""
+    """Judgements since it was first judged, those included at which nothing was heard of it."""
     first_soc: float = 0.0
     """Its charge when it was first judged."""
     least_soc: float = 1.0
@@ -110,13 +110,14 @@ def judge(
         form: how finely descriptors are written; what rounding can do is no doubt.
 
     Returns:
-        Standings of all in `known`, and of others unchanged: one strike more where a claim cannot be so, one less
+        Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
     seen_per_metre = _metres_seen_per_metre_up(known)
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / s.seconds for i, s in before.items()}
-    after = dict(standings)
+    # who was not heard drained on: its fall, once it is heard again, is over this second too
+    after = {i: s if i in known else s._replace(seconds=s.seconds + 1) for i, s in standings.items()}
     for peer, claim in known.items():
         standing = before[peer]
         doubt = ""
@@ -124,7 +125,7 @@ def judge(
             others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.seconds
             doubt = (
                 (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
-                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()))
+                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps / 2)
                 or battery_doubt(
                     claim.battery_soc,
                     standing.least_soc,
@@ -186,15 +187,18 @@ def coverage_doubt(d: Descriptor, seen_per_metre: float, blur_m: float = 0.0) ->
     return f"coverage: {missing} cells unseen that it must see" if missing >= FALSE_CELLS else ""
 
 
-def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival]) -> str:
-    """What a goodput claim says against the payloads that came over the link; empty where it may be so."""
+def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival], rounded_mbps: float = 0.0) -> str:
+    """What a goodput claim says against the payloads that came over the link; empty where it may be so.
+
+    Args: `rounded_mbps` is how far the claim may be off by the descriptor's form.
+    """
     if not arrivals:
         return ""
     fastest_mbps = max(a.phy_mbps for a in arrivals)
-    if claimed_mbps > OVERSTATED * fastest_mbps:
+    if claimed_mbps - rounded_mbps > OVERSTATED * fastest_mbps:
         return f"goodput: {claimed_mbps:.0f} Mb/s claimed, frames came at {fastest_mbps:.0f}"
     rates = [a.mbps for a in arrivals if a.size_bytes >= LARGE_BYTES]
-    if rates and claimed_mbps < UNDERSTATED * median(rates):
+    if rates and claimed_mbps + rounded_mbps < UNDERSTATED * median(rates):
         return f"goodput: {claimed_mbps:.1f} Mb/s claimed, {median(rates):.0f} arrived"
     return ""
 

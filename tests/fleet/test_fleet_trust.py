@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.compact import Form, decode_compact, encode_compact
 from fleet.coverage import survey
 from fleet.lies import falsified
 from fleet.trust import (
@@ -89,7 +90,7 @@ def test_nobody_doubts_itself() -> None:
 def test_who_left_is_remembered_as_it_was() -> None:
     standings = after(20, ("coverage", "much"))
     gone = {i: d for i, d in fleet(20).items() if i != 1}
-    assert judge(standings, 0, gone, {})[1] == standings[1]
+    assert judge(standings, 0, gone, {})[1] == standings[1]._replace(seconds=21)
 
 
 # --- coverage ------------------------------------------------------------------------------------
@@ -146,6 +147,20 @@ def test_battery_against_the_past_and_the_fleet() -> None:
     assert battery_doubt(0.945, 0.945, 0.95, 0.02) == "", "a battery four times as large"
 
 
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_a_goodput_that_its_form_rounds_to_nothing_is_no_lie(bits: int) -> None:
+    """1.9 Mb/s are told as 0 in steps of 4: what came at 1.6 is no doubt. What lies further off is one all the same."""
+    form = Form(number_bits=bits)
+    slow = [Arrival(12_000, 0.06, 8.6)]
+    for goodput, came, doubted in ((1.9, slow, False), (0.1, [Arrival(160_000, 0.02, 100.0)], True)):
+        standings: dict[int, Standing] = {}
+        for second in range(5):
+            known = {i: decode_compact(encode_compact(d, form)) for i, d in fleet(second).items()}
+            known[1] = decode_compact(encode_compact(honest(1, 20.0, 0.0, 0.9 - 0.0005 * second, goodput), form))
+            standings = judge(standings, 0, known, {1: came}, form)
+        assert (standings[1].trust < 1.0) is doubted, standings[1].reason
+
+
 def test_a_charge_in_whole_percents_is_no_lie() -> None:
     """As a real drone's telemetry has it: a step every 25 s. One that never falls is found all the same, a percent later."""
     standings: dict[int, Standing] = {}
@@ -187,6 +202,15 @@ def test_the_loss_of_a_strong_drone_brings_nobody_into_doubt() -> None:
             del known[1]
         standings = judge(standings, 0, known, {})
         assert all(s.trust == 1.0 for s in standings.values())
+
+
+def test_the_return_of_a_silent_majority_brings_nobody_into_doubt() -> None:
+    """Three of five are heard for four seconds and again from the 80th on: they fell all the while, as all did."""
+    standings: dict[int, Standing] = {}
+    for second in range(100):
+        known = {i: d for i, d in fleet(second).items() if i in (0, 2) or not 4 <= second < 80}
+        standings = judge(standings, 0, known, {})
+        assert all(s.trust == 1.0 for s in standings.values()), second
 
 
 def test_a_doubted_drone_stays_where_it_is_and_says_nothing() -> None:
