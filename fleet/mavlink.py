@@ -30,6 +30,8 @@ _SENSORS = (
 )
 _UNKNOWN_U16 = 0xFFFF
 _MAX_I16 = 0x7FFF
+_FARTHEST_UP_M = 100_000.0
+"""Of an origin; altitudes go in 32-bit millimetres."""
 _LOG_STAMP = struct.Struct(">Q")
 SIGNING_EPOCH_US = 1_420_070_400_000_000
 """2015-01-01, from which the clocks of signed frames count."""
@@ -54,6 +56,8 @@ class Origin:
                 f"origin is ({self.latitude_deg}, {self.longitude_deg}), must lie within ±85° and ±180°: a local "
                 "east and north mean nothing at a pole"
             )
+        if not abs(self.altitude_m) <= _FARTHEST_UP_M:
+            raise ValueError(f"its altitude is {self.altitude_m} m, must be within ±{_FARTHEST_UP_M:g} m")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +101,7 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
     position, velocity = swap_enu_ned(state.position_m).tolist(), swap_enu_ned(state.velocity_mps).tolist()
     latitude, longitude, altitude = geodetic(state.position_m, origin)
     heading = round(float(compass_deg(yaw_rad(state.orientation_xyzw))) * 100) % 36000
-    charge, current_ca = round(state.soc * 100), min(round(state.current_a * 100), _MAX_I16)
+    charge, current_ca = round(state.soc * 100), _fitting(state.current_a * 100)
     return [
         mavlink2.MAVLink_heartbeat_message(
             mavlink2.MAV_TYPE_QUADROTOR,
@@ -116,7 +120,7 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
             round(longitude * 1e7),
             round(altitude * 1000),
             round(state.position_m[2] * 1000),
-            *(round(v * 100) for v in velocity),
+            *(_fitting(v * 100) for v in velocity),
             heading,
         ),
         mavlink2.MAVLink_sys_status_message(
@@ -154,13 +158,17 @@ def _roll_pitch_yaw(w: float, x: float, y: float, z: float) -> tuple[float, floa
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def _fitting(value: float) -> int:
+    """A number in 16 bits; what traces tell may lie beyond them."""
+    return max(-_MAX_I16, min(round(value), _MAX_I16))
+
+
 def _pack_voltage_mv(voltage_v: float) -> list[int]:
     """BATTERY_STATUS.voltages: cells are not modelled singly, so the pack's voltage stands in slot 0 and what does
-    not fit there in slot 1, as the message's definition asks."""
-    total = round(voltage_v * 1000)
-    if total < _UNKNOWN_U16:
-        return [total] + [_UNKNOWN_U16] * 9
-    return [_UNKNOWN_U16 - 1, total - _UNKNOWN_U16 + 1] + [_UNKNOWN_U16] * 8
+    not fit there in the slots after it, as the message's definition asks."""
+    full, rest = divmod(round(voltage_v * 1000), _UNKNOWN_U16 - 1)
+    slots = [_UNKNOWN_U16 - 1] * full + [rest] * (rest > 0 or not full)
+    return slots + [_UNKNOWN_U16] * (10 - len(slots))
 
 
 STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS"})
@@ -220,7 +228,8 @@ def answers(request: mavlink2.MAVLink_message, drone: int) -> list[mavlink2.MAVL
         peer, component = request.get_srcSystem(), request.get_srcComponent()
         return [mavlink2.MAVLink_mission_count_message(peer, component, 0, request.mission_type)]
     if asked == "COMMAND_LONG":
-        version = request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and int(request.param1) == _VERSION_ID
+        # compared as the float that it is: it may be no number
+        version = request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and request.param1 == _VERSION_ID
         result = mavlink2.MAV_RESULT_ACCEPTED if version else mavlink2.MAV_RESULT_UNSUPPORTED
         said: list[mavlink2.MAVLink_message] = [mavlink2.MAVLink_command_ack_message(request.command, result)]
         return [*said, _version(drone)] if version else said

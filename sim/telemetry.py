@@ -141,11 +141,13 @@ class MavlinkEndpoint:
         self._stream: Stream | None = None
         self._listener = Listener()
         self._begin_s = 0.0
-        self._peer: tuple[str, int] | None = None if self._waits else (host, port)
+        self._peer: Any = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if self._waits:
                 self._socket.bind((host, port))
+            else:  # a name is looked up once, not for every frame
+                self._peer = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]
             self._socket.setblocking(False)
             self.address = self._socket.getsockname()
         except OSError as error:
@@ -200,7 +202,8 @@ def _parse(address: str) -> tuple[bool, str, int]:
     """Whether to wait for a peer, and host and port."""
     kind, _, rest = address.partition(":")
     host, _, port = rest.rpartition(":")
-    if kind not in ("udpout", "udpin") or not host or not port.isdigit() or not 0 <= int(port) <= 65_535:
+    least = int(kind == "udpout")  # any free port may be waited at, none sent to
+    if kind not in ("udpout", "udpin") or not host or not port.isdecimal() or not least <= int(port) <= 65_535:
         raise RunError(f"{address!r} is no MAVLink address, must be as udpout:127.0.0.1:14550 or udpin:127.0.0.1:14550")
     return kind == "udpin", host, int(port)
 

@@ -15,11 +15,7 @@ from sim.folders import RunError, ensure_folder
 BAG, TLOG = "bag", "sortie.tlog"
 BEGIN = "2026-01-01T00:00:00"
 """When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
-FIRST, LAST = datetime(1970, 1, 1, tzinfo=UTC), datetime(2038, 1, 1, tzinfo=UTC)
-"""What a bag's stamps can tell, whole seconds in 32 bits, and any sortie that begins before the end besides."""
-
-SIGNED_FROM_US = (datetime(2015, 1, 1, tzinfo=UTC) - FIRST) // timedelta(microseconds=1)
-"""Where the time in MAVLink's signatures begins."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def export(
@@ -46,13 +42,13 @@ def export(
     if key is not None and not tlog:
         raise typer.BadParameter("--key signs --tlog alone")
     if origin is not None and not tlog:
-        raise typer.BadParameter("--origin places --tlog alone: a bag is in metres")
-    began_us = (moment(begin) - FIRST) // timedelta(microseconds=1)
+        raise typer.BadParameter("--origin places --tlog alone")
+    # ROS counts seconds in 32 bits, signatures from 2015 on; beyond 2096 a log's stamps are no times
+    first, end = (1970, 2038) if mcap else (2015 if key is not None else 1970, 2096)
+    began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
     if tlog:
         from sim.telemetry import ORIGIN, parse_origin, read_key, save_tlog
 
-        if key is not None and began_us < SIGNED_FROM_US:
-            raise RunError(f"begin is {begin!r}, must be from 2015 on with --key: signatures count from there")
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
         where = ORIGIN if origin is None else parse_origin(origin)
         frames = save_tlog(rundir.load(run), path, began_us, where, secret)
@@ -71,8 +67,8 @@ def export(
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)
 
 
-def moment(text: str) -> datetime:
-    """A time as ISO 8601; UTC where it names no zone.
+def moment(text: str, first: int, end: int) -> datetime:
+    """A time as ISO 8601, from the first year to before the end's; UTC where it names no zone.
 
     Raises:
         RunError: it is none, or one that stamps cannot tell, naming it.
@@ -82,6 +78,6 @@ def moment(text: str) -> datetime:
     except ValueError:
         raise RunError(f"begin is {text!r}, must be a time as in {BEGIN}") from None
     when = when if when.tzinfo is not None else when.replace(tzinfo=UTC)
-    if not FIRST <= when < LAST:
-        raise RunError(f"begin is {text!r}, must be from {FIRST.year} on and before {LAST.year}")
+    if not datetime(first, 1, 1, tzinfo=UTC) <= when < datetime(end, 1, 1, tzinfo=UTC):
+        raise RunError(f"begin is {text!r}, must lie from {first} to before {end}")
     return when

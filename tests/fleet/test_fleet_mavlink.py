@@ -113,6 +113,14 @@ def test_landed_is_disarmed_and_large_packs_overflow_into_the_second_slot() -> N
     assert large["SYS_STATUS"].current_battery == 32767
 
 
+def test_what_a_trace_may_tell_fits_the_wire() -> None:
+    """Voltages to 200 V, currents of either sign, a jump of 20 km within a row."""
+    far = sent(replace(STATE, voltage_v=200.0, current_a=-500.0, velocity_mps=(2e5, -2e5, 0.0)))
+    assert far["BATTERY_STATUS"].voltages == [65534, 65534, 65534, 3398] + [65535] * 6
+    assert far["SYS_STATUS"].current_battery == far["BATTERY_STATUS"].current_battery == -32767
+    assert (far["GLOBAL_POSITION_INT"].vx, far["GLOBAL_POSITION_INT"].vy) == (-32767, 32767)
+
+
 def test_geodetic_against_the_ellipsoid() -> None:
     """Earth-centred coordinates of both ends are as far apart as the drone is from the origin."""
 

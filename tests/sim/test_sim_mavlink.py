@@ -105,14 +105,14 @@ def test_a_lost_drone_is_disarmed(log: Path) -> None:
 def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path: Path) -> None:
     run = tmp_path / "run"
     rundir.save(record, run)
-    arguments = ["export", str(run), "--tlog", "--begin", "2026-11-21T09:00:00", "--origin", "52.5,13.4,30"]
+    arguments = ["export", str(run), "--tlog", "--begin", "2026-11-21T09:00:00.25", "--origin", "52.5,13.4,30"]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 0, said.output
     dump = [str(Path(sys.executable).parent / "mavlogdump.py"), "--format", "json", "--types", "GLOBAL_POSITION_INT"]
     done = subprocess.run([sys.executable, *dump, str(run / "sortie.tlog")], capture_output=True, text=True, check=True)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(lines) == 5 * record.scenario.frames
-    assert lines[0]["meta"]["timestamp"] == 1_795_251_600.0
+    assert lines[0]["meta"]["timestamp"] == 1_795_251_600.25
     assert lines[0]["data"]["lat"] == pytest.approx(52.5e7, abs=5_000)
 
 
@@ -122,7 +122,7 @@ def test_a_log_is_signed_from_2015_on(record: SortieRecord, tmp_path: Path) -> N
     key.write_text("ab" * 32)
     command = ["export", str(run), "--tlog", "--key", str(key), "--begin"]
     said = CliRunner().invoke(app, [*command, "2014-12-31"])
-    assert str(said.exception).startswith("begin is '2014-12-31', must be from 2015 on with --key")
+    assert str(said.exception).startswith("begin is '2014-12-31', must lie from 2015 to before 2096")
     assert CliRunner().invoke(app, [*command, "2015-01-01"]).exit_code == 0
 
 
@@ -235,6 +235,7 @@ def test_a_waiting_endpoint_answers_a_ground_station_and_sends_to_it(record: Sor
         (mavlink2.MAVLink_param_request_list_message(0, 0), ["PARAM_VALUE"]),
         (mavlink2.MAVLink_mission_request_list_message(3, 1, 0), ["MISSION_COUNT"]),
         (mavlink2.MAVLink_command_long_message(3, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0), ["COMMAND_ACK", "AUTOPILOT_VERSION"]),
+        (mavlink2.MAVLink_command_long_message(3, 1, 512, 0, math.nan, 0, 0, 0, 0, 0, 0), ["COMMAND_ACK"]),
         (mavlink2.MAVLink_command_long_message(3, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0), ["COMMAND_ACK"]),
         (mavlink2.MAVLink_command_long_message(4, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0), []),
         (mavlink2.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), []),
@@ -364,15 +365,31 @@ def test_a_key_with_nothing_to_sign_is_named(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--key", str(tmp_path / "key")])
     assert said.exit_code == 2
     assert "--key signs --tlog alone" in said.output
+    said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--origin", "47,8"])
+    assert said.exit_code == 2
+    assert "--origin places --tlog alone" in said.output
 
 
 # --- what can go wrong -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("address", ["14550", "udp:127.0.0.1:14550", "udpout::14550", "udpout:127.0.0.1:99999"])
+@pytest.mark.parametrize(
+    "address", ["14550", "udp:127.0.0.1:14550", "udpout::14550", "udpout:127.0.0.1:99999", "udpout:127.0.0.1:0"]
+)
 def test_an_address_that_is_none_is_named(address: str) -> None:
     with pytest.raises(RunError, match=re.escape(f"{address!r} is no MAVLink address, must be as udpout:")):
         MavlinkEndpoint(address)
+
+
+def test_a_host_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once, not by a sortie that tells nobody anything."""
+
+    def unknown(*_: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(RunError, match=r"^udpout:nowhere\.invalid:14550: Name or service not known$"):
+        MavlinkEndpoint("udpout:nowhere.invalid:14550")
 
 
 def test_a_port_that_is_taken_is_named() -> None:
@@ -383,7 +400,7 @@ def test_a_port_that_is_taken_is_named() -> None:
             MavlinkEndpoint(f"udpin:127.0.0.1:{port}")
 
 
-@pytest.mark.parametrize("text", ["here", "47", "1,2,3,4", "89,0"])
+@pytest.mark.parametrize("text", ["here", "47", "1,2,3,4", "89,0", "47,8,nan", "47,8,1e9"])
 def test_an_origin_that_is_none_is_named(text: str) -> None:
     with pytest.raises(RunError, match=rf"^origin is '{text}', must be latitude,longitude or"):
         parse_origin(text)

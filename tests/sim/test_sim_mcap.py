@@ -217,9 +217,13 @@ def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_
     ("arguments", "message"),
     [
         (["--mcap", "--begin", "noon"], r"begin is 'noon', must be a time as in 2026-01-01T00:00:00"),
-        (["--mcap", "--begin", "1969-12-31"], r"begin is '1969-12-31', must be from 1970 on and before 2038"),
-        (["--tlog", "--begin", "1969-12-31T23:59+00:00"], r"must be from 1970 on and before 2038"),
-        (["--mcap", "--begin", "2038-01-01"], r"begin is '2038-01-01', must be from 1970 on and before 2038"),
+        (["--mcap", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2038"),
+        (["--mcap", "--begin", "2050-01-01"], r"begin is '2050-01-01', must lie from 1970 to before 2038"),
+        (["--tlog", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2096"),
+        (
+            ["--tlog", "--begin", "2010-01-01", "--key", "k"],
+            r"begin is '2010-01-01', must lie from 2015 to before 2096",
+        ),
         (["--mcap", "--out", "."], r"holds files but no metadata\.yaml"),
     ],
 )
