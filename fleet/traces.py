@@ -6,15 +6,15 @@ One row a drone and time, CSV or Parquet. Names, units and frames are those of t
     t_s                       seconds since the sortie's begin, increasing for each drone        must be there
     drone                     whose row; left out, everything is drone 0's
     x_m, y_m, z_m             pose, ENU                                                           all three, or no pose
-    qx, qy, qz, qw            attitude, FLU in ENU                             } one of the two, or level and heading
+    qx, qy, qz, qw            attitude, FLU in ENU (all four)                  } one of the two, or level and heading
     yaw_deg                   heading, counter-clockwise from east             } along the track
-    vx_mps, vy_mps, vz_mps    velocity, ENU; left out, the slope of the positions
+    vx_mps, vy_mps, vz_mps    velocity, ENU; left out, the slope of the positions                  all three, or none
     soc                       state of charge by charge, 0 … 1; it never rises
     voltage_v, current_a      at the terminals
     rssi_dbm, rssi_percent    what the drone's radio heard; kept for people, nothing reads it
 
-Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. A drone without
-a pose or a charge keeps its model there.
+Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. Before the first and
+after the last place a drone stands there, without velocity. A drone without a pose or a charge keeps its model there.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 BATTERY = ("soc", "voltage_v", "current_a")
 ROUNDING = 1e-5
 """A charge that rises by less is rounding, and held."""
+ROUNDING_S = 1e-6
+"""A frame so little beyond a trace's end is at its end."""
 COLUMNS = ("t_s", "drone", *POSITION, *ATTITUDE, "yaw_deg", *VELOCITY, *BATTERY, "rssi_dbm", "rssi_percent")
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "t_s": TIME_S,
@@ -118,8 +120,9 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
     """
     path = Path(path)
     columns = read_columns(path, BOUNDS)
-    if 0 < sum(name in columns for name in POSITION) < 3:
-        raise TraceError(f"{path}: a pose needs all of {', '.join(POSITION)}")
+    for what, names in (("a pose", POSITION), ("an attitude", ATTITUDE), ("a velocity", VELOCITY)):
+        if 0 < sum(name in columns for name in names) < len(names):
+            raise TraceError(f"{path}: {what} needs all of {', '.join(names)}")
     who = columns.get("drone", np.zeros(len(columns["t_s"])))
     check_whole(path, "drone", who)
     found = {}
@@ -156,6 +159,7 @@ def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> 
             orientation = np.repeat(pose.orientation_xyzw, len(t_s), axis=0)
         else:
             orientation = Slerp(pose.time_s, Rotation.from_quat(pose.orientation_xyzw))(t_s).as_quat()
+        velocity[np.abs(motion.time_s - t_s) > ROUNDING_S] = 0.0  # there it stands, headed as it will or did
         flips = np.sign((orientation[1:] * orientation[:-1]).sum(axis=-1))
         orientation[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips))[:, None]
         yaw = yaw_rad(orientation)

@@ -80,6 +80,18 @@ def test_heading_and_attitude_are_taken_where_given(tmp_path: Path) -> None:
     np.testing.assert_allclose(tilted.body_rates_radps[:, 0], 0, atol=1e-6)
 
 
+def test_before_the_first_and_after_the_last_place_a_drone_stands(tmp_path: Path) -> None:
+    """5 m/s north in every row, told from 2 s to 6 s: no velocity where the place is held, and the same heading."""
+    rows = "".join(f"{t},0,{5 * t},60,0,5,0\n" for t in (2.0, 4.0, 6.0 - 1e-9))
+    path = written(tmp_path, "t_s,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps\n" + rows)
+    flown = follow(fly(FLEET, 10.0, 0.1, 1), read_traces(path, 5), 0.1)
+    moves = flown.velocity_mps[:, 0, 1] != 0
+    assert flown.time_s[moves].tolist() == pytest.approx([k / 10 for k in range(20, 61)])
+    np.testing.assert_allclose(flown.velocity_mps[moves, 0], [[0, 5, 0]] * 41)
+    np.testing.assert_allclose(flown.yaw_rad[:, 0], np.pi / 2)
+    assert (flown.position_m[~moves, 0, 1] == np.where(flown.time_s[~moves] < 4, 10.0, 30.0 - 5e-9)).all()
+
+
 def test_a_flight_written_as_states_flies_again(tmp_path: Path) -> None:
     """Every state of the motion comes back through a file with the record's columns."""
     motion = fly(FLEET, 20.0, 0.1, 7)
@@ -112,6 +124,8 @@ def test_a_flight_written_as_states_flies_again(tmp_path: Path) -> None:
         ("t_s,drone,soc\n0,0,1\n0,1,1\n0,1,0.9\n", "t_s in row 3 of drone 1 is 0, must increase"),
         ("t_s,soc\n0,0.9\n1,0.8\n2,0.85\n", "drone 0: soc rises from 0.8 to 0.85 at 2 s, must not rise in flight"),
         ("t_s,x_m,y_m\n0,1,1\n", "a pose needs all of x_m, y_m, z_m"),
+        ("t_s,qx,qy,qz\n0,0,0,0\n", "an attitude needs all of qx, qy, qz, qw"),
+        ("t_s,vx_mps,vy_mps\n0,1,1\n", "a velocity needs all of vx_mps, vy_mps, vz_mps"),
     ],
 )
 def test_a_broken_trace_gives_its_one_line(tmp_path: Path, text: str, message: str) -> None:
