@@ -107,7 +107,7 @@ _Found = dict[str, tuple[Array, Array]]
 
 def _from_dataflash(raw: RawLog) -> tuple[_Found, str]:
     tables, found = raw.tables, _Found()
-    if gps := tables.get("GPS"):
+    if gps := _first_of(tables.get("GPS", {})):
         fixed = gps["Status"] >= 3
         found["fix"] = _stacked(_seconds(gps, "T")[fixed], *(gps[c][fixed] for c in ("Lat", "Lng", "Alt")))
     for name in ("XKF1", "NKF1", "EKF1"):
@@ -120,11 +120,12 @@ def _from_dataflash(raw: RawLog) -> tuple[_Found, str]:
         found["attitude"] = _seconds(att), _from_euler(att["Roll"], att["Pitch"], att["Yaw"], degrees=True)
     for name in ("BAT", "CURR"):
         if name in tables:
-            table = _rows(tables[name], tables[name]["Instance"] == 0) if "Instance" in tables[name] else tables[name]
+            table = _first_of(tables[name])
             unit = 0.01 if np.issubdtype(table["Volt"].dtype, np.integer) else 1.0
             found["battery"] = _stacked(_seconds(table), table["Volt"] * unit, table["Curr"] * unit)
             capacity = raw.parameters().get("BATT_CAPACITY", 0.0)
-            if "CurrTot" in table and capacity > 0:
+            # a count that stands at nothing is that of a pack whose current is not measured
+            if "CurrTot" in table and capacity > 0 and (table["CurrTot"] > 0).any():
                 found["charge"] = _stacked(_seconds(table), 1.0 - table["CurrTot"] / capacity)
             break
     if radio := tables.get("RAD"):
@@ -188,8 +189,11 @@ def _from_ulog(raw: RawLog) -> tuple[_Found, str]:
     if attitude := tables.get("vehicle_attitude"):
         found["attitude"] = _seconds(attitude), _from_quaternion(attitude["q"])
     if battery := tables.get("battery_status"):
-        found["battery"] = _stacked(_seconds(battery), battery["voltage_v"], battery["current_a"])
-        found["charge"] = _stacked(_seconds(battery), battery["remaining"])
+        # PX4's unknowns: 0 V, −1 A, −1 of the charge
+        known, counted, t_s = battery["voltage_v"] > 0, battery["remaining"] >= 0, _seconds(battery)
+        current = np.where(battery["current_a"] == -1, np.nan, battery["current_a"])
+        found["battery"] = _stacked(t_s[known], battery["voltage_v"][known], current[known])
+        found["charge"] = _stacked(t_s[counted], battery["remaining"][counted])
     if radio := tables.get("radio_status"):
         found["rssi"] = _stacked(_seconds(radio), _sik_dbm(radio["rssi"]))
     elif remote := tables.get("input_rc"):
@@ -210,20 +214,20 @@ def _assemble(kind: str, raw: RawLog, translate: Callable[[RawLog], tuple[_Found
     found, unit = translate(raw)
     found = {name: _sound(name, *each, problems) for name, each in found.items() if len(each[0])}
     found = {name: each for name, each in found.items() if len(each[0])}
-    fix = found.pop("fix", None)
-    origin = None if fix is None else (float(fix[1][0, 0]), float(fix[1][0, 1]))
-    if fix is not None and "position" not in found:
-        found["position"] = fix[0], local_m(fix[1])
+    origin = None
+    if (fix := found.pop("fix", None)) is not None:
+        near = _near(local_m(fix[1]), [] if "position" in found else problems)  # before one of them becomes the origin
+        if near.any():
+            degrees = fix[1][near]
+            origin = float(degrees[0, 0]), float(degrees[0, 1])
+            found.setdefault("position", (fix[0][near], local_m(degrees)))
     begin_s = min((t_s[0] for t_s, _ in found.values()), default=0.0)
     end_s = max((t_s[-1] for t_s, _ in found.values()), default=0.0)
     series = {}
     for name, (t_s, values) in found.items():
         if name == "position":
-            values = values - values[0]
-            near = np.linalg.norm(values - np.median(values, axis=0), axis=-1) <= FAR_M
-            if not near.all():
-                problems.append(f"{(~near).sum()} positions lie over {FAR_M / 1000:g} km off and are left out")
-            t_s, values = t_s[near], values[near]
+            near = _near(values, problems)
+            t_s, values = t_s[near], values[near] - values[near][:1]
         if name == "velocity":
             slow = np.linalg.norm(values, axis=-1) <= FAST_MPS
             if not slow.all():
@@ -264,6 +268,14 @@ def _sound(name: str, t_s: Array, values: Array, problems: list[str]) -> tuple[A
         t_s, values = t_s[longest], values[longest]
     forward = np.concatenate([[True], t_s[1:] > np.maximum.accumulate(t_s)[:-1]]) if len(t_s) else np.zeros(0, bool)
     return t_s[forward], values[forward]
+
+
+def _near(metres: Array, problems: list[str]) -> npt.NDArray[np.bool_]:
+    """Which places [K, 3] are no errors."""
+    near: npt.NDArray[np.bool_] = np.linalg.norm(metres - np.median(metres, axis=0), axis=-1) <= FAR_M
+    if not near.all():
+        problems.append(f"{(~near).sum()} positions lie over {FAR_M / 1000:g} km off and are left out")
+    return near
 
 
 def _falling(values: Array, problems: list[str]) -> Array:
@@ -311,6 +323,12 @@ def _seconds(table: Table, *others: str) -> Array:
 
 def _rows(table: Table, rows: Column) -> Table:
     return {name: values[rows] for name, values in table.items()}
+
+
+def _first_of(table: Table) -> Table:
+    """The rows of the first of several devices, which ArduPilot's versions number under different names."""
+    number = next((name for name in ("Instance", "Inst", "I") if name in table), None)
+    return table if number is None else _rows(table, table[number] == 0)
 
 
 def _stacked(t_s: Array, *columns: Column) -> tuple[Array, Array]:

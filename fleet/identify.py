@@ -98,5 +98,7 @@ def _measured(log: FlightLog) -> tuple[Series, float]:
     if log.battery is None or log.charge is None:
         raise LogError("the log has no voltage, current and charge")
     known = np.isfinite(log.battery.values).all(axis=-1)
+    if not known.any():
+        raise LogError("the log's current was not measured")
     battery = Series(log.battery.time_s[known], log.battery.values[known])
     return battery, float(np.interp(battery.time_s[0], log.charge.time_s, log.charge.values[:, 0]))

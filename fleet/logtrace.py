@@ -36,12 +36,15 @@ def context_trace(
         from_s, until_s: the stretch of the log that is taken; its begin becomes 0.
 
     Raises:
-        LogError: less than a second is left, or nothing in it.
+        LogError: less than a second or two rows are left, or nothing in them.
     """
     end_s = min(until_s, log.duration_s)
     if end_s - from_s < MIN_S:
         raise LogError(f"{end_s - from_s:.1f} s from {from_s:g} s on, must be {MIN_S:g} s at least")
-    t_s = np.arange(math.floor((end_s - from_s) * rate_hz + 1e-9) + 1) / rate_hz
+    steps = math.floor((end_s - from_s) * rate_hz + 1e-9)
+    if steps < 1:
+        raise LogError(f"{end_s - from_s:.1f} s at {rate_hz:g} rows a second are one row, must be two at least")
+    t_s = np.arange(steps + 1) / rate_hz
     at = t_s + from_s
     columns: dict[str, Array] = {"t_s": t_s, "drone": np.zeros_like(t_s)}
     if log.position is not None:

@@ -24,6 +24,8 @@ MADE = "made by `sortie import`"
 """By which its scenarios are known."""
 FULL_CELL_V = 4.25
 LONGEST_S = 7200.0
+LEAST_SOC = 0.001
+"""What a flight's charge is held at least at: an estimate of nothing left grounds a drone, and it flew on."""
 LOWEST_M = 2.0
 """Where the flight's lowest point is put above the flat ground of the simulator's town, unless told."""
 
@@ -40,9 +42,7 @@ def import_log(
     ] = None,
     lift: Annotated[
         float | None,
-        typer.Option(
-            help="Metres added to every height; left out, the lowest point flies at 2 m.", min=-10_000, max=10_000
-        ),
+        typer.Option(help="Metres added to every height; left out, the lowest point flies at 2 m.", min=-1e4, max=1e4),
     ] = None,
 ) -> None:
     """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it as one drone.
@@ -64,6 +64,8 @@ def import_log(
                 f"{log}: {until - from_s:.0f} s to fly, must be at most {LONGEST_S:g}: name --from and --until"
             )
         columns = context_trace(flight, rate, from_s, until)
+        if "soc" in columns:
+            columns["soc"] = np.maximum(columns["soc"], LEAST_SOC)  # NaN stays
         if "z_m" in columns:
             columns["z_m"] += LOWEST_M - float(np.nanmin(columns["z_m"])) if lift is None else lift
     text = scenario_text(slug(log), columns, flight.parameters, folder / TRACE, f"{flight.kind} log {log.name!r}")

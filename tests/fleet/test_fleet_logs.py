@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.dataflash import read_dataflash
-from fleet.flightlog import LogError, local_m, read_log
+from fleet.dataflash import RawLog, read_dataflash
+from fleet.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
+from fleet.identify import predicted_voltage
 from fleet.mavlink import geodetic, read_tlog
 from fleet.ulog import read_ulog
+from scenarios.schema import Battery
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")
@@ -63,6 +65,60 @@ def test_without_an_estimate_the_receivers_positions_are_taken(tmp_path: Path) -
     assert log.origin_deg == pytest.approx((47.0, 8.0))
     np.testing.assert_allclose(log.position.values[-1], [29.7, 39.6, 9.9], atol=0.02)
     assert log.velocity is None
+
+
+@pytest.mark.parametrize("named", [b"TimeUS,Inst,Volt,Curr,CurrTot", b"TimeUS,Instance,Volt,Curr,CurrTot"])
+def test_the_first_battery_is_taken_however_the_version_numbers_them(named: bytes, tmp_path: Path) -> None:
+    """ArduPilot calls the column Instance up to 4.0 and Inst since."""
+    begin = examples.dataflash_begin().replace(b"TimeUS,Instance,Volt,Curr,CurrTot", named.ljust(33, b"\0"))
+    steps = (
+        examples.dataflash_step(k) + examples.dataflash_message("BAT", 5_000_001 + k * 100_000, 1, 12.0, 1.0, 4000.0)
+        for k in range(20)
+    )
+    log = read_log(written(tmp_path, "bin", begin + b"".join(steps)))
+    assert log.battery is not None
+    assert log.charge is not None
+    np.testing.assert_allclose(log.battery.values, [[16.0 - 0.01 * k, 15.0] for k in range(20)], atol=1e-5)
+    np.testing.assert_allclose(log.charge.values[:, 0], [0.9 - 0.001 * k for k in range(20)], atol=1e-5)
+
+
+def assembled(kind: str, **tables: dict[str, list[object]]) -> FlightLog:
+    """A log of some tables, a row every tenth of a second."""
+    stamp = {"ULog": "timestamp", "DataFlash": "TimeUS"}[kind]
+    columns = {name: {k: np.array(v) for k, v in table.items()} for name, table in tables.items()}
+    for name, table in columns.items():
+        if name != "PARM":
+            table[stamp] = np.arange(len(next(iter(table.values())))) * 100_000
+    return _assemble(kind, RawLog(columns, ()), _from_ulog if kind == "ULog" else _from_dataflash)
+
+
+def test_the_first_receiver_is_taken() -> None:
+    """Two 100 m apart, in turn."""
+    places = {"Lat": [47.0, 47.0009] * 5, "Lng": [8.0] * 10, "Alt": [400.0] * 10}
+    log = assembled("DataFlash", GPS={"I": [0, 1] * 5, "Status": [3] * 10, **places})
+    assert log.position is not None
+    assert log.position.values.tolist() == [[0.0, 0.0, 0.0]] * 5
+
+
+def test_what_an_autopilot_does_not_know_is_no_value() -> None:
+    """PX4 says 0 V, −1 A and −1 of the charge; ArduPilot counts nothing where it has no sensor."""
+    log = assembled("ULog", battery_status={"voltage_v": [0, 16, 16], "current_a": [-1, -1, 5], "remaining": [-1] * 3})
+    assert log.charge is None
+    assert log.battery is not None
+    np.testing.assert_array_equal(log.battery.values, [[16, np.nan], [16, 5]])
+    log = assembled(
+        "DataFlash",
+        BAT={"Volt": [16.0] * 3, "Curr": [0.0] * 3, "CurrTot": [0.0] * 3},
+        PARM={"Name": [b"BATT_CAPACITY"], "Value": [5000.0]},
+    )
+    assert log.battery is not None
+    assert log.charge is None
+
+
+def test_a_pack_is_not_identified_without_a_current() -> None:
+    unmeasured = {"voltage_v": [16.0] * 3, "current_a": [-1.0] * 3, "remaining": [0.9, 0.8, 0.7]}
+    with pytest.raises(LogError, match=r"^the log's current was not measured$"):
+        predicted_voltage(assembled("ULog", battery_status=unmeasured), Battery())  # type: ignore[arg-type]
 
 
 @given(st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-100, 500)))
@@ -139,6 +195,27 @@ def test_values_that_are_no_numbers_and_places_that_are_too_far(tmp_path: Path) 
     log = read_log(written(tmp_path, "bin", WHOLE["bin"] + bad + worse))
     assert "1 positions lie over 20 km off and are left out" in log.problems
     assert "1 rows of velocity are not finite and are left out" in log.problems
+
+
+@pytest.mark.parametrize("wrong", [0, 4, 9])
+def test_a_fix_that_is_too_far_is_left_out_wherever_it_stands(wrong: int) -> None:
+    """A degree off, the first one too: it is no origin, from which all others would lie too far."""
+    lat = [47.0 + 1e-5 * k for k in range(10)]
+    lat[wrong] -= 1.0
+    log = assembled("DataFlash", GPS={"Status": [3] * 10, "Lat": lat, "Lng": [8.0] * 10, "Alt": [400.0] * 10})
+    assert "1 positions lie over 20 km off and are left out" in log.problems
+    assert log.position is not None
+    first = int(wrong == 0)
+    assert log.origin_deg == pytest.approx((47.0 + 1e-5 * first, 8.0))
+    north_m = [1.1117 * (k - first) for k in range(10) if k != wrong]
+    np.testing.assert_allclose(log.position.values[:, 1], north_m, atol=1e-3)
+
+
+def test_places_are_told_from_the_first_that_is_no_error(tmp_path: Path) -> None:
+    bad = examples.dataflash_message("XKF1", 4_900_000, 0, 0.0, 0.0, 0.0, 9e6, 0.0, 0.0, 0.0)
+    log = read_log(written(tmp_path, "bin", examples.dataflash_begin() + bad + WHOLE["bin"]))
+    assert log.position is not None
+    np.testing.assert_allclose(log.position.values[[0, -1]], [[0, 0, 0], [29.7, 39.6, 9.9]], atol=0.02)
 
 
 def test_a_charge_that_rises_is_held(tmp_path: Path) -> None:

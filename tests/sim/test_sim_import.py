@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 
 import log_examples as examples
@@ -56,6 +57,27 @@ def test_a_stretch_of_the_log_begins_at_zero(tmp_path: Path) -> None:
     assert set(trace.column_names) <= set(COLUMNS)
 
 
+def test_a_charge_that_is_told_to_be_gone_does_not_land_it(tmp_path: Path) -> None:
+    """Counted over the capacity that was set: nothing left from the fourth second on, and the flight went on."""
+    log = tmp_path / "empty.bin"
+    log.write_bytes(examples.dataflash().replace(struct.pack("<f", 5000.0), struct.pack("<f", 540.0)))
+    done = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out")], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    states = run_sortie(load(tmp_path / "out/scenario.yaml")).tables["states"]
+    assert min(states["soc"].to_pylist()) == pytest.approx(0.001, abs=1e-4)
+    assert all(states["airborne"].to_pylist())
+
+
+@pytest.mark.parametrize("option", ["--lift", "--until"])
+@pytest.mark.parametrize("value", ["nan", "-1e5"])
+def test_a_number_that_is_none_is_refused(option: str, value: str, tmp_path: Path) -> None:
+    log = tmp_path / "short.bin"
+    log.write_bytes(examples.dataflash())
+    said = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out"), option, value])
+    assert (said.exit_code, option in said.output) == (2, True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_gaps_are_empty_cells(tmp_path: Path) -> None:
     data = examples.dataflash()
     begin, step = len(examples.dataflash_begin()), len(examples.dataflash_step(0))
@@ -85,6 +107,7 @@ def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) 
         ([__file__], "is no DataFlash log"),
         ([str(log), "--from", "9.5"], "0.4 s from 9.5 s on, must be 1 s at least"),
         ([str(log), "--until", "9000"], "9000 s to fly, must be at most 7200"),
+        ([str(log), "--until", "5", "--rate", "0.1"], "5.0 s at 0.1 rows a second are one row, must be two at least"),
     ):
         with pytest.raises(RunError, match=said):
             CliRunner().invoke(app, ["import", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
