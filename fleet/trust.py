@@ -84,6 +84,11 @@ class Standing(NamedTuple):
     """Whether it ever told its charge more finely than in whole percents."""
 
     @property
+    def elapsed(self) -> int:
+        """Seconds from its first judgement to its latest: its charge has fallen for so long."""
+        return self.seconds - 1
+
+    @property
     def trust(self) -> float:
         """1 until a doubt was found twice in a row, then halved by each further one; 0 from the sixth."""
         if self.strikes < STRIKES_TO_DOUBT:
@@ -115,14 +120,14 @@ def judge(
     """
     seen_per_metre = _metres_seen_per_metre_up(known)
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
-    fell_per_s = {i: (s.first_soc - known[i].battery_soc) / s.seconds for i, s in before.items()}
+    fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
     # who was not heard drained on: its fall, once it is heard again, is over this second too
     after = {i: s if i in known else s._replace(seconds=s.seconds + 1) for i, s in standings.items()}
     for peer, claim in known.items():
         standing = before[peer]
         doubt = ""
         if peer != ego:
-            others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.seconds
+            others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
             doubt = (
                 (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
                 or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps / 2)

@@ -213,6 +213,20 @@ def test_the_return_of_a_silent_majority_brings_nobody_into_doubt() -> None:
         assert all(s.trust == 1.0 for s in standings.values()), second
 
 
+def test_who_is_heard_late_has_not_fallen_before() -> None:
+    """Small packs that lose 0.55 % a second, and a drone whose claims come late and every two seconds: from one judgement
+    to the next it fell for a second, not for two, and at its first not at all."""
+    standings: dict[int, Standing] = {}
+    heard_at = 11
+    for second in range(30):
+        known = {i: honest(i, 20.0 * i, soc=0.9 - 0.0055 * second) for i in range(5)}
+        known[1] = known[1]._replace(battery_soc=0.9 - 0.0055 * (second - (second - heard_at) % 2))
+        if second < heard_at:
+            del known[1]
+        standings = judge(standings, 0, known, {})
+        assert all(s.trust == 1.0 for s in standings.values()), second
+
+
 def test_a_doubted_drone_stays_where_it_is_and_says_nothing() -> None:
     d = honest(3, 10.0, 20.0)
     small = discounted(d)
