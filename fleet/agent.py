@@ -172,6 +172,7 @@ class Agent:
         self._standings: dict[int, Standing] = {}
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
+        self._judged_at_s = -math.inf
         self._judged_every = max(1, round(JUDGED_EVERY_S / rules.period_s))
         self.gate = Gate()
         self.handshake_bytes = handshake_bytes  # goes with the policy
@@ -291,9 +292,10 @@ class Agent:
         return self._standings.get(peer, UNJUDGED).trust
 
     def _judge(self) -> None:
-        """Hold what peers claimed in the last second against what is known otherwise."""
+        """Hold what peers claimed since the last time against what is known otherwise, each claim once."""
         now_s, before = self.env.now, self._standings
-        heard = {i: self._claims[i] for i in self._known if now_s - self._heard_at_s[i] <= self._fresh_s}
+        since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
+        heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             told_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s

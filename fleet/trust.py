@@ -33,6 +33,7 @@ FALSE_CELLS = 4
 # --- goodput
 LARGE_BYTES = 10_000
 """Smaller payloads say too little about a link."""
+TELLS_FOR_S = 2.0 * JUDGED_EVERY_S
 UNDERSTATED, OVERSTATED = 0.1, 1.5
 """A claim is a doubt below the first times what was seen to arrive (an estimate rises by 0.3 of the gap at each
 sample), or above the second times the data rate at which it came: no link carries more than that."""
@@ -110,7 +111,7 @@ def judge(
 
     Args:
         standings: what it thought, itself included; empty at first.
-        known: the latest descriptor of every drone that it heard lately, and its own.
+        known: the latest descriptor of every drone that it heard since it last judged, and its own.
         arrivals: payloads that reached it in this second, by sender.
         form: how finely descriptors are written; what rounding can do is no doubt.
 
@@ -228,8 +229,12 @@ def battery_doubt(
 
 
 def could_tell(arrivals: Sequence[Arrival], told_s: float) -> tuple[list[Arrival], list[Arrival]]:
-    """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next."""
-    return [a for a in arrivals if a.t_done_s <= told_s], [a for a in arrivals if a.t_done_s > told_s]
+    """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next.
+
+    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither.
+    """
+    told = [a for a in arrivals if told_s - TELLS_FOR_S < a.t_done_s <= told_s]
+    return told, [a for a in arrivals if a.t_done_s > told_s]
 
 
 def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:

@@ -180,6 +180,7 @@ def test_a_claim_answers_for_what_came_before_it() -> None:
     came = [Arrival(160_000, 0.02, 600.0, t_done_s) for t_done_s in (1.0, 2.0, 3.0)]
     assert could_tell(came, 2.0) == (came[:2], came[2:])
     assert could_tell(came, 0.5) == ([], came)
+    assert could_tell(came, 4.5) == (came[2:], []), "a link may break in the two seconds before"
 
 
 def test_a_fault_is_no_lie() -> None:

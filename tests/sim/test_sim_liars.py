@@ -99,6 +99,18 @@ def test_honest_fleets_doubt_nobody_at_any_rate_of_the_plane(rate_hz: float) -> 
         assert outcome(record)["distrusted_by"] == {}
 
 
+def test_honest_fleets_doubt_nobody_where_slow_descriptors_are_lost() -> None:
+    """One each ten seconds, of which links of 200 m lose some: a charge does not stand still because nobody tells it."""
+    slow = ["context.rate_hz=1", "context.publish_every=10", "radio.tx_power_dbm=0", "fleet.formation.spacing_m=200"]
+    asked = ["perception.detector=none", "duration_s=60", "events=[]", "fleet.formation.shape=line", *slow]
+    lost = 0
+    for seed in range(1, 7):
+        record = run_sortie(load("track_target", [*asked, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        lost += sum(age_s > 20 for age_s in record.tables["ages"]["age_s"].to_pylist())
+        assert outcome(record)["distrusted_by"] == {}
+    assert lost > 100
+
+
 def test_honest_traces_are_not_doubted(tmp_path: Path) -> None:
     """A charge in whole percents, and links that carry more than the channel's own frames could."""
     drones, links = tmp_path / "drones.csv", tmp_path / "links.csv"
