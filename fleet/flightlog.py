@@ -101,6 +101,25 @@ def read_log(path: str | Path) -> FlightLog:
 
 # --- what each kind calls its things ---------------------------------------------------------------
 
+_NED_FIELDS = ("VN", "VE", "VD", "PN", "PE", "PD")
+_FIELDS = {
+    "GPS": ("Status", "Lat", "Lng", "Alt"),
+    **dict.fromkeys(("XKF1", "NKF1", "EKF1"), _NED_FIELDS),
+    "ATT": ("Roll", "Pitch", "Yaw"),
+    **dict.fromkeys(("BAT", "CURR"), ("Volt", "Curr")),
+    "RAD": ("RSSI",),
+    "vehicle_gps_position": ("fix_type", "vel_n_m_s", "vel_e_m_s", "vel_d_m_s"),
+    "vehicle_local_position": ("x", "y", "z", "vx", "vy", "vz", "xy_valid", "z_valid", "v_xy_valid", "v_z_valid"),
+    "vehicle_attitude": ("q",),
+    "battery_status": ("voltage_v", "current_a", "remaining"),
+    "radio_status": ("rssi",),
+    "input_rc": ("rssi",),
+}
+"""What is read of the messages of logs that describe themselves, and may be damaged where they do; MAVLink's are known."""
+_FIX_FIELDS = ("latitude_deg", "longitude_deg", "altitude_msl_m")
+"""PX4's from 1.14 on."""
+_TIMES = ("TimeUS", "TimeMS", "timestamp")
+
 _Found = dict[str, tuple[Array, Array]]
 """Name of a FlightLog field → times, s by the log's clock, and values [K, C]; `fix` holds degrees and metres."""
 
@@ -169,15 +188,15 @@ def _from_tlog(raw: RawLog) -> tuple[_Found, str]:
 
 def _from_ulog(raw: RawLog) -> tuple[_Found, str]:
     tables, found, unit = raw.tables, _Found(), "dBm"
-    if (gps := tables.get("vehicle_gps_position")) and "fix_type" in gps:
-        fixed = gps["fix_type"] >= 3
-        scale = 1.0 if "latitude_deg" in gps else 1e-7
-        names = ("latitude_deg", "longitude_deg", "altitude_msl_m") if scale == 1.0 else ("lat", "lon", "alt")
-        height = gps[names[2]][fixed] * (1.0 if scale == 1.0 else 1e-3)
-        t_s = _seconds(gps)[fixed]
-        found["fix"] = _stacked(t_s, gps[names[0]][fixed] * scale, gps[names[1]][fixed] * scale, height)
-        ned = np.stack([gps[c][fixed] for c in ("vel_n_m_s", "vel_e_m_s", "vel_d_m_s")], -1)
-        found["velocity"] = t_s, swap_enu_ned(ned)
+    gps = tables.get("vehicle_gps_position", {})
+    for names, degree, metre in ((("lat", "lon", "alt"), 1e-7, 1e-3), (_FIX_FIELDS, 1.0, 1.0)):
+        if all(name in gps for name in names):
+            fixed = gps["fix_type"] >= 3
+            lat, lon, height = (gps[name][fixed] for name in names)
+            t_s = _seconds(gps)[fixed]
+            found["fix"] = _stacked(t_s, lat * degree, lon * degree, height * metre)
+            ned = np.stack([gps[c][fixed] for c in ("vel_n_m_s", "vel_e_m_s", "vel_d_m_s")], -1)
+            found["velocity"] = t_s, swap_enu_ned(ned)
     if local := tables.get("vehicle_local_position"):
         for name, columns, valid in (
             ("position", ("x", "y", "z"), ("xy_valid", "z_valid")),
@@ -211,7 +230,7 @@ def _assemble(kind: str, raw: RawLog, translate: Callable[[RawLog], tuple[_Found
     several = sorted(name for name in raw.tables if name.startswith("battery_status."))
     if several:
         problems.append(f"{len(several) + 1} batteries, the first is taken")
-    found, unit = translate(raw)
+    found, unit = translate(RawLog(_with_fields(raw.tables, problems), raw.problems))
     found = {name: _sound(name, *each, problems) for name, each in found.items() if len(each[0])}
     found = {name: each for name, each in found.items() if len(each[0])}
     origin = None
@@ -268,6 +287,20 @@ def _sound(name: str, t_s: Array, values: Array, problems: list[str]) -> tuple[A
         t_s, values = t_s[longest], values[longest]
     forward = np.concatenate([[True], t_s[1:] > np.maximum.accumulate(t_s)[:-1]]) if len(t_s) else np.zeros(0, bool)
     return t_s[forward], values[forward]
+
+
+def _with_fields(tables: Mapping[str, Table], problems: list[str]) -> dict[str, Table]:
+    """The tables that have a time and what is read of them; the others are told."""
+    whole = {}
+    for name, table in tables.items():
+        lacks = [field for field in _FIELDS.get(name, ()) if field not in table]
+        if name in _FIELDS and not any(time in table for time in _TIMES):
+            lacks.append("time")
+        if lacks:
+            problems.append(f"{name} has no {', '.join(lacks)} and is left out")
+        else:
+            whole[name] = table
+    return whole
 
 
 def _near(metres: Array, problems: list[str]) -> npt.NDArray[np.bool_]:

@@ -171,6 +171,26 @@ def test_a_wrong_checksum_is_counted(tmp_path: Path) -> None:
     assert any("1 messages are damaged" in problem for problem in log.problems)
 
 
+@pytest.mark.parametrize(
+    ("kind", "described", "damaged", "told", "lost"),
+    [
+        ("bin", b"Instance,Volt,", b"Instance,Vo1t,", "BAT has no Volt and is left out", "battery"),
+        ("bin", b"TimeUS,Roll", b"T1meUS,Roll", "ATT has no time and is left out", "attitude"),
+        ("bin", b"VN,VE,VD,PN,PE,PD", b"VN,VE,VD,PM,PE,QD", "XKF1 has no PN, PD and is left out", "velocity"),
+        ("ulg", b"float remaining", b"float remainxng", "battery_status has no remaining and is left out", "battery"),
+    ],
+)
+def test_a_message_without_its_fields_is_left_out_and_told(
+    kind: str, described: bytes, damaged: bytes, told: str, lost: str, tmp_path: Path
+) -> None:
+    """A description is as easily damaged as what it describes; the rest of the flight stands."""
+    assert described in WHOLE[kind]
+    log = read_log(written(tmp_path, kind, WHOLE[kind].replace(described, damaged)))
+    assert told in log.problems
+    assert getattr(log, lost) is None
+    assert log.position is not None
+
+
 def test_a_gap_is_told_with_its_place(tmp_path: Path) -> None:
     begin, step = len(examples.dataflash_begin()), len(examples.dataflash_step(0))
     data = WHOLE["bin"]
