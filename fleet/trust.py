@@ -39,8 +39,9 @@ UNDERSTATED, OVERSTATED = 0.1, 1.5
 sample), or above the second times the data rate at which it came: no link carries more than that."""
 
 # --- battery
-JUMP = 0.05
-"""A fall by so much within a second is a fault, or a lie that begins; either way the charge is watched anew."""
+JUMP = 0.015
+"""A fall by so much from one judgement to the next is a fault, or a lie that begins; either way the charge is watched anew.
+Above a step of whole percents, and no higher: in a fleet of two or three a fault below it passes for the fleet's fall."""
 RISE = 0.03
 """Charge that may come back: estimators of real drones correct themselves by a few percent."""
 PERCENT = 0.01
