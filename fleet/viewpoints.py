@@ -10,7 +10,7 @@ and then standing where it ends. What flies at any time was found safe to the en
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -164,7 +164,13 @@ def shifts(plan: Plan, time_s: Array) -> tuple[Array, Array, Array]:
 
 
 def grant(
-    drone: int, wanted_m: Place, plans: Sequence[Plan], course: Course, bounds: Bounds, frame: int
+    drone: int,
+    wanted_m: Place,
+    plans: Sequence[Plan],
+    course: Course,
+    bounds: Bounds,
+    frame: int,
+    gone: Container[int] = (),
 ) -> Move | str | None:
     """What is granted of a drone's wish: the safety layer.
 
@@ -173,6 +179,7 @@ def grant(
         wanted_m: the shift that it asks for, the formation's frame.
         plans: every drone's moves so far.
         frame: the move would begin with it.
+        gone: drones that have left the air for good, to whom nobody comes near.
 
     Returns:
         A move as far towards the wish as is safe; None where the drone stands there already, or is on its way and has to
@@ -190,7 +197,7 @@ def grant(
         if math.dist(start, end) < LEAST_MOVE_M:
             break
         move = Move(now_s, _width_s(math.dist(start, end), bounds), start, end)
-        near = _too_near(drone, move, plans, course, bounds)
+        near = _too_near(drone, move, plans, course, bounds, gone)
         if near is not None:
             refused = f"would come too near drone {near}"
         elif not fenced(course, bounds, drone, (*plan, move), frame):
@@ -222,10 +229,12 @@ def least_m(course: Course, bounds: Bounds, i: int, j: int) -> float:
     return min(bounds.separation_m, float(np.hypot(*(course.slot_m[i] - course.slot_m[j]))))
 
 
-def _too_near(drone: int, move: Move, plans: Sequence[Plan], course: Course, bounds: Bounds) -> int | None:
+def _too_near(
+    drone: int, move: Move, plans: Sequence[Plan], course: Course, bounds: Bounds, gone: Container[int]
+) -> int | None:
     """The first drone to which a move would come closer than allowed, at any time."""
     for other, plan in enumerate(plans):
-        if other == drone:
+        if other == drone or other in gone:
             continue
         least = least_m(course, bounds, drone, other) - 1e-9
         apart = course.slot_m[drone] - course.slot_m[other]

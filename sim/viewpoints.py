@@ -74,7 +74,8 @@ class Choreography:
     def _granted(self, drone: int) -> Move | str | None:
         """What comes of a wish; a move is on the plan from here on."""
         x_m, y_m, _ = self._wishes[drone]
-        answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame)
+        gone = [agent.drone for agent in self._world.agents if not agent.airborne]
+        answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame, gone)
         if isinstance(answer, Move):
             self.plans[drone] = (*self.plans[drone], answer)
         return answer

@@ -133,6 +133,7 @@ def test_a_wish_through_another_drone_is_cut_short_or_refused() -> None:
     assert isinstance(move, Move)
     assert move.end_m == (0.0, -5.0)  # a quarter of it
     assert grant(2, (0.0, -39.0), [()] * 5, course, bounds, 0) == "would come too near drone 0"
+    assert isinstance(grant(2, (0.0, -39.0), [()] * 5, course, bounds, 0, gone={0}), Move), "nobody is there any more"
 
 
 def test_a_wish_for_where_another_is_going_waits_and_is_cut_short() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -126,6 +127,15 @@ def test_drones_return_to_their_slots_when_the_policy_changes() -> None:
     aside = np.linalg.norm(moves - stays, axis=-1)
     assert aside[190].min() > 7.9
     assert aside[-1].max() < 1e-9
+
+
+def test_nobody_keeps_clear_of_drones_that_left_the_air() -> None:
+    lost = "events=[{kind: drone_lost, at_s: 0, drone: 0}, {kind: drone_lost, at_s: 0, drone: 1}]"
+    bounds = ("fleet.viewpoints.separation_m=19", "fleet.viewpoints.reach_m=50")
+    record = run_sortie(example(*LONG, *bounds, lost), vantage)
+    told = [e["text"] for e in record.tables["events"].to_pylist() if e["kind"] == "viewpoint"]
+    assert any(text.startswith("moves ") for text in told)
+    assert not [text for text in told if re.search(r"too near drone [01]\b", text)]
 
 
 def test_a_fleet_in_which_a_trace_flies_holds_its_slots(tmp_path: Path) -> None:
