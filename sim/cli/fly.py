@@ -69,9 +69,8 @@ def fly(
     out.print(tables.outcome_table(result))
     out.print(tables.transitions_table(result))
     report(result)
-    out.print(
-        f"kept in [bold]{path}[/bold]{escape(instead)}" + (f", see it with: sortie view {path}" if recording else "")
-    )
+    see = f", see it with: sortie view {path}" if recording else ""
+    out.print(f"kept in [bold]{path}[/bold]{escape(instead)}{see}", soft_wrap=True)
     if expected is not None:
         same = "is" if record.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")

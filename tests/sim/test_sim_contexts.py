@@ -153,8 +153,8 @@ class Seer:
 
     asked = 0
 
-    def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: object) -> None:
-        self._truth = SurrogateDetector(scene, config.model_copy(update={"weights": None}), seed)
+    def __init__(self, scene: SceneModel, config: Perception, seed: int, weights: object, replication: int) -> None:
+        self._truth = SurrogateDetector(scene, config.model_copy(update={"weights": None}), seed, None, replication)
 
     def detect(self, jobs: list[tuple[Capture, object]]) -> list[Boxes]:
         Seer.asked += len(jobs)

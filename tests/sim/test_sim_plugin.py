@@ -15,8 +15,8 @@ from sim_examples import BASE, example
 from typer.testing import CliRunner
 
 from scenarios.load import load
-from sim import cli
 from sim.checking import check_scenario
+from sim.cli.app import app
 from sim.expect import check, limit
 from sim.folders import RunError
 from sim.golden import golden_path, moved, write_golden
@@ -190,12 +190,12 @@ def test_another_sortie_than_the_files_own_is_never_its_golden_outcome(tmp_path:
     line = "fleet.drones=2: a golden outcome is written of the scenario as its file has it, set nothing"
     with pytest.raises(RunError, match=line):
         check_scenario(str(path), ["fleet.drones=2"], update=True)
-    done = CliRunner().invoke(cli.app, ["check", str(path), "--update", "--set", "fleet.drones=2"])
+    done = CliRunner().invoke(app, ["check", str(path), "--update", "--set", "fleet.drones=2"])
     assert isinstance(done.exception, RunError)
     code, lines = _pytest(tmp_path, "--sortie-update", "--sortie-set", "fleet.drones=2")
     assert (code, lines) == (4, [f"ERROR: {line}", ""])
     assert golden_path(path).read_bytes() == before
-    done = CliRunner().invoke(cli.app, ["check", str(path), "--update"])
+    done = CliRunner().invoke(app, ["check", str(path), "--update"])
     assert f"golden outcome written: {golden_path(path)}\n" in done.output
     code, lines = _pytest(tmp_path, "--sortie-update")
     assert (code, lines[-2:]) == (0, [f"golden outcome written: {golden_path(path)}", "1 passed"])
