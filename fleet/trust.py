@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ FALSE_CELLS = 4
 LARGE_BYTES = 10_000
 """Smaller payloads say too little about a link."""
 TELLS_FOR_S = 2.0 * JUDGED_EVERY_S
+ROUNDING_S = 1e-6
 UNDERSTATED, OVERSTATED = 0.1, 1.5
 """A claim is a doubt below the first times what was seen to arrive (an estimate rises by 0.3 of the gap at each
 sample), or above the second times the data rate at which it came: no link carries more than that."""
@@ -64,6 +66,11 @@ class Arrival(NamedTuple):
     """The data rate of its frames, as its receiver's radio knows it; infinite where it does not."""
     t_done_s: float = -math.inf
     """When its last byte came."""
+
+    @property
+    def sent_s(self) -> float:
+        """When it was handed to its sender's radio."""
+        return self.t_done_s - self.took_s
 
     @property
     def mbps(self) -> float:
@@ -232,9 +239,14 @@ def battery_doubt(
 def could_tell(arrivals: Sequence[Arrival], told_s: float) -> tuple[list[Arrival], list[Arrival]]:
     """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next.
 
-    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither.
+    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither. Nor does
+    what came where their row broke off, or is none: the claim may be of a payload that did not come.
     """
     told = [a for a in arrivals if told_s - TELLS_FOR_S < a.t_done_s <= told_s]
+    sent_s = sorted(a.sent_s for a in told)
+    apart_s = min((b - a for a, b in pairwise(sent_s)), default=0.0)
+    if told_s - max(sent_s, default=told_s) > apart_s + ROUNDING_S:
+        told = []
     return told, [a for a in arrivals if a.t_done_s > told_s]
 
 

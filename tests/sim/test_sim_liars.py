@@ -99,6 +99,17 @@ def test_honest_fleets_doubt_nobody_at_any_rate_of_the_plane(rate_hz: float) -> 
         assert outcome(record)["distrusted_by"] == {}
 
 
+def test_honest_fleets_doubt_nobody_at_the_edge_of_range() -> None:
+    """There a payload that is lost brings its sender's estimate to nothing, beside those that came before it."""
+    weak = ["radio.tx_power_dbm=-8", "fleet.formation.spacing_m=60", "perception.detector=none", "duration_s=20"]
+    lost = 0
+    for seed in (1, 2):
+        record = run_sortie(load("track_target", [*weak, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        lost += record.tables["transmissions"]["status"].to_pylist().count("lost")
+        assert outcome(record)["distrusted_by"] == {}
+    assert lost > 100
+
+
 def test_honest_fleets_doubt_nobody_where_slow_descriptors_are_lost() -> None:
     """One each ten seconds, of which links of 200 m lose some: a charge does not stand still because nobody tells it."""
     slow = ["context.rate_hz=1", "context.publish_every=10", "radio.tx_power_dbm=0", "fleet.formation.spacing_m=200"]
