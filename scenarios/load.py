@@ -59,6 +59,9 @@ def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> Scenario:
     """Read a scenario from text; `source` stands for the file name in errors. Raises ScenarioError."""
     root = tree(text, source)
+    for key, what, command in _OTHERS:
+        if child(root, key) is not None and child(root, "name") is None:
+            raise ScenarioError(f"{source}: is {what}, not a scenario; its command is: {command} {source}")
     for override in overrides:
         root = _override(root, override)
     return validated(root, Scenario)
@@ -151,6 +154,9 @@ def load_contexts(path_or_name: str | Path) -> Contexts | None:
     root = tree(text, source)
     return validated(root, Contexts) if child(root, "contexts") is not None else None
 
+
+_OTHERS = (("campaign", "a campaign", "sortie campaign"), ("contexts", "a set of contexts", "sortie compare"))
+"""What else lies in files like these, by the key that only it has."""
 
 # --- overrides and errors ------------------------------------------------------------------------
 

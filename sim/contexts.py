@@ -46,8 +46,8 @@ class Summary:
     ap: float
     gain: tuple[float, float, float]
     """Mean AP over that of the best fixed policy, with its 95 % interval: contexts resampled in pairs."""
-    of_oracle: float
-    """Mean AP over that of the best fixed policy of each context."""
+    of_oracle: float | None
+    """Mean AP over that of the best fixed policy of each context; None where those found nothing."""
     data_bytes: float
     energy_j: float
     miss_rate: float
@@ -126,7 +126,7 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
         raise RunError("no context has an accuracy under every policy: there was no car to be seen, or nothing scored")
     ap = {p: a[known] for p, a in ap.items()}
     best = _best_fixed({p: float(a.mean()) for p, a in ap.items()})
-    oracle = np.max([ap[p] for p in _fixed(policies)], axis=0).mean()
+    oracle = float(np.max([ap[p] for p in _fixed(policies)], axis=0).mean())
     rows = []
     for p in policies:
         mine = [at[p, c] for c in contexts]
@@ -134,7 +134,7 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
         mean = float(ap[p].mean())
         rows.append(
             Summary(
-                p, mean, (mean - float(ap[best].mean()), low, high), mean / float(oracle),
+                p, mean, (mean - float(ap[best].mean()), low, high), mean / oracle if oracle else None,
                 float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
                 float(np.mean([c.miss_rate for c in mine])),
             )

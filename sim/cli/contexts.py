@@ -61,7 +61,7 @@ def compare_contexts(
         gain, low, high = (100 * g for g in r.gain)
         table.add_row(
             r.policy, f"{r.ap:.3f}", "–" if r.policy == fixed else f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]",
-            f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}", f"{r.miss_rate:.1%}",
+            "–" if r.of_oracle is None else f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}", f"{r.miss_rate:.1%}",
         )  # fmt: skip
     out.print(table)
     flown = ", ".join(p for p in policies if p in FIXED)

@@ -15,7 +15,7 @@ from perception.harness import report
 from perception.harness.rows import INSTRUMENTS, Row, differ_by_chance
 from perception.harness.verdict import Verdict
 from sim.console import out, stages
-from sim.folders import RunError
+from sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
     from perception.harness.picture import Picture
@@ -62,7 +62,7 @@ def paper(
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
     from perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from perception.harness import figures, rows
+    from perception.harness import figures, report, rows
     from perception.harness.found import Asked
     from sim import paper as making
 
@@ -71,6 +71,9 @@ def paper(
         raise RunError(f"unsent is {unsent!r}, must be zero, masked or both")
     if cells_by not in ("confidence", "norm"):
         raise RunError(f"cells_by is {cells_by!r}, must be confidence or norm")
+    if frame is not None and (readme is not None or against is not None):
+        raise RunError(f"--{'against' if readme is None else 'readme'} goes with the whole report, not with --frame")
+    ensure_between(readme, report.BEGIN, report.END)
     try:
         asked = Asked(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1

@@ -57,6 +57,14 @@ def command(*arguments: object) -> int:
         (("train", "--warm-start", "w.safetensors"), "w.safetensors: no such weights"),
         (("train", "--out", "."), ".: is a folder, must be a file"),
         (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
+        (("fly", "link_battery"), "link_battery.yaml: is a campaign, not a scenario; its command is: sortie campaign"),
+        (("check", "contexts"), "contexts.yaml: is a set of contexts, not a scenario; its command is: sortie compare"),
+        (
+            ("paper", "--frame", "0", "--readme", "example.yaml"),
+            "--readme goes with the whole report, not with --frame",
+        ),
+        (("paper", "--frame", "0", "--against", "."), "--against goes with the whole report, not with --frame"),
+        (("paper", "--readme", "example.yaml"), "must hold <!-- paper"),
     ],
 )
 def test_what_cannot_be_honoured_is_refused_before_anything_flies(

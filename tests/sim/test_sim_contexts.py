@@ -113,6 +113,12 @@ def test_a_context_without_a_car_counts_for_nothing() -> None:
         summarise([cell("all-4", "c0", nan), cell("boxes", "c0", nan)])
 
 
+def test_where_the_fixed_policies_find_nothing_there_is_no_share_of_them() -> None:
+    rows = summarise([cell(p, "c0", ap) for p, ap in (("all-4", 0.0), ("adaptive", 0.1))])
+    assert [r.of_oracle for r in rows] == [None, None]
+    assert [r.gain[0] for r in rows] == [0.0, pytest.approx(0.1)]
+
+
 def test_contexts_without_a_detector_are_refused_before_anything_flies(tmp_path: Path) -> None:
     path = tmp_path / "small.yaml"
     path.write_text(SMALL.replace("detector=surrogate", "detector=none"))
