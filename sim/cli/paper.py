@@ -62,7 +62,7 @@ def paper(
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
     from perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from perception.harness import figures, report, rows
+    from perception.harness import figures, rows
     from perception.harness.found import Asked
     from sim import paper as making
 

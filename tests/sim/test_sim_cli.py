@@ -186,9 +186,6 @@ def test_a_damaged_run_says_so(tmp_path: Path) -> None:
         rundir.load(tmp_path / "run")
 
 
-# --- commands ------------------------------------------------------------------------------------
-
-
 def test_a_run_of_another_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "run"
     rundir.save(run_sortie(example("duration_s=0.1")), path)
@@ -196,6 +193,9 @@ def test_a_run_of_another_version_says_so(tmp_path: Path) -> None:
     pq.write_table(table, path / "transmissions.parquet")
     with pytest.raises(RunError, match=r"run: the run is damaged: transmissions\.parquet has no column hops; another"):
         rundir.load(path)
+
+
+# --- commands ------------------------------------------------------------------------------------
 
 
 def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path) -> None:

@@ -22,3 +22,10 @@ def test_flying_without_the_network_loads_nothing_heavy(detector: str) -> None:
     loaded = subprocess.run([sys.executable, "-c", fly], capture_output=True, text=True, check=True).stdout
     assert "sim.sortie" in loaded.split()
     assert HEAVY & set(loaded.split()) == set()
+
+
+def test_the_command_line_loads_nothing_heavy() -> None:
+    start = "import sys, sim.cli.app; print(*sys.modules, sep='\\n')"
+    loaded = subprocess.run([sys.executable, "-c", start], capture_output=True, text=True, check=True).stdout
+    assert "sim.cli.fly" in loaded.split()
+    assert HEAVY & set(loaded.split()) == set()

@@ -47,10 +47,8 @@ def test_regions_are_told_apart_and_those_without_a_disc_left_out() -> None:
 
 def test_gains_are_of_the_contexts_that_both_policies_saw_something_in() -> None:
     """A policy that looks from elsewhere may have no car in a context's disc where another has one."""
-    first, second = (
-        levels("all-4", [0.3, 0.4, 0.5], [0.3, 0.4, 0.5]),
-        levels("vantage", [0.9, 0.5, 0.7], [0.9, 0.6, 0.7]),
-    )
+    first = levels("all-4", [0.3, 0.4, 0.5], [0.3, 0.4, 0.5])
+    second = levels("vantage", [0.9, 0.5, 0.7], [0.9, 0.6, 0.7])
     gain = {m.what: m for m in means(first + second[1:])}["vantage − all-4"]
     assert (gain.torch[0], gain.surrogate) == pytest.approx((0.15, 0.2))
     gain = {m.what: m for m in means(first[:2] + second[1:])}["vantage − all-4"]

@@ -220,10 +220,6 @@ def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_
         (["--mcap", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2038"),
         (["--mcap", "--begin", "2050-01-01"], r"begin is '2050-01-01', must lie from 1970 to before 2038"),
         (["--tlog", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2096"),
-        (
-            ["--tlog", "--begin", "2010-01-01", "--key", "k"],
-            r"begin is '2010-01-01', must lie from 2015 to before 2096",
-        ),
         (["--mcap", "--out", "."], r"holds files but no metadata\.yaml"),
     ],
 )
@@ -235,4 +231,3 @@ def test_what_a_user_gets_wrong_is_named(
     said = CliRunner().invoke(app, ["export", "run", *arguments])
     assert re.search(message, str(said.exception))
     assert CliRunner().invoke(app, ["export", "run"]).exit_code == 2  # no format named
-    assert CliRunner().invoke(app, ["export", "run", "--mcap", "--origin", "1,2"]).exit_code == 2

@@ -329,18 +329,6 @@ def test_one_drone_flies_alone() -> None:
     assert o["switches"] is None
 
 
-def test_a_switch_is_counted_on_every_link_that_it_concerns() -> None:
-    """Each drone opens all its links once, in one decision: one switch a link, in as many entries as there are drones."""
-    scenario = example("policy.name=all-4", "policy.params={}")
-    o = outcome(run_sortie(scenario))
-    entries = [t for t in o["transitions"] if t["from"] == "nothing"]
-    links = scenario.fleet.drones * (scenario.fleet.drones - 1)
-    assert len(entries) < sum(len(t["peers"]) for t in entries) == links
-    assert o["switches"] == pytest.approx(
-        sum(len(t["peers"]) for t in o["transitions"]) / links / (o["duration_s"] / 60)
-    )
-
-
 def test_duty_cycle_rests_the_computer() -> None:
     def resting(view: object) -> list[Directive]:
         return [Directive(view.ego, p, duty_percent=20) for p in view.peers]  # type: ignore[attr-defined]
