@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.motion import fly
 from perception.outside.exchange import moved
-from perception.outside.recorded import write_recording
+from perception.outside.writing import write_recording
 from perception.scene import SceneModel
 from scenarios.schema import Scenario
 from sim.world import route_bounds

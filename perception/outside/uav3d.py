@@ -26,8 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from perception.errors import InputError
 from perception.geometry import FULL
-from perception.outside.recorded import Floats, write_recording
+from perception.outside.recorded import Floats
 from perception.outside.unpickle import UnpickleError, load_data
+from perception.outside.writing import write_recording
 
 UAVS = 5
 SIDES = ("FRONT", "BACK", "LEFT", "RIGHT", "BOTTOM")

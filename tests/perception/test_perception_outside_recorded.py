@@ -12,7 +12,8 @@ import pytest
 from recording_examples import score_map, small
 
 from perception.outside.exchange import moved
-from perception.outside.recorded import RecordingError, cells_of, open_recording, write_recording
+from perception.outside.recorded import RecordingError, cells_of, open_recording
+from perception.outside.writing import write_recording
 
 
 @pytest.fixture
@@ -174,6 +175,18 @@ def test_writing_zarr_is_whole_or_not_at_all(tmp_path: Path) -> None:
     small(tmp_path / "r")
     with pytest.raises(RecordingError, match="r: exists already, a Zarr recording must be written to a new folder"):
         small(tmp_path / "r")
+
+
+@pytest.mark.parametrize("name", ["r", "r.npz"])
+def test_what_would_be_refused_when_it_is_read_is_not_written(name: str, tmp_path: Path) -> None:
+    """1e5 is infinite in float16, as which features and confidences are kept."""
+    for values in (np.full((2, 3, 64, 64), 1e5), np.full((2, 3, 64, 64), np.nan)):
+        told = f"{tmp_path / name}: features of frame 1 are not finite as float16, must be within ±65504"
+        with pytest.raises(RecordingError, match=f"^{re.escape(told)}$"):
+            small(tmp_path / name, features=[np.full((2, 3, 64, 64), 65504.0), values])
+    with pytest.raises(RecordingError, match=r"confidence are not finite as float16, must be within ±65504"):
+        small(tmp_path / name, confidence=np.full((2, 2, 64, 64), -1e5))
+    assert not list(tmp_path.iterdir())
 
 
 def test_rows_of_another_width_or_of_another_drone_are_not_written(tmp_path: Path) -> None:
