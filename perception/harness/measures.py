@@ -244,8 +244,11 @@ class Peak:
         yield from self.curve
 
     def measure(self, scores: Scores) -> Measured:
-        """That budget."""
-        return Measured(POINTS * best(self.curve, self.region, scores).rho)
+        """That budget; NaN where there was nothing to find under any."""
+        top = best(self.curve, self.region, scores)
+        if not np.isfinite(scores.ap(top, self.region)):
+            return Measured(float("nan"), note="nothing was there to be found")
+        return Measured(POINTS * top.rho)
 
 
 @dataclass(frozen=True, slots=True)

@@ -140,6 +140,9 @@ def test_the_crossover_is_where_the_lead_changes(leads: tuple[float, ...], at: f
 def test_the_peak_is_a_budget_in_per_cent() -> None:
     curve = tuple(all_4(rho) for rho in (0.05, 0.1, 1.0))
     assert Peak(curve, "mission").measure(PAPER).value == pytest.approx(10.0)
+    nowhere = Peak(curve, "mission").measure(Made({}, lambda c, r: math.nan))
+    assert math.isnan(nowhere.value)
+    assert nowhere.note == "nothing was there to be found"
 
 
 def test_matched_bytes_are_compared_at_the_same_budget() -> None:
