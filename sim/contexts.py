@@ -45,7 +45,7 @@ class Summary:
     policy: str
     ap: float
     gain: tuple[float, float, float]
-    """Mean AP over that of the best fixed policy, with its 95 % interval: contexts resampled in pairs."""
+    """Mean AP over that of the best fixed policy, with its 95 % interval: contexts resampled in pairs; NaN for a single one."""
     of_oracle: float | None
     """Mean AP over that of the best fixed policy of each context; None where those found nothing."""
     data_bytes: float
@@ -157,11 +157,11 @@ def _fixed(policies: Sequence[str]) -> list[str]:
 
 
 def paired_interval(differences: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean difference over contexts [n]."""
+    """95 % percentile bootstrap interval of the mean difference over contexts [n]; NaN of a single one, which has none."""
+    if len(differences) < 2:
+        return float("nan"), float("nan")
     from scipy import stats  # half a second to import, and only here
 
-    if len(differences) < 2:
-        return float(differences[0]), float(differences[0])
     low, high = stats.bootstrap(
         (differences,), np.mean, n_resamples=DRAWS, method="percentile", rng=np.random.default_rng(seed)
     ).confidence_interval

@@ -136,7 +136,7 @@ def _surrogate(calibration: Path | None) -> Constructor:
 @dataclass(frozen=True, slots=True)
 class Mean:
     """The mean over contexts of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, contexts
-    resampled in pairs, of the torch detector's and of the difference."""
+    resampled in pairs, of the torch detector's and of the difference; NaN for a single one."""
 
     what: str
     region: str

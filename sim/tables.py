@@ -25,6 +25,12 @@ def number(value: Any, form: str = ".3f", unit: str = "") -> str:
     return "–" if value is None or value != value else f"{value:{form}}{unit and ' ' + unit}"
 
 
+def points(found: tuple[float, float, float], form: str = ".1f") -> str:
+    """An AP or a difference of two with its interval, in points; alone where the interval is NaN."""
+    value, low, high = (100 * f for f in found)
+    return f"{value:{form}}" + ("" if low != low else f" [{low:{form}}, {high:{form}}]")
+
+
 def size(count: float) -> str:
     """Bytes in the unit that reads best (decimal prefixes)."""
     for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
@@ -169,10 +175,7 @@ def _side_by_side(rows: Sequence[Compared]) -> dict[str, list[str]]:
 
 
 def _gain(gain: tuple[float, float, float] | None) -> str:
-    if gain is None:
-        return ""
-    value, low, high = (100 * g for g in gain)
-    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+    return "" if gain is None else points(gain, "+.1f")
 
 
 def explanations(rows: Sequence[Compared]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from policies.registry import resolve
 from scenarios.load import load, load_contexts
 from sim.console import out, stages, user_errors
 from sim.in_flight import REGIONS, Level, flights, means
+from sim.tables import points
 
 if TYPE_CHECKING:
     from perception.surrogate.judge import Verdict
@@ -88,7 +89,6 @@ def _in_flight(levels: Sequence[Level], title: str) -> Iterator[Table]:
         for column in ("policy", "torch", "surrogate", "error"):
             table.add_column(column, no_wrap=True)
         for m in (m for m in found if m.region == region):
-            torch, error = (f"{100 * v[0]:.1f} \\[{100 * v[1]:.1f}, {100 * v[2]:.1f}]" for v in (m.torch, m.error))
-            table.add_row(m.what, torch, f"{100 * m.surrogate:.1f}", error)
+            table.add_row(m.what, points(m.torch), f"{100 * m.surrogate:.1f}", points(m.error))
         if table.row_count:
             yield table

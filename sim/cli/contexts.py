@@ -21,7 +21,7 @@ from sim.console import bars, out
 from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
 from sim.folders import RunError, ensure_files, write_text
 from sim.in_flight import torch_answers
-from sim.tables import number, size
+from sim.tables import number, points, size
 
 
 def refuse(options: Mapping[str, object]) -> None:
@@ -58,9 +58,9 @@ def compare_contexts(
         "all contexts", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
     )  # fmt: skip
     for r in rows:
-        gain, low, high = (100 * g for g in r.gain)
+        gain = "–" if r.policy == fixed else points(r.gain, "+.1f")
         table.add_row(
-            r.policy, f"{r.ap:.3f}", "–" if r.policy == fixed else f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]",
+            r.policy, f"{r.ap:.3f}", gain,
             "–" if r.of_oracle is None else f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}", f"{r.miss_rate:.1%}",
         )  # fmt: skip
     out.print(table)
@@ -71,11 +71,16 @@ def compare_contexts(
     )
     if out_file is not None:
         found = {
-            "summary": [asdict(r) for r in rows],
-            "cells": [{**asdict(c), "ap": None if math.isnan(c.ap) else c.ap} for c in cells],
+            "summary": [{**asdict(r), "gain": [_known(g) for g in r.gain]} for r in rows],
+            "cells": [{**asdict(c), "ap": _known(c.ap)} for c in cells],
         }
         write_text(out_file, json.dumps(found, indent=1) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
+
+
+def _known(figure: float) -> float | None:
+    """As JSON has it, which has no NaN."""
+    return None if math.isnan(figure) else figure
 
 
 def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cell], width: int) -> Iterator[Table]:

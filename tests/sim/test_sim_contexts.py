@@ -108,7 +108,7 @@ def test_a_context_without_a_car_counts_for_nothing() -> None:
     rows = summarise([cell(p, f"c{k}", a) for p, values in ap.items() for k, a in enumerate(values)])
     assert [(r.policy, r.ap) for r in rows] == [("all-4", 0.4), ("best-2", 0.2), ("boxes", 0.5)]
     assert best_fixed(rows) == "all-4"
-    assert rows[2].gain == pytest.approx((0.1, 0.1, 0.1))
+    assert rows[2].gain == pytest.approx((0.1, nan, nan), nan_ok=True), "one context is left, which has no interval"
     with pytest.raises(RunError, match="no context has an accuracy under every policy"):
         summarise([cell("all-4", "c0", nan), cell("boxes", "c0", nan)])
 
@@ -152,6 +152,26 @@ def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: p
     assert [r["policy"] for r in kept["summary"]] == ["all-4", "boxes"]
     assert len(kept["cells"]) == 4
     assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
+
+
+def test_a_single_context_has_no_interval(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the figure stood twice, it looked certain."""
+    path, out = tmp_path / "one.yaml", tmp_path / "out.json"
+    path.write_text(SMALL.partition("  - {name: rich")[0])
+    cells = [cell(policy, "poor", ap) for policy, ap in (("all-4", 0.25), ("boxes", 0.375))]
+    monkeypatch.setattr(commands, "fly_all", lambda *_, **__: cells)
+    monkeypatch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", "all-4,boxes", "--out", str(out)])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert not stop.value.code
+    printed = capsys.readouterr().out
+    assert "+12.5" in printed
+    assert "[" not in printed
+    kept = json.loads(out.read_text(), parse_constant=pytest.fail)
+    assert [r["gain"] for r in kept["summary"]] == [[0.0, None, None], [0.125, None, None]]
 
 
 class Seer:

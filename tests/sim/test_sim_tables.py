@@ -1,8 +1,9 @@
-"""What users and policies wrote is printed as they wrote it."""
+"""What is printed: figures with their intervals, and what users and policies wrote as they wrote it."""
 
 from __future__ import annotations
 
 import io
+import math
 
 from rich.console import Console
 from rich.table import Table
@@ -12,7 +13,7 @@ from policies.contract import Directive, FleetView, Representation
 from sim.expect import Verdict
 from sim.outcome import outcome
 from sim.sortie import run_sortie
-from sim.tables import transitions_table, verdict_table
+from sim.tables import points, transitions_table, verdict_table
 
 REASON = "as in [roi] and [/roi]"
 """Which the terminal's markup would swallow, or stumble over."""
@@ -22,6 +23,11 @@ def printed(table: Table) -> str:
     console = Console(file=io.StringIO(), width=200)
     console.print(table)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_points_without_an_interval_stand_alone() -> None:
+    assert points((0.013, 0.005, 0.02)) == "1.3 [0.5, 2.0]"
+    assert points((0.013, math.nan, math.nan), "+.2f") == "+1.30"
 
 
 def test_brackets_in_a_policys_reason_are_brackets() -> None:
