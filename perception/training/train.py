@@ -85,12 +85,12 @@ def train(
         warm_start: begin from these weights instead of from nothing, as far as tensors fit (the log names the others).
         minutes: stop training after this long, validate and write what there is; the checkpoint stays.
         resume: go on from the checkpoint in `work`, if it belongs to the same run.
-        device: "cpu" or "cuda"; left out, cuda where there is one.
+        device: as `device_named` takes it.
         progress: called with (stage, done, of).
         scalars: called with (step, values by name) for loss curves: train/loss, train/lr, validation/ap_single, validation/ap_full.
 
     Raises:
-        ValueError: weights that cannot be read, or a benchmark of another range than the network's.
+        ValueError: weights that cannot be read, a benchmark of another range than the network's, or no such device.
     """
     begun = time.monotonic()
     tell = progress or (lambda stage, done, of: None)
@@ -100,7 +100,7 @@ def train(
         raise ValueError(
             f"the benchmark reaches ±{bench.geometry.half_extent_m:g} m, must be the network's ±{config.half_extent_m:g} m"
         )
-    where = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    where = device_named(device)
     root, work = root or benchmark_root(), work or out.parent
     files = make_split(bench, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering scenes", i, n))
     held_out = make_split(bench, "validation", root, progress=lambda i, n: tell("rendering validation", i, n))
@@ -169,6 +169,20 @@ def train(
     show(done, {"validation/ap_single": usual.ap_a, "validation/ap_full": usual.ap_b})
     log.info("AP@0.5 single %.3f, full %.3f", usual.ap_a, usual.ap_b)
     return TrainResult(out, done, loss, usual, len(data), spent / 60)
+
+
+def device_named(name: str | None) -> torch.device:
+    """Where to train: "cpu", "cuda" or one of several as in "cuda:1"; left out, cuda where there is one.
+
+    Raises:
+        ValueError: there is none of that name here.
+    """
+    there = ["cpu"]
+    if torch.cuda.is_available():
+        there += ["cuda", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
+    if name is not None and name not in there:
+        raise ValueError(f"device is {name!r}, must be one of {', '.join(there)} here")
+    return torch.device(name or ("cuda" if "cuda" in there else "cpu"))
 
 
 def _first(frames: Frames, count: int) -> Frames:

@@ -13,6 +13,7 @@ from rich.table import Table
 from policies.registry import resolve
 from scenarios.load import load, load_contexts
 from sim.console import out, stages, user_errors
+from sim.folders import ensure_files
 from sim.in_flight import REGIONS, Level, flights, means
 from sim.tables import points
 
@@ -50,6 +51,8 @@ def calibrate(
             load(fly)
         if made is not None and fly is None:
             raise ValueError("--made goes with --fly: there is nothing else to do with it")
+        if made is None:
+            ensure_files(out_file)
     if made is None:
         with user_errors(), stages() as progress:
             _, verdict = make(

@@ -62,6 +62,7 @@ def train(
     from perception.geometry import Geometry
     from perception.model import ModelConfig
     from perception.training.recipe import Recipe
+    from perception.training.train import device_named
     from perception.training.train import train as train_detector
     from sim import tables
     from sim.playback.training import TrainingLog
@@ -79,8 +80,7 @@ def train(
         )
         if fusion not in FUSIONS:
             raise ValueError(f"fusion is {fusion!r}, must be one of {', '.join(FUSIONS)}")
-        if (device or "cpu").partition(":")[0] not in ("cpu", "cuda"):
-            raise ValueError(f"device is {device!r}, must be cpu or cuda")
+        device_named(device)
         if warm_start is not None and not warm_start.is_file():
             raise ValueError(f"{warm_start}: no such weights")
         ensure_files(out_file)
