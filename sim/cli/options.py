@@ -15,7 +15,10 @@ ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a lib
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.battery.initial_soc=0.5")
 ]
-SeedOption = Annotated[int | None, typer.Option(help="Of every draw; left out, its own.", min=0, max=2**63 - 1)]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Seed of every random draw; left out, the scenario's.", min=0, max=2**63 - 1),
+]
 PolicyOption = Annotated[
     str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
 ]
