@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sim.console import out, stages, user_errors
-from sim.folders import RunError, ensure_folder, put_between, replacing
+from sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
 
 if TYPE_CHECKING:
     from perception.study.measure import Row
@@ -91,6 +91,7 @@ def study_report(
     drawn: list[tuple[str, str]] = []
     with user_errors():
         ensure_folder(out_dir, TABLE, "report", {REPORT, TABLE, *figures.CAPTIONS})
+        ensure_between(readme, report.BEGIN, report.END)
         rows = _read_rows(table)
         with replacing(out_dir) as folder:
             _write_table(to_table(rows), folder / TABLE)

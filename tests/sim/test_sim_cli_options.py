@@ -67,6 +67,7 @@ def command(*arguments: object) -> int:
         ),
         (("paper", "--frame", "0", "--against", "."), "--against goes with the whole report, not with --frame"),
         (("paper", "--readme", "example.yaml"), "must hold <!-- paper"),
+        (("study", "report", "--readme", "example.yaml"), "must hold <!-- study"),
     ],
 )
 def test_what_cannot_be_honoured_is_refused_before_anything_flies(
