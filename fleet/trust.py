@@ -41,9 +41,10 @@ UNDERSTATED, OVERSTATED = 0.1, 1.5
 sample), or above the second times the data rate at which it came: no link carries more than that."""
 
 # --- battery
-JUMP = 0.015
-"""A fall by so much from one judgement to the next is a fault, or a lie that begins; either way the charge is watched anew.
-Above a step of whole percents, and no higher: in a fleet of two or three a fault below it passes for the fleet's fall."""
+JUMP, MOST_JUMP = 0.015, 0.05
+"""A fall by so much a second, or by the second at once, is a fault, or a lie that begins; either way the charge is watched
+anew. Above a step of whole percents, and no higher: in a fleet of two or three a fault below it passes for the fleet's
+fall. A small pack that is heard every ten seconds falls by more than the first between two claims."""
 RISE = 0.03
 """Charge that may come back: estimators of real drones correct themselves by a few percent."""
 PERCENT = 0.01
@@ -91,6 +92,8 @@ class Standing(NamedTuple):
     least_soc: float = 1.0
     fine: bool = False
     """Whether it ever told its charge more finely than in whole percents."""
+    unheard: int = 0
+    """Judgements since the last at which it was heard."""
 
     @property
     def elapsed(self) -> int:
@@ -131,7 +134,9 @@ def judge(
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
     # who was not heard drained on: its fall, once it is heard again, is over this second too
-    after = {i: s if i in known else s._replace(seconds=s.seconds + 1) for i, s in standings.items()}
+    after = {
+        i: s if i in known else s._replace(seconds=s.seconds + 1, unheard=s.unheard + 1) for i, s in standings.items()
+    }
     for peer, claim in known.items():
         standing = before[peer]
         doubt = ""
@@ -156,9 +161,9 @@ def judge(
 
 def _aged(standing: Standing, soc: float) -> Standing:
     """The standing a second later; who is judged for the first time, or fell at once, begins with its charge."""
-    strikes, reason, seconds, first_soc, least_soc, fine = standing
+    strikes, reason, seconds, first_soc, least_soc, fine, unheard = standing
     fine = fine or abs(soc / PERCENT - round(soc / PERCENT)) > 1e-4
-    if seconds == 0 or soc < least_soc - JUMP:
+    if seconds == 0 or soc < least_soc - min(JUMP * (1 + unheard), MOST_JUMP):
         return Standing(strikes, reason, 1, soc, soc, fine)
     return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine)
 
@@ -239,14 +244,15 @@ def battery_doubt(
 def could_tell(arrivals: Sequence[Arrival], told_s: float) -> tuple[list[Arrival], list[Arrival]]:
     """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next.
 
-    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither. Nor does
-    what came where their row broke off, or is none: the claim may be of a payload that did not come.
+    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither. Where their
+    row broke off, or is none, the claim may be of a payload that did not come: then they tell how fast their frames were,
+    which no loss lets an estimate exceed, but nothing of how much must have arrived.
     """
     told = [a for a in arrivals if told_s - TELLS_FOR_S < a.t_done_s <= told_s]
     sent_s = sorted(a.sent_s for a in told)
     apart_s = min((b - a for a, b in pairwise(sent_s)), default=0.0)
     if told_s - max(sent_s, default=told_s) > apart_s + ROUNDING_S:
-        told = []
+        told = [a._replace(size_bytes=0) for a in told]
     return told, [a for a in arrivals if a.t_done_s > told_s]
 
 

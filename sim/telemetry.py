@@ -150,9 +150,10 @@ class MavlinkEndpoint:
                 self._peer = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]
             self._socket.setblocking(False)
             self.address = self._socket.getsockname()
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a name that none can be, as a..b
             self._socket.close()
-            raise RunError(f"{address}: {error.strerror}") from error
+            why = error.strerror if isinstance(error, OSError) else "no name of a host"
+            raise RunError(f"{address}: {why}") from error
 
     def begin(self, scenario: Scenario, scene: SceneModel) -> None:
         """Start the clock."""

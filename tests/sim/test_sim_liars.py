@@ -110,6 +110,14 @@ def test_honest_fleets_doubt_nobody_at_the_edge_of_range() -> None:
     assert lost > 100
 
 
+def test_who_claims_more_than_a_full_channel_carries_is_found_out() -> None:
+    """There a payload is on its way whenever a claim is made; none of them could make it true."""
+    full = ["radio.bandwidth_mhz=20", "perception.detector=none", "duration_s=30"]
+    much = "events=[{kind: lie, at_s: 5, drone: 2, about: goodput, claim: much}]"
+    record = run_sortie(load("track_target", [*full, much, *policy_overrides("all-4(rho=0.1)", "worked")]), None, 1)
+    assert outcome(record)["distrusted_by"] == {"2": 4}
+
+
 def test_honest_fleets_doubt_nobody_where_slow_descriptors_are_lost() -> None:
     """One each ten seconds, of which links of 200 m lose some: a charge does not stand still because nobody tells it."""
     slow = ["context.rate_hz=1", "context.publish_every=10", "radio.tx_power_dbm=0", "fleet.formation.spacing_m=200"]

@@ -392,6 +392,12 @@ def test_a_host_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         MavlinkEndpoint("udpout:nowhere.invalid:14550")
 
 
+def test_a_host_that_none_can_be_is_named() -> None:
+    """Python's resolver says so in words of its own before it asks anybody."""
+    with pytest.raises(RunError, match=r"^udpout:a\.\.b:14550: no name of a host$"):
+        MavlinkEndpoint("udpout:a..b:14550")
+
+
 def test_a_port_that_is_taken_is_named() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
