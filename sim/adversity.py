@@ -17,7 +17,7 @@ from fleet.wire import decode_descriptor, encode_descriptor
 from scenarios.schema import BatteryFault, CellFailure, ClockSkew, DroneLost, Event, Jam, Lie, LinkDrop, Scenario, Spoof
 from scenarios.streams import stream
 from sim.ether import Ether
-from sim.world import World, at
+from sim.world import World, at, with_frame
 
 OVERSIZED_BYTES = 2000
 
@@ -35,11 +35,11 @@ def schedule(scenario: Scenario, world: World, ether: Ether, *, seed: int, repli
     """
     begins = [_Begin(scenario, world, ether, e, index, seed, replication) for index, e in enumerate(scenario.events)]
     for begin in begins:
-        at(world.env, begin.event.at_s, begin)
+        at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
     for begin in begins:
         event = begin.event
         if isinstance(event, LinkDrop | Jam | Lie) and event.until_s is not None:
-            at(world.env, event.until_s, begin.end)
+            at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
 
 
 class _Begin:
@@ -66,15 +66,18 @@ class _Begin:
                 if world.agents[event.drone].airborne:
                     world.remove(event.drone, "drone_lost", "fell silent")
             case BatteryFault():
-                world.note(event.drone, "battery_fault", f"{event.lost_fraction:.0%} of the remaining energy is gone")
                 world.drain()
-                world.batteries.fault(event.drone, event.lost_fraction)
-                world.ground_landed()
+                if world.agents[event.drone].airborne:  # who left the air spends nothing any more
+                    lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
+                    world.note(event.drone, "battery_fault", lost)
+                    world.batteries.fault(event.drone, event.lost_fraction)
+                    world.ground_landed()
             case CellFailure():
                 world.drain()
-                world.batteries.drop_cell(event.drone)
-                world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
-                world.ground_landed()
+                if world.agents[event.drone].airborne:
+                    world.batteries.drop_cell(event.drone)
+                    world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
+                    world.ground_landed()
             case ClockSkew():
                 world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
                 world.agents[event.drone].clock_skew_s = event.skew_s

@@ -51,10 +51,10 @@ class Bytes(TypedDict):
 
 
 class Drone(TypedDict):
-    soc: Annotated[float, "State of charge at the end, 0 … 1."]
-    voltage_v: Annotated[float, "At the pack's terminals at the end."]
+    soc: Annotated[float, "State of charge, 0 … 1."]
+    voltage_v: Annotated[float, "At the pack's terminals."]
     airborne: Annotated[bool, "Whether it still flew."]
-    energy_j: Annotated[float, "Spent, all causes."]
+    energy_j: Annotated[float, "Spent to the very end, all causes."]
 
 
 class Policies(TypedDict):
@@ -118,8 +118,8 @@ class Outcome(TypedDict):
     age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
     data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
     descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
-    battery: Annotated[dict[str, float], "State of charge at the end, by drone."]
-    drones: Annotated[dict[str, Drone], "Each at the end."]
+    battery: Annotated[dict[str, float], "State of charge as the last frame begins, by drone."]
+    drones: Annotated[dict[str, Drone], "Each as the last frame begins."]
     energy_j: Annotated[dict[str, float], "By cause, and `total`; hover outweighs the radio about a hundredfold."]
     policies: Annotated[Policies, "Who decided, and how often it was put right."]
     switches: Annotated[

@@ -32,7 +32,7 @@ from policies.views import ViewError, from_json
 from scenarios.schema import Policy as PolicySection
 from scenarios.schema import PolicyChange
 from sim.record import DECISIONS_OF, Recorder
-from sim.world import at
+from sim.world import at, with_frame
 
 _PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 
@@ -237,7 +237,9 @@ class Pilot:
                 self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
 
 
-def schedule_policies(env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent]) -> None:
+def schedule_policies(
+    env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
+) -> None:
     """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
     two changes at one instant the later in the list comes last."""
     for pilot, agent in zip(pilots, agents, strict=True):
@@ -251,7 +253,7 @@ def schedule_policies(env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot
                 told = [p for p in pilots if not drones or p.drone in drones]
                 due.append((at_s, place, partial(_take_over, told, policy, f"command {word!r}", place)))
     for at_s, _, act in sorted(due, key=lambda entry: entry[:2]):
-        at(env, at_s, act)
+        at(env, with_frame(at_s, frame_s), act)
     for at_s, drone, view in plan.replays:
         at(env, at_s, partial(pilots[drone].show, view))
 

@@ -180,7 +180,7 @@ def run_sortie(
     if observer is not None:
         observer.begin(scenario, scene)
     schedule(scenario, world, ether, seed=seed, replication=replication)
-    schedule_policies(env, flight_plan, pilots, agents)
+    schedule_policies(env, flight_plan, pilots, agents, scenario.frame_s)
     world.start()
     for agent in agents:
         agent.start()

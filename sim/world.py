@@ -38,11 +38,21 @@ USABLE_SNR_DB = 0.0
 LEAST_MBPS = 1e-6
 """A link that carries anything at all."""
 
+INSTANT_S = 1e-9
+"""Times so little apart are one, and differ by rounding."""
+
 
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
     """Call `act` at simulated time `t_s`."""
     event = env.timeout(max(0.0, t_s - env.now))
     event.callbacks.append(lambda _event: act())
+
+
+def with_frame(t_s: float, frame_s: float) -> float:
+    """When what happens at `t_s` is due, so that it is no later than a frame that begins then: at 7.5 Hz the clock of
+    14.8 s says a last digit less."""
+    frame_at_s = round(t_s / frame_s) * frame_s
+    return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
 
 
 class World:
@@ -118,7 +128,7 @@ class World:
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land who has to."""
         dt_s = self.env.now - self._stepped_to_s
-        if dt_s <= 0:
+        if dt_s <= INSTANT_S:  # no time to tell shares of
             return
         self._stepped_to_s = self.env.now
         airtime_s = list(self.air.airtime_s)

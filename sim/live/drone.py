@@ -99,7 +99,7 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
     )
     agent.clock_skew_s = go.unix_ns * 1e-9 - orders.begin_s  # stamps are ns since 1970, as ROS 2 has them
     node.fly(agent, rules, senses.goodput_mbps)
-    schedule_policies(clock, plan, [pilot], [agent])
+    schedule_policies(clock, plan, [pilot], [agent], scenario.frame_s)
     if orders.trace.end_s < orders.end_s:
         at(clock, orders.trace.end_s, agent.stop)
     agent.start()

@@ -272,6 +272,14 @@ def test_a_battery_fault_takes_its_energy_and_is_in_the_ledger() -> None:
     assert o["battery"]["1"] < 0.6 < o["battery"]["0"]
 
 
+@pytest.mark.parametrize("fault", ["battery_fault, lost_fraction: 0.5", "cell_failure"])
+def test_a_drone_that_left_the_air_loses_no_energy(fault: str) -> None:
+    events = f"events=[{{kind: drone_lost, drone: 1, at_s: 2}}, {{kind: {fault}, drone: 1, at_s: 3}}]"
+    o = outcome(run_sortie(example("duration_s=4", events)))
+    assert o["energy_j"]["fault"] == 0.0
+    assert [e["kind"] for e in o["events"]] == ["drone_lost"]
+
+
 def test_jam_and_link_drop_end_when_they_should(base: SortieRecord) -> None:
     def snr(record: SortieRecord, begin_s: float, end_s: float) -> float:
         sent = record.tables["transmissions"]
@@ -302,6 +310,24 @@ def test_what_ends_with_a_frame_ends_before_it(begin_s: float, end_s: float) -> 
         for record in flown
     )
     assert after_db == clear_db != set()
+
+
+def test_an_event_comes_before_its_frame_whatever_the_clock_rounds() -> None:
+    """At 7.5 Hz the frame of 14.8 s stands a last digit below it on the clock."""
+    lost = "events=[{kind: drone_lost, drone: 3, at_s: 14.8}]"
+    record = run_sortie(example("context.rate_hz=7.5", "duration_s=15", "perception.detector=none", lost))
+    seen = record.tables["states"].filter(pc.equal(record.tables["states"]["drone"], 3)).to_pylist()
+    assert [row["t_s"] < 14.8 - 1e-9 for row in seen] == [row["airborne"] for row in seen]
+
+
+def test_an_event_with_a_frame_leaves_the_others_headrooms_alone() -> None:
+    """0.3 is a last digit below the third frame: what lies between them is no time to tell the radio's share of."""
+    said = []
+    for events in ("[]", "[{kind: battery_fault, drone: 3, at_s: 0.3, lost_fraction: 0.01}]"):
+        told = run_sortie(example("duration_s=0.5", f"events={events}")).tables["descriptors"].to_pylist()
+        said.append([d["cpu_headroom"] for d in told if d["drone"] != 3])
+    assert said[0] == pytest.approx(said[1])
+    assert min(said[0]) < 1.0
 
 
 def test_the_end_of_a_link_drop_names_the_link() -> None:
