@@ -148,18 +148,21 @@ def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> 
     new: dict[str, Array] = {name: getattr(motion, name).copy() for name in names}
     for drone, pose in posed.items():
         t_s = np.clip(motion.time_s, pose.time_s[0], pose.time_s[-1])
+        beyond = np.abs(motion.time_s - t_s) > ROUNDING_S
+        within = np.flatnonzero(~beyond)
         position = _sample(t_s, pose.time_s, pose.position_m)
         if pose.velocity_mps is not None:
             velocity = _sample(t_s, pose.time_s, pose.velocity_mps)
         else:
-            velocity = _slope(position, frame_s)
+            velocity = _slope(position, within, frame_s)
         if pose.orientation_xyzw is None:
             orientation = _level(velocity)
         elif len(pose.time_s) == 1:
             orientation = np.repeat(pose.orientation_xyzw, len(t_s), axis=0)
         else:
             orientation = Slerp(pose.time_s, Rotation.from_quat(pose.orientation_xyzw))(t_s).as_quat()
-        velocity[np.abs(motion.time_s - t_s) > ROUNDING_S] = 0.0  # there it stands, headed as it will or did
+        acceleration = _slope(velocity, within, frame_s)  # a trace's begin and end are no manoeuvres
+        velocity[beyond] = acceleration[beyond] = 0.0  # there it stands, headed as it will or did
         flips = np.sign((orientation[1:] * orientation[:-1]).sum(axis=-1))
         orientation[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips))[:, None]
         yaw = yaw_rad(orientation)
@@ -168,7 +171,7 @@ def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> 
         new["est_yaw_rad"][:, drone] = np.mod(believed_yaw + np.pi, 2 * np.pi) - np.pi
         new["position_m"][:, drone], new["velocity_mps"][:, drone] = position, velocity
         new["orientation_xyzw"][:, drone], new["yaw_rad"][:, drone] = orientation, yaw
-        new["acceleration_mps2"][:, drone] = _slope(velocity, frame_s)
+        new["acceleration_mps2"][:, drone] = acceleration
         new["body_rates_radps"][:, drone] = body_rates(orientation[:, None], frame_s)[:, 0]
     flown = replace(motion, **new)
     for each in fields(flown):
@@ -251,9 +254,13 @@ def _sample(t_s: Array, time_s: Array, values: Array) -> Array:
     return np.stack([np.interp(t_s, time_s, column) for column in values.T], axis=-1)
 
 
-def _slope(values: Array, step_s: float) -> Array:
-    """Central differences [T, 3]; of a single frame, zeros."""
-    return np.gradient(values, step_s, axis=0) if len(values) > 1 else np.zeros_like(values)
+def _slope(values: Array, frames: npt.NDArray[np.intp], step_s: float) -> Array:
+    """Central differences [T, 3] of the values in these frames, held beyond them; of a single one, zeros."""
+    if len(frames) < 2:
+        return np.zeros_like(values)
+    at = np.clip(np.arange(len(values)), frames[0], frames[-1]) - frames[0]
+    slope: Array = np.gradient(values[frames], step_s, axis=0)[at]
+    return slope
 
 
 def _level(velocity: Array) -> Array:

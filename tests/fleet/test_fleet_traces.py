@@ -80,14 +80,17 @@ def test_heading_and_attitude_are_taken_where_given(tmp_path: Path) -> None:
     np.testing.assert_allclose(tilted.body_rates_radps[:, 0], 0, atol=1e-6)
 
 
-def test_before_the_first_and_after_the_last_place_a_drone_stands(tmp_path: Path) -> None:
-    """5 m/s north in every row, told from 2 s to 6 s: no velocity where the place is held, and the same heading."""
-    rows = "".join(f"{t},0,{5 * t},60,0,5,0\n" for t in (2.0, 4.0, 6.0 - 1e-9))
-    path = written(tmp_path, "t_s,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps\n" + rows)
+@pytest.mark.parametrize(("names", "told"), [(",vx_mps,vy_mps,vz_mps", ",0,5,0"), ("", "")])
+def test_before_the_first_and_after_the_last_place_a_drone_stands(names: str, told: str, tmp_path: Path) -> None:
+    """5 m/s north in every row, told from 2 s to 6 s: no velocity where the place is held, and the same heading; nor is
+    the begin or the end a manoeuvre, whose thrust no pack could give."""
+    rows = "".join(f"{t},0,{5 * t},60{told}\n" for t in (2.0, 4.0, 6.0 - 1e-9))
+    path = written(tmp_path, f"t_s,x_m,y_m,z_m{names}\n" + rows)
     flown = follow(fly(FLEET, 10.0, 0.1, 1), read_traces(path, 5), 0.1)
     moves = flown.velocity_mps[:, 0, 1] != 0
     assert flown.time_s[moves].tolist() == pytest.approx([k / 10 for k in range(20, 61)])
     np.testing.assert_allclose(flown.velocity_mps[moves, 0], [[0, 5, 0]] * 41)
+    np.testing.assert_allclose(flown.acceleration_mps2[:, 0], 0.0, atol=1e-6)
     np.testing.assert_allclose(flown.yaw_rad[:, 0], np.pi / 2)
     assert (flown.position_m[~moves, 0, 1] == np.where(flown.time_s[~moves] < 4, 10.0, 30.0 - 5e-9)).all()
 
