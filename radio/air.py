@@ -17,8 +17,9 @@ from itertools import pairwise
 from math import nan
 from typing import cast
 
+import numpy as np
 import simpy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from radio.airtime import repair_wire_bytes, sample_wire
 from radio.broadcasts import Broadcast, Broadcasts, OnHeard
@@ -134,6 +135,14 @@ class Air:
         """[N, N], sender by receiver: mean SNR in this frame, dB; NaN on the diagonal."""
         snr_db = self.channel.snr_db
         return snr_db if self._overrides is None else self._overrides.snr_db(snr_db)
+
+    def usable(self, least_snr_db: float) -> NDArray[np.bool_]:
+        """[N, N]: links of at least this mean SNR in this frame; of those with a traced loss or goodput, the ones that
+        carry anything."""
+        usable = self.snr_db >= least_snr_db
+        if self._overrides is not None and (traced := self._overrides.traced).any():
+            usable = np.where(traced, self.link_mbps() > 0.0, usable)
+        return usable
 
     # --- context ---------------------------------------------------------------------------------
 

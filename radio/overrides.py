@@ -108,6 +108,11 @@ class Overrides:
         """[N, N]: the trace's loss in this frame, NaN where it has none."""
         return self._given.loss
 
+    @property
+    def traced(self) -> NDArray[np.bool_]:
+        """[N, N]: links that the trace gives a loss or a goodput in this frame, whatever their SNR."""
+        return ~(np.isnan(self._given.loss) & np.isnan(self._given.goodput_mbps))
+
     def mbps(self, modelled: FloatArray) -> FloatArray:
         """[N, N]: the trace's goodput where it has one, else the model's."""
         return np.where(np.isnan(self._given.goodput_mbps), modelled, self._given.goodput_mbps)

@@ -176,10 +176,8 @@ class World:
         busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
         self._busy_at_s = (self.env.now, busy_s)
         flying = [a.drone for a in self.agents if a.airborne]
-        quality, least = self.air.snr_db, USABLE_SNR_DB
-        if self._scenario.radio.trace is not None:  # which may tell a loss or a goodput whatever the SNR
-            quality, least = self.air.link_mbps(), LEAST_MBPS
-        linked = linked_drones(quality if len(flying) == len(quality) else quality[np.ix_(flying, flying)], least)
+        usable = self.air.usable(USABLE_SNR_DB)
+        linked = linked_drones(usable if len(flying) == len(usable) else usable[np.ix_(flying, flying)], threshold=1.0)
         self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
         if self._scenario.radio.relay_max_hops > 1:
             self._write_topology(flying)

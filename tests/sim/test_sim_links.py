@@ -78,6 +78,17 @@ def test_links_that_a_trace_cuts_are_not_usable(quality: str, tmp_path: Path) ->
     assert [cut for cut in record.tables["topology"]["cut_drones"].to_pylist() if cut != [1]] == []
 
 
+@pytest.mark.parametrize(("power_dbm", "gained"), [(8, 0), (-4, 2)])
+def test_a_trace_of_one_link_leaves_the_others_as_they_are(power_dbm: int, gained: int, tmp_path: Path) -> None:
+    """Links of 150 m or more come and go about 0 dB; or none is there, but the one that is there by its trace."""
+    far = ("fleet.formation.spacing_m=150", f"radio.tx_power_dbm={power_dbm}")
+    (tmp_path / "links.csv").write_text("t_s,sender,receiver,loss\n0,0,1,0\n")
+    alone, traced = (run_sortie(example(*far, *t)) for t in ((), (f"radio.trace={tmp_path / 'links.csv'}",)))
+    before, after = (r.tables["medium"]["connected_drones"].to_pylist() for r in (alone, traced))
+    assert min(before) < 5
+    assert after == [k + gained for k in before]
+
+
 def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:
     scenario = load("paper_context", ["perception.detector=none"])
     record = run_sortie(scenario)
