@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from scenarios.files import named_files
 from scenarios.load import library, load
 from scenarios.schema import Scenario
 from sim.expect import Verdict, check
 from sim.folders import RunError
-from sim.golden import golden_path, moved, write_golden
+from sim.golden import golden_path, moved, named_from, write_golden
 from sim.outcome import outcome
 from sim.record import SortieRecord
 from sim.sortie import run_sortie
@@ -62,9 +63,10 @@ def check_scenario(
     results = [result, *_more(scenario, progress)]
     verdicts = [_explained(v, record, result) for v in check(scenario, record, result, results)]
     golden = golden_path(library().get(path_or_name, Path(path_or_name)))
-    written = write_golden(golden, result) if update else ""
+    portable = named_from(golden.parent, result, named_files(scenario.model_dump(mode="json")))
+    written = write_golden(golden, portable) if update else ""
     if golden.is_file() and not overrides and not update:
-        verdicts.append(_golden(golden, result))
+        verdicts.append(_golden(golden, portable))
     return Checked(scenario, tuple(verdicts), _replay(path_or_name, overrides), written)
 
 
@@ -103,7 +105,8 @@ def _golden(path: Path, result: dict[str, Any]) -> Verdict:
     shown = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(found.items())[:SHOWN])
     more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     got = f"{len(found)} moved: {shown}{more}" if found else "the same"
-    return Verdict(f"the outcome in {path.name}", got, not found, "renew it with --update where it was meant to move")
+    renew = "renew it with --update (pytest: --sortie-update) where it was meant to move"
+    return Verdict(f"the outcome in {path.name}", got, not found, renew)
 
 
 def _short(value: Any) -> str:

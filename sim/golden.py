@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +39,23 @@ def figures(result: dict[str, Any]) -> dict[str, Any]:
 
     walk("", {k: v for k, v in result.items() if k not in LEFT_OUT})
     return flat
+
+
+def named_from(folder: Path, result: dict[str, Any], files: Iterable[str]) -> dict[str, Any]:
+    """The outcome with its scenario's files named from `folder`: it is the same wherever a project lies or is flown from."""
+    names = {name: Path(os.path.relpath(name, folder)).as_posix() for name in files if Path(name).exists()}
+    if not names:
+        return result
+    any_file = re.compile("|".join(re.escape(name) for name in sorted(names, key=len, reverse=True)))
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {renamed(key): renamed(inner) for key, inner in value.items()}
+        if isinstance(value, list):
+            return [renamed(inner) for inner in value]
+        return any_file.sub(lambda found: names[found[0]], value) if isinstance(value, str) else value
+
+    return {key: renamed(value) for key, value in result.items()}
 
 
 def write_golden(path: Path, result: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -136,6 +137,25 @@ def test_a_golden_outcome_is_compared_and_only_renewed_when_asked(tmp_path: Path
     assert golden.read_text() == before
     check_scenario(str(path), update=True)
     assert golden.read_text() != before
+
+
+@pytest.mark.parametrize("folder", ["project", "moved to (another) place"])
+def test_a_golden_outcome_holds_wherever_the_project_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    """Policy files are named by how they are found, which is another path in pytest, in the shell and on another machine."""
+    first, second = tmp_path / "first", tmp_path / folder
+    first.mkdir()
+    (first / "mine.py").write_text("def decide(view):\n    return []\n")
+    own = "policy: {name: 'mine.py:decide', changes: [{at_s: 0.5, name: silence}]}"
+    (first / "own.yaml").write_text(SHORT.replace("policy: {name: worked, params: {rho: 0.25}, dwell_s: 0.3}", own))
+    assert check_scenario(str(first / "own.yaml"), update=True).written
+    shutil.copytree(first, second)
+    for here, path in ((second, "own.yaml"), (tmp_path, f"{folder}/own.yaml"), (tmp_path, str(second / "own.yaml"))):
+        monkeypatch.chdir(here)
+        (golden,) = check_scenario(path).verdicts
+        assert golden.got == "the same"
+    assert str(tmp_path) not in golden_path(first / "own.yaml").read_text()
 
 
 def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
