@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import math
 import numbers
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,12 +62,18 @@ BOUNDS: dict[str, Bound] = {
 user's file declares."""
 
 
+_MODULE = "sortie_policy_"
+"""How modules of policies from files are called."""
+
+
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     """A registered policy, or `path/to/file.py:function`, with its parameters bound.
 
     Raises:
         PolicyError: unknown name or parameter, a parameter out of its bounds, missing file or function.
     """
+    if name.endswith(".py"):
+        raise PolicyError(f"policy file {name!r} without its function, must be {name}:function")
     function = _from_file(name) if ":" in name else POLICIES.get(name)
     if function is None:
         raise PolicyError(f"unknown policy {name!r}, known: {', '.join(POLICIES)}, or path/to/file.py:function")
@@ -78,6 +85,14 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
         if bound is not None and not bound.holds(value):
             raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.words}")
     return functools.partial(function, **params) if params else function
+
+
+def told(error: Exception) -> str:
+    """An exception out of a policy in words, with the last line that it came through of a file that was not registered."""
+    frames = traceback.walk_tb(error.__traceback__)
+    lines = [(f.f_code.co_filename, n) for f, n in frames if str(f.f_globals.get("__name__")).startswith(_MODULE)]
+    place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
+    return f"{type(error).__name__}: {error}{place}"
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
@@ -111,14 +126,14 @@ def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
     path = Path(file)
     if not path.is_file():
         raise PolicyError(f"policy file {file!r} not found")
-    spec = importlib.util.spec_from_file_location(f"sortie_policy_{path.stem}", path)
+    spec = importlib.util.spec_from_file_location(f"{_MODULE}{path.stem}", path)
     if spec is None or spec.loader is None:
         raise PolicyError(f"policy file {file!r} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise PolicyError(f"policy file {file!r} does not load: {type(error).__name__}: {error}") from error
+        raise PolicyError(f"policy file {file!r} does not load: {told(error)}") from error
     function = getattr(module, attribute, None)
     if not callable(function):
         raise PolicyError(f"policy file {file!r} has no function {attribute!r}")

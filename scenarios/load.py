@@ -186,7 +186,7 @@ def _nearby(path: Path) -> str:
         here = sorted(p.name for p in path.parent.glob("*.y*ml"))
     except (OSError, ValueError):
         here = []
-    known = {Path(name).stem: name for name in [*library(), *here]}
+    known = {Path(name).stem: name for name in [*library(), *campaigns(), *context_sets(), *here]}
     near = nearest(path.stem, known)
     return f"did you mean {known[near]}?" if near else f"the library has {', '.join(library())}"
 

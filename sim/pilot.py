@@ -26,7 +26,7 @@ from policies.contract import (
     check_reposition,
 )
 from policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
-from policies.registry import handshake_bytes, resolve, viewpoint_of
+from policies.registry import handshake_bytes, resolve, told, viewpoint_of
 from policies.shield import MARK, checked, enforce
 from policies.views import ViewError, from_json
 from scenarios.schema import Policy as PolicySection
@@ -188,7 +188,7 @@ class Pilot:
         try:
             asked = self._look(view)
         except Exception as error:
-            what = f"its viewpoint raises {type(error).__name__}: {error}"
+            what = f"its viewpoint raises {told(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
         check_reposition(asked, view)
         return asked
@@ -199,7 +199,7 @@ class Pilot:
         except PolicyError:
             raise
         except Exception as error:
-            what = f"raises {type(error).__name__}: {error}"
+            what = f"raises {told(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
         if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
             what = f"returns {type(answer).__name__}, must be a sequence of directives"

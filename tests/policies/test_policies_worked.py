@@ -127,6 +127,11 @@ def test_registry_errors_name_what_there_is(tmp_path) -> None:
     (tmp_path / "bad.py").write_text("def decide(view) return []\n")
     with pytest.raises(PolicyError, match="does not load: SyntaxError"):
         resolve(f"{tmp_path}/bad.py:decide")
+    (tmp_path / "late.py").write_text("import math\n\nLEAST = math.sqrt(-1)\n")
+    with pytest.raises(PolicyError, match=r"late.py' does not load: ValueError: .* \(late\.py, line 3\)$"):
+        resolve(f"{tmp_path}/late.py:decide")
+    with pytest.raises(PolicyError, match=r"mine.py' without its function, must be .*mine.py:function"):
+        resolve(f"{tmp_path}/mine.py")
     assert list(resolve(f"{tmp_path}/mine.py:decide")(fleet_of(5))) == []
 
 

@@ -67,6 +67,7 @@ def test_a_missing_file_names_what_was_probably_meant(tmp_path: Path) -> None:
     for name, hint in (
         (tmp_path / "valey.yaml", "did you mean valley.yaml?"),
         ("track_targt", "did you mean track_target?"),
+        ("link_batery", "did you mean link_battery?"),  # a campaign
         ("zzz.yaml", "the library has paper_context, paper_replay, search_grid, track_target"),
     ):
         with pytest.raises(ScenarioError) as caught:

@@ -193,7 +193,7 @@ BROKEN = {
     "greedy": ("[Directive(view.ego, p, rho=7.0) for p in view.peers]", r"directive 0→\d: rho is 7\.0, must be in \[0, 1\]"),
     "stray": ("[Directive(view.ego, 77)]", r"directive 0→77: destination 77 is not a peer in the view"),
     "empty": ("None", r"policy '.*empty' on drone \d returns NoneType, must be a sequence of directives"),
-    "crash": ("[1 / 0]", r"policy '.*crash' on drone \d raises ZeroDivisionError: division by zero"),
+    "crash": ("[1 / 0]", r"policy '.*crash' on drone \d raises ZeroDivisionError: division by zero \(mine\.py, line 4\)"),
     "wrong": ("['features']", "a policy returns Directive, got str"),
 }  # fmt: skip
 
