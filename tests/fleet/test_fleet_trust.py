@@ -90,7 +90,7 @@ def test_nobody_doubts_itself() -> None:
 def test_who_left_is_remembered_as_it_was() -> None:
     standings = after(20, ("coverage", "much"))
     gone = {i: d for i, d in fleet(20).items() if i != 1}
-    assert judge(standings, 0, gone, {})[1] == standings[1]._replace(seconds=21)
+    assert judge(standings, 0, gone, {})[1] == standings[1]._replace(seconds=21, unheard=1)
 
 
 # --- coverage ------------------------------------------------------------------------------------
