@@ -56,6 +56,7 @@ def _lines(rows: Rows, folder: Path, pictures: dict[str, bool]) -> Iterator[str]
         yield f"`stop_when` ended it: the interval of {asked.metric} is narrow enough."
     if left := rows.all.num_rows - rows.table.num_rows:
         yield f"{left} of the runs are left out of all that follows: their {plan.unit} is not finished at every grid point."
+    yield from _lost(rows)
     if plan.campaign.sample.method in ("latin_hypercube", "sobol") and len(plan.points) > 1:
         yield "Draws of this design are spread more evenly than independent ones, so the intervals are on the wide side."
     yield from _by_policy(rows)
@@ -72,6 +73,19 @@ polars.read_parquet("{folder}/runs/*.parquet")
 pandas.read_parquet("{folder}/runs")
 duckdb.sql("from '{folder}/runs/*.parquet'")
 ```"""
+
+
+def _lost(rows: Rows) -> Iterator[str]:
+    """What failed runs take out of the means, and by whose fault."""
+    plan, lost = rows.plan, rows.lost()
+    if units := int(lost.any(axis=1).sum()):
+        whose = ", ".join(f"{label} {n}" for label, n in zip(plan.policies, lost.sum(axis=0), strict=True) if n)
+        yield (
+            f"{units} of the {plan.unit}s are left out of all means, where a policy's runs failed ({whose}): "
+            "policies are compared on the same draws."
+        )
+    if none := [p for i, p in enumerate(plan.policies) if not rows.done[rows.policy == i].any()]:
+        yield f"No run of {', '.join(none)} finished."
 
 
 def _by_policy(rows: Rows) -> Iterator[str]:

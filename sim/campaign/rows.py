@@ -51,37 +51,45 @@ class Rows:
         """[runs]; NaN where there is none."""
         return np.asarray(self.table[metric].to_numpy(zero_copy_only=False), float)
 
+    def lost(self, mask: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """[units, policies]: where all runs of a policy at a grid point have failed. A policy that never finished a run has
+        lost nothing: there is no mean of it anywhere."""
+        mask = np.ones(len(self.unit), bool) if mask is None else mask
+        failed = (self._count(mask & ~self.done) > 0) & (self._count(mask & self.done) == 0)
+        flew = np.bincount(self.policy, self.done, minlength=failed.shape[2]) > 0
+        return np.asarray(failed.any(axis=1) & flew)
+
     def by_unit(self, metric: str, mask: NDArray[np.bool_] | None = None) -> Floats:
         """Means [units, policies] over the grid points of a unit, each the mean of its replications; NaN where there is no
-        value, or where a point's runs have all failed: without it the mean would be of something else. Units without
-        any are left out."""
+        value. Left out are units without any, and those that a policy has `lost`: the others' means would be over other
+        draws than its own."""
         values = self.values(metric)
         mask = np.ones(len(values), bool) if mask is None else mask
-        policies, points = len(self.plan.policies), len(self.plan.grid)
-        units = int(self.unit.max()) + 1 if len(self.unit) else 0
-        shape = (units, points, policies)
-        at = (self.unit * points + self.table["cell"].to_numpy() % points) * policies + self.policy
-
-        def count(which: NDArray[np.bool_], weights: Floats | None = None) -> Floats:
-            some = None if weights is None else weights[which]
-            return np.bincount(at[which], some, minlength=units * points * policies).reshape(shape).astype(float)
-
         use = mask & ~np.isnan(values)
-        told, failed = count(use), (count(mask & ~self.done) > 0) & (count(mask & self.done) == 0)
+        told = self._count(use)
         with np.errstate(invalid="ignore"):
-            of_points = count(use, values) / told
+            of_points = self._count(use, values) / told
             means = np.nansum(of_points, axis=1) / (told > 0).sum(axis=1)
-        means[failed.any(axis=1)] = math.nan
+        means[self.lost(mask).any(axis=1)] = math.nan
         return np.asarray(means[~np.isnan(means).all(axis=1)])
 
+    def _count(self, which: NDArray[np.bool_], weights: Floats | None = None) -> Floats:
+        """[units, points, policies]: how many of these runs, or the sum of their weights."""
+        policies, points = len(self.plan.policies), len(self.plan.grid)
+        units = int(self.unit.max()) + 1 if len(self.unit) else 0
+        at = (self.unit * points + self.table["cell"].to_numpy() % points) * policies + self.policy
+        some = None if weights is None else weights[which]
+        count = np.bincount(at[which], some, minlength=units * points * policies)
+        return count.reshape(units, points, policies).astype(float)
+
     def pair(self, metric: str, a: int, b: int) -> tuple[Floats, Floats]:
-        """Means by unit of two policies, over the scenes in which both have a value."""
-        values = self.values(metric).reshape(-1, len(self.plan.policies))[
-            :, [a, b]
-        ]  # a scene's policies stand together
-        both = ~np.isnan(values).any(axis=1)
-        unit = self.unit[:: len(self.plan.policies)][both]
-        at = np.unique(unit, return_inverse=True)[1]
+        """Means by unit of two policies, over the scenes of the units of `by_unit` in which both have a value."""
+        policies = len(self.plan.policies)
+        values = self.values(metric).reshape(-1, policies)[:, [a, b]]  # a scene's policies stand together
+        unit = self.unit[::policies]
+        kept = np.flatnonzero(~self.lost().any(axis=1))
+        both = ~np.isnan(values).any(axis=1) & np.isin(unit, kept)
+        at = np.unique(unit[both], return_inverse=True)[1]
         count = np.bincount(at)
         return np.bincount(at, values[both, 0]) / count, np.bincount(at, values[both, 1]) / count
 

@@ -269,10 +269,56 @@ def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
         status[run], values[run] = "failed", math.nan
     table = rows.table.set_column(rows.table.schema.get_field_index("status"), "status", pa.array(status))
     table = table.set_column(table.schema.get_field_index("bytes.data_sent"), "bytes.data_sent", pa.array(values))
-    means = Rows(rows.plan, table, rows.unit, rows.policy).by_unit("bytes.data_sent")
-    assert means[0].tolist() == [30, 31]
-    assert math.isnan(means[1, 0])
-    assert means[1, 1] == 31
+    left = Rows(rows.plan, table, rows.unit, rows.policy)
+    assert left.by_unit("bytes.data_sent").tolist() == [[30, 31]] * 5, "the other policy's mean of draw 1, too"
+    assert [len(side) for side in left.pair("bytes.data_sent", 0, 1)] == [5, 5]
+    assert left.lost().sum(axis=0).tolist() == [1, 0]
+
+
+def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path) -> None:
+    """It does worse by 1 everywhere, and fails in the two draws where all do worst."""
+    pytest.importorskip("matplotlib")
+    from sim.campaign.report import write_report
+
+    p, folder = plan(tmp_path), tmp_path / "a"
+    hard = (0, 1)
+
+    class Picky(Pretended):
+        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
+            for rows in super().results(code, tasks):  # type: ignore[arg-type]
+                yield [self.one(r) for r in rows]
+
+        def one(self, r: Result) -> Result:
+            unit, policy = p.at(r.run).cell // 2, r.run % 2
+            if policy == 1 and unit in hard:
+                return Result(r.run, r.key, "failed", "ValueError: too hard", "", (None, None))
+            return r._replace(values=(100.0 * (unit in hard) + policy, 0.0))
+
+    run_campaign(p, folder, Picky())  # type: ignore[arg-type]
+    rows = read_rows(folder)
+    assert rows.by_unit("bytes.data_sent").mean(axis=0).tolist() == [0.0, 1.0]
+    assert winner(rows, "bytes.data_sent") == "worked"
+    said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(rho=0.1) 2): policies are"
+    assert said in write_report(folder).read_text()
+
+
+def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from sim.campaign.report import write_report
+
+    p, folder = plan(tmp_path), tmp_path / "a"
+
+    class Broken(Pretended):
+        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
+            for rows in super().results(code, tasks):  # type: ignore[arg-type]
+                yield [
+                    Result(r.run, r.key, "failed", "ValueError: broken", "", (None, None)) if r.run % 2 else r
+                    for r in rows
+                ]
+
+    run_campaign(p, folder, Broken())  # type: ignore[arg-type]
+    assert np.isnan(read_rows(folder).by_unit("bytes.data_sent")).tolist() == [[False, True]] * 6
+    assert "No run of best-2(rho=0.1) finished." in write_report(folder).read_text()
 
 
 def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:
