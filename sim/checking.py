@@ -29,14 +29,19 @@ class Checked:
 
     scenario: Scenario
     verdicts: tuple[Verdict, ...]
-    replay: str
-    """The command that shows the sortie."""
+    command: tuple[str, ...]
+    """Which flies it."""
     written: str = ""
     """Which golden outcome was written, in words; empty if none was."""
 
     @property
     def failed(self) -> list[Verdict]:
         return [v for v in self.verdicts if not v.holds]
+
+    def replay(self, verdict: Verdict) -> str:
+        """The command that shows the sortie that a verdict is best seen in."""
+        again = ["--replication", str(verdict.replication)] if verdict.replication else []
+        return shlex.join([*self.command, *again, "--view"])
 
 
 def check_scenario(
@@ -61,13 +66,14 @@ def check_scenario(
     record = run_sortie(scenario, progress=progress)
     result = outcome(record)
     results = [result, *_more(scenario, progress)]
-    verdicts = [_explained(v, record, result) for v in check(scenario, record, result, results)]
+    verdicts = [_explained(v, scenario, record, results) for v in check(scenario, record, result, results)]
     golden = golden_path(library().get(path_or_name, Path(path_or_name)))
     portable = named_from(golden.parent, result, named_files(scenario.model_dump(mode="json")))
     written = write_golden(golden, portable) if update else ""
     if golden.is_file() and not overrides and not update:
         verdicts.append(_golden(golden, portable))
-    return Checked(scenario, tuple(verdicts), _replay(path_or_name, overrides), written)
+    command = ("sortie", "fly", path_or_name, *(x for o in overrides for x in ("--set", o)))
+    return Checked(scenario, tuple(verdicts), command, written)
 
 
 def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
@@ -94,10 +100,16 @@ def _more(scenario: Scenario, progress: Callable[[float], None] | None) -> list[
     return found
 
 
-def _explained(verdict: Verdict, record: SortieRecord, result: dict[str, Any]) -> Verdict:
+def _explained(
+    verdict: Verdict, scenario: Scenario, record: SortieRecord, results: Sequence[dict[str, Any]]
+) -> Verdict:
+    """With the reason from the record of its replication, which is flown again where it is not the first: kept are
+    outcomes alone."""
     if verdict.holds or not verdict.metric:
         return verdict
-    return replace(verdict, why=why(verdict.metric, record, result))
+    k = verdict.replication
+    shown = record if k == 0 else run_sortie(scenario, replication=k)
+    return replace(verdict, why=why(verdict.metric, shown, results[k]))
 
 
 def _golden(path: Path, result: dict[str, Any]) -> Verdict:
@@ -111,7 +123,3 @@ def _golden(path: Path, result: dict[str, Any]) -> Verdict:
 
 def _short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _replay(path_or_name: str, overrides: Sequence[str]) -> str:
-    return shlex.join(["sortie", "fly", path_or_name, *(x for o in overrides for x in ("--set", o)), "--view"])

@@ -26,6 +26,8 @@ class Verdict:
     """The metric that it is about; empty for decisions and golden outcomes."""
     why: str = ""
     """What the record says about it, where it does not hold."""
+    replication: int = 0
+    """Which one shows it best."""
 
 
 def metric(result: dict[str, Any], dotted: str) -> Any:
@@ -121,17 +123,21 @@ def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
         try:
             value = metric(result, e.metric)
         except KeyError as error:
-            return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric)
+            return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric, replication=i)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric)
+            return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric, replication=i)
         values.append(float(value))
     if len(values) < e.replications:
         return Verdict(expected, f"{len(values)} replications flown", False, e.because, e.metric)
     mean, off = limit(values, e.confidence)
-    holds = (e.at_least is None or mean - off >= e.at_least - e.tolerance) and (
-        e.at_most is None or mean + off <= e.at_most + e.tolerance
-    )
-    return Verdict(expected, f"{mean:.6g} ± {off:.2g} over {len(values)}", holds, e.because, e.metric)
+    low = e.at_least is not None and mean - off < e.at_least - e.tolerance
+    high = e.at_most is not None and mean + off > e.at_most + e.tolerance
+    got = f"{mean:.6g} ± {off:.2g} over {len(values)}"
+    if not low and not high:
+        return Verdict(expected, got, True, e.because, e.metric)
+    worst = values.index(min(values) if low else max(values))
+    got = f"{got}, {values[worst]:.6g} in replication {worst}"
+    return Verdict(expected, got, False, e.because, e.metric, replication=worst)
 
 
 def limit(values: Sequence[float], confidence: float) -> tuple[float, float]:

@@ -141,7 +141,7 @@ class ScenarioItem(pytest.Item):
             return
         verdict = checked.verdicts[self.number]
         if not verdict.holds:
-            raise ExpectationFailed(verdict, checked.replay)
+            raise ExpectationFailed(verdict, checked.replay(verdict))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """An expectation in its own words; what a user can mend in one line."""

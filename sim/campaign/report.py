@@ -47,8 +47,10 @@ def _lines(rows: Rows, folder: Path, pictures: dict[str, bool]) -> Iterator[str]
     failed = len(_failures(rows))
     shape = f"{plan.units} {plan.unit}s"
     grid = f" at {len(plan.grid)} grid points" if len(plan.grid) > 1 else ""
+    count = plan.campaign.replications
+    more = "s" if count > 1 else ""
     yield (
-        f"\n{rows.all.num_rows} of {plan.runs} runs: {shape}{grid}, {plan.campaign.replications} replication(s), "
+        f"\n{rows.all.num_rows} of {plan.runs} runs: {shape}{grid}, {count} replication{more}, "
         f"{len(plan.policies)} policies on the same draws; {failed} failed. Base scenario `{plan.campaign.base}`, "
         f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )

@@ -33,8 +33,8 @@ def check(
         out.print(tables.verdict_table(flown.name, checked.verdicts))
         if checked.written:
             out.print(checked.written, soft_wrap=True, markup=False)
-        if checked.failed:
-            out.print(f"see it with: {checked.replay}", soft_wrap=True, markup=False)
+        for command in dict.fromkeys(map(checked.replay, checked.failed)):
+            out.print(f"see it with: {command}", soft_wrap=True, markup=False)
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
         raise typer.Exit(1)

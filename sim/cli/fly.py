@@ -27,6 +27,9 @@ def fly(
     policy: PolicyOption = None,
     seed: SeedOption = None,
     set_: SetOption = None,
+    replication: Annotated[
+        int | None, typer.Option(help="Another draw of everything random, as sortie check's replications.", min=0)
+    ] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; left out, under runs/.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Stream to a Rerun viewer while it flies.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Open the recording afterwards.")] = False,
@@ -50,14 +53,14 @@ def fly(
 ) -> None:
     """Fly one sortie, print its outcome, and keep the run."""
     if campaign is not None or run is not None:
-        flown, seed, replication, expected = again(campaign, run, (scenario, policy, seed, set_))
+        flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
     else:
-        flown, replication, expected = loaded(_named(scenario), set_, policy), 0, None
-    path = out_dir or rundir.default_path(flown, seed, replication)
+        flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
+    path = out_dir or rundir.default_path(flown, seed, number)
     rundir.ensure_writable(path)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
-        record = run_sortie(flown, None, seed, replication=replication, progress=ticker, observer=watchers or None)
+        record = run_sortie(flown, None, seed, replication=number, progress=ticker, observer=watchers or None)
 
     def save_recording(folder: Path) -> None:
         from sim.playback.recording import save_rrd

@@ -59,6 +59,7 @@ def command(*arguments: object) -> int:
         (("train", "--warm-start", "w.safetensors"), "w.safetensors: no such weights"),
         (("train", "--out", "."), ".: is a folder, must be a file"),
         (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
+        (("fly", "--from-campaign", ".", "--run", "0", "--replication", "0"), "name nothing else"),
         (("fly", "link_battery"), "link_battery.yaml: is a campaign, not a scenario; its command is: sortie campaign"),
         (("check", "contexts"), "contexts.yaml: is a set of contexts, not a scenario; its command is: sortie compare"),
         (

@@ -109,7 +109,7 @@ def test_a_failure_tells_why_and_how_to_see_it(tmp_path: Path) -> None:
     (failed,) = checked.failed
     assert "payloads: " in failed.why
     assert "decided because of " in failed.why
-    assert checked.replay == f"sortie fly '{path}' --view"
+    assert checked.replay(checked.verdicts[0]) == f"sortie fly '{path}' --view"
 
 
 def test_replications_are_flown_once_each(tmp_path: Path) -> None:
@@ -119,6 +119,20 @@ def test_replications_are_flown_once_each(tmp_path: Path) -> None:
     each = [outcome(run_sortie(load(path), replication=r))["energy_j"]["total"] for r in (0, 1)]
     assert each[0] != each[1]
     assert verdict.got.startswith(f"{sum(each) / 2:.6g} ± ")
+
+
+def test_a_failure_over_replications_shows_the_worst_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    asked = "{metric: bytes.data_delivered, at_most: 1, replications: 4, confidence: 0.9}"
+    path.write_text(SHORT + f"expect: [{asked}]\n")
+    checked = check_scenario(str(path))
+    (failed,) = checked.failed
+    flown = [outcome(run_sortie(checked.scenario, replication=k))["bytes"]["data_delivered"] for k in range(4)]
+    worst = int(np.argmax(flown))
+    assert worst > 0, "else nothing is shown"
+    assert failed.got.endswith(f" over 4, {flown[worst]:.6g} in replication {worst}")
+    assert "payloads: " in failed.why
+    assert checked.replay(failed) == f"sortie fly {path} --replication {worst} --view"
 
 
 def test_a_golden_outcome_is_compared_and_only_renewed_when_asked(tmp_path: Path) -> None:
