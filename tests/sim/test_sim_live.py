@@ -88,6 +88,20 @@ def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
     assert reader.take() == []
 
 
+def test_a_reader_that_is_found_while_they_are_counted_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The binding's list of them asks how many there are, makes room for so many, and asks again."""
+    bus, topic = Bus(DOMAIN), Topic(Kind.COMPACT, 0, 2)
+    writer = bus.writer(topic)
+    said = iter([1, 2])
+    monkeypatch.setattr(type(writer._writer), "_get_matched_subscriptions", lambda *_: next(said))
+    assert writer.listeners == 0
+    readers = [Bus(DOMAIN).reader(topic, 1) for _ in range(2)]
+    until_s = time.monotonic() + 10.0
+    while writer.listeners < len(readers) and time.monotonic() < until_s:
+        time.sleep(0.01)
+    assert writer.listeners == len(readers)
+
+
 def test_a_line_that_is_no_field_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(messages.DEFINITIONS, "a/msg/B", "float32 x\nfloat32<=3 y")
     with pytest.raises(ValueError, match=r"^a/msg/B: 'float32<=3 y' is no field$"):
