@@ -52,7 +52,7 @@ class Writer:
     """One end that speaks on a topic."""
 
     def __init__(self, writer: DataWriter[Any], topic: Topic) -> None:
-        self._writer = writer
+        self._writer: Any = writer  # parts of it have no types
         self.topic = topic
         self._sample = dds_type(topic.kind.ros_type)
 
