@@ -6,7 +6,6 @@ World frame ENU, metres. Entities: `world/truth` grey, `world/found` blue, `worl
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from perception.geometry import CELLS
 from perception.harness.picture import Picture, to_world
 from perception.render import CAMERAS
 from perception.types import Boxes
-from sim.folders import RunError, partial_file
 from sim.playback.canvas import MISSION, drone_colour
+from sim.playback.recording import new_file
 
 APPLICATION = "sortie-frame"
 TRUTH, FOUND = (150, 152, 158, 255), (80, 150, 255, 255)
@@ -35,21 +34,8 @@ def save_frame(picture: Picture, path: Path) -> None:
     Raises:
         RunError: the file cannot be written.
     """
-    partial = partial_file(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
-        recording = rr.RecordingStream(APPLICATION)
-        recording.save(partial, default_blueprint=layout(picture))
+    with new_file(path, layout(picture), APPLICATION) as recording:
         log_frame(recording, picture)
-        recording.flush()
-        recording.disconnect()
-        partial.rename(path)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def log_frame(recording: rr.RecordingStream, picture: Picture) -> None:

@@ -60,7 +60,7 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
     Raises:
         RunError: the file cannot be written.
     """
-    with _new_file(path, blueprint(record.scenario)) as recording:
+    with new_file(path, blueprint(record.scenario)) as recording:
         Playback(recording, record.scenario, scene_of(record)).add(record.scenario.duration_s, record.tables)
 
 
@@ -76,7 +76,7 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
     """
     labels = [label for label, _ in flown]
     scenario = flown[0][1].scenario
-    with _new_file(path, comparison(scenario, labels)) as recording:
+    with new_file(path, comparison(scenario, labels)) as recording:
         recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {scenario.seed}")
         for root, (_, record) in zip(roots(labels), flown, strict=True):
             playback = Playback(recording, record.scenario, scene_of(record), root)
@@ -84,13 +84,17 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
 
 
 @contextmanager
-def _new_file(path: Path, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
-    """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails."""
+def new_file(path: Path, layout: rrb.Blueprint, application: str = APPLICATION) -> Iterator[rr.RecordingStream]:
+    """A recording that becomes the file at `path` when all of it is drawn, and nothing where drawing fails.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
     partial = partial_file(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
-        recording = rr.RecordingStream(APPLICATION)
+        recording = rr.RecordingStream(application)
         recording.save(partial, default_blueprint=layout)
         yield recording
         recording.flush()

@@ -6,10 +6,13 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 from scenarios.load_campaign import load_campaign
 from sim.campaign.plan import Plan, make_plan
+from sim.campaign.rows import Rows
 from sim.campaign.work import Result, Task, task_key
 
 CLUSTER = pytest.mark.filterwarnings(
@@ -83,3 +86,18 @@ def pretend(run: int, task: str, code: str) -> Result:
 
 
 __all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "table_bytes", "write"]
+
+
+def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> Rows:
+    """A campaign whose metric is a function of (fields' values, policy number)."""
+    p = plan(tmp_path, text)
+    columns: dict[str, list[object]] = {}
+    for run in range(p.runs):
+        at = p.at(run)
+        fields = p.varied(at.cell)
+        row = {**at._asdict(), "policy": p.policies[at.policy], "status": "done", **fields}
+        row[metric] = value(fields, at.policy)  # type: ignore[operator]
+        for name, v in row.items():
+            columns.setdefault(name, []).append(v)
+    table = pa.table(columns)
+    return Rows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, Pretended, plan
+from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -30,21 +30,6 @@ TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 4
 )
 
 ONE_METRIC = TWO.replace("[bytes.data_sent, energy_j.total]", "[bytes.data_sent]")
-
-
-def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> Rows:
-    """A campaign whose metric is a function of (fields' values, policy number)."""
-    p = plan(tmp_path, text)
-    columns: dict[str, list[object]] = {}
-    for run in range(p.runs):
-        at = p.at(run)
-        fields = p.varied(at.cell)
-        row = {**at._asdict(), "policy": p.policies[at.policy], "status": "done", **fields}
-        row[metric] = value(fields, at.policy)  # type: ignore[operator]
-        for name, v in row.items():
-            columns.setdefault(name, []).append(v)
-    table = pa.table(columns)
-    return Rows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40))
@@ -226,99 +211,6 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     assert [line.split("\n")[1] for line in told if line.startswith("\n## ")] == ["## Metrics by policy", "## The rows"]
     assert not draw_varied(rows, tmp_path / "none.png")
     assert not draw_pareto(rows, tmp_path / "none.png")
-
-
-def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
-    """Parts hold 30 rows, a draw at 22 grid points 44: what a campaign that was cut off has of the next draw is left out."""
-    counts = ", ".join(map(str, range(1, 23)))
-    text = CAMPAIGN.replace(
-        "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", f"fleet.drones: {{kind: grid, values: [{counts}]}}"
-    )
-    p, folder = plan(tmp_path, text.replace("replications: 2", "replications: 1")), tmp_path / "a"
-
-    def drones(run: int) -> float:
-        return float(p.varied(p.at(run).cell)["fleet.drones"])
-
-    class Counting(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [r._replace(values=(drones(r.run), 0.0)) for r in rows]
-
-    with pytest.raises(KeyboardInterrupt):
-        run_campaign(p, folder, Counting(stop_after=40))  # type: ignore[arg-type]
-    with pytest.raises(RunError, match="a: no draw is finished at all its grid points yet, go on with the campaign"):
-        read_rows(folder)
-    with pytest.raises(KeyboardInterrupt):
-        run_campaign(p, folder, Counting(stop_after=70))  # type: ignore[arg-type]
-    rows = read_rows(folder)
-    assert (rows.all.num_rows, rows.table.num_rows) == (90, 88)
-    assert rows.by_unit("bytes.data_sent") == pytest.approx(np.full((2, 2), 11.5))
-    pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
-
-    told = write_report(folder).read_text()
-    assert "2 of the runs are left out of all that follows: their draw is not finished at every grid point." in told
-    assert "`stop_when` ended it" not in told
-
-
-def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
-    """Replications stand in for one another; without any of them the mean would be of other points."""
-    rows = rows_of(tmp_path, CAMPAIGN, lambda fields, policy: fields["fleet.formation.spacing_m"] + policy)
-    status, values = ["done"] * 48, rows.values("bytes.data_sent")
-    for run in (0, 8, 10):  # one replication of draw 0; both of draw 1 at 20 m
-        status[run], values[run] = "failed", math.nan
-    table = rows.table.set_column(rows.table.schema.get_field_index("status"), "status", pa.array(status))
-    table = table.set_column(table.schema.get_field_index("bytes.data_sent"), "bytes.data_sent", pa.array(values))
-    left = Rows(rows.plan, table, rows.unit, rows.policy)
-    assert left.by_unit("bytes.data_sent").tolist() == [[30, 31]] * 5, "the other policy's mean of draw 1, too"
-    assert [len(side) for side in left.pair("bytes.data_sent", 0, 1)] == [5, 5]
-    assert left.lost().sum(axis=0).tolist() == [1, 0]
-
-
-def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path) -> None:
-    """It does worse by 1 everywhere, and fails in the two draws where all do worst."""
-    pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
-
-    p, folder = plan(tmp_path), tmp_path / "a"
-    hard = (0, 1)
-
-    class Picky(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [self.one(r) for r in rows]
-
-        def one(self, r: Result) -> Result:
-            unit, policy = p.at(r.run).cell // 2, r.run % 2
-            if policy == 1 and unit in hard:
-                return Result(r.run, r.key, "failed", "ValueError: too hard", "", (None, None))
-            return r._replace(values=(100.0 * (unit in hard) + policy, 0.0))
-
-    run_campaign(p, folder, Picky())  # type: ignore[arg-type]
-    rows = read_rows(folder)
-    assert rows.by_unit("bytes.data_sent").mean(axis=0).tolist() == [0.0, 1.0]
-    assert winner(rows, "bytes.data_sent") == "worked"
-    said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(rho=0.1) 2): policies are"
-    assert said in write_report(folder).read_text()
-
-
-def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
-
-    p, folder = plan(tmp_path), tmp_path / "a"
-
-    class Broken(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [
-                    Result(r.run, r.key, "failed", "ValueError: broken", "", (None, None)) if r.run % 2 else r
-                    for r in rows
-                ]
-
-    run_campaign(p, folder, Broken())  # type: ignore[arg-type]
-    assert np.isnan(read_rows(folder).by_unit("bytes.data_sent")).tolist() == [[False, True]] * 6
-    assert "No run of best-2(rho=0.1) finished." in write_report(folder).read_text()
 
 
 def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from cli_examples import command
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
 from perception.surrogate.model import SHIPPED as CALIBRATION
 from sim import rundir
-from sim.cli.app import app, main
+from sim.cli.app import app
 from sim.expect import check
 from sim.folders import RunError
 from sim.outcome import outcome
@@ -33,17 +34,6 @@ def scenario(tmp_path: Path) -> Path:
     path = tmp_path / "example.yaml"
     path.write_text(BASE)
     return path
-
-
-def command(*arguments: object) -> int:
-    """The command's entry point in this process; its exit code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as stop:
-            return int(stop.code or 0)
-    return 0
 
 
 def sortie(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
+from cli_examples import command
 from sim_examples import BASE
-
-from sim.cli.app import main
 
 
 @pytest.fixture
@@ -16,17 +14,6 @@ def scenario(tmp_path: Path) -> Path:
     path = tmp_path / "example.yaml"
     path.write_text(BASE)
     return path
-
-
-def command(*arguments: object) -> int:
-    """The command in this process; its exit code."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as stop:
-            return int(stop.code or 0)
-    return 0
 
 
 @pytest.mark.parametrize(

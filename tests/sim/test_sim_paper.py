@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from cli_examples import command
 from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 from rerun.chunk import RrdReader
 from sim_examples import example
-from test_sim_cli import command
 
 from perception.geometry import CELLS, FULL
 from perception.harness import report, rows

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
+from cli_examples import command
 
 from policies.conformance import RULES
 from policies.contract import TaskPhase
 from policies.registry import resolve
 from policies.views import draw_views, from_json, to_json
 from sim import console
-from sim.cli.app import main
 from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 
 FAULTY = '''
@@ -41,16 +40,6 @@ def forgetful(view):
 QUICK = ("--views", 10, "--drones", 2)
 
 
-def sortie(*arguments: object) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sortie", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as stop:
-            return int(stop.code or 0)
-    return 0
-
-
 @pytest.fixture
 def faulty(tmp_path: Path) -> Path:
     path = tmp_path / "faulty.py"
@@ -63,25 +52,25 @@ def test_counterexamples_replace_counterexamples_and_nothing_else(
 ) -> None:
     out = tmp_path / "out"
     for _ in range(2):
-        assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
+        assert command("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
     (folder,) = out.iterdir()
     before = sorted(p.name for p in folder.iterdir())
     assert {p.suffix for p in folder.iterdir()} == {".json", ".yaml"}
     (folder / "notes.txt").write_text("keep")
     capsys.readouterr()
-    assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 2
+    assert command("verify", f"{faulty}:decide", *QUICK, "--out", out) == 2
     said = f"error: {folder}: holds notes.txt, which is no counterexample; name another --out or move it\n"
     assert capsys.readouterr().err == said
     assert sorted(p.name for p in folder.iterdir()) == sorted([*before, "notes.txt"])
     mine = tmp_path / "worked" / "mine.json"
     mine.parent.mkdir()
     mine.write_text("[]")
-    assert sortie("verify", "worked", *QUICK, "--out", tmp_path) == 2  # its folder would be tmp_path/worked
+    assert command("verify", "worked", *QUICK, "--out", tmp_path) == 2  # its folder would be tmp_path/worked
     assert mine.read_text() == "[]"
 
 
 def test_the_worked_policy_passes_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert sortie("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
+    assert command("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
     assert "when battery < 0.6: rate_hz <= 5" in printed
     assert printed.count("proved") == 10
@@ -92,7 +81,7 @@ def test_a_planted_fault_gives_a_counterexample_that_fails_until_it_is_mended(
     faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert sortie("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
+    assert command("verify", f"{faulty}:decide", *QUICK, "--out", out) == 1
     assert "refuted" in capsys.readouterr().out
     (kept,) = out.rglob("*.json")
     view = from_json(kept.read_text())
@@ -100,23 +89,23 @@ def test_a_planted_fault_gives_a_counterexample_that_fails_until_it_is_mended(
     assert 0.4 < me.battery_soc < 0.4000001, "a sliver of charge in which no drawn view lies"
     assert me.region is not None
     scenario = kept.with_suffix(".yaml")
-    assert sortie("check", scenario) == 1
+    assert command("check", scenario) == 1
     assert "invariant_violations" in capsys.readouterr().out
     faulty.write_text(FAULTY.replace("quiet_below=0.4000001", "quiet_below=0.0"))
-    assert sortie("check", scenario) == 0
+    assert command("check", scenario) == 0
 
 
 def test_a_parameter_is_part_of_what_is_verified(faulty: Path, tmp_path: Path) -> None:
-    assert sortie("verify", f"{faulty}:decide(quiet_below=0.1)", *QUICK, "--out", tmp_path / "out") == 0
+    assert command("verify", f"{faulty}:decide(quiet_below=0.1)", *QUICK, "--out", tmp_path / "out") == 0
 
 
 def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rules = tmp_path / "rules.txt"
     rules.write_text("rate_hz <= 4  # slower than it is\n")
-    assert sortie("verify", f"{faulty}:decide", *QUICK, "--invariants", rules, "--out", tmp_path / "out") == 1
+    assert command("verify", f"{faulty}:decide", *QUICK, "--invariants", rules, "--out", tmp_path / "out") == 1
     assert "rate_hz <= 4" in capsys.readouterr().out
     rules.write_text("rate_hz <=\n")
-    assert sortie("verify", "worked", *QUICK, "--invariants", rules) == 2
+    assert command("verify", "worked", *QUICK, "--invariants", rules) == 2
     assert "line 1, 'rate_hz <=': 'rate_hz <=' is no expression" in capsys.readouterr().err
 
 
@@ -196,7 +185,7 @@ def test_a_policy_that_gives_no_directives_is_a_broken_one(
     monkeypatch.setattr(console.out, "width", 1000)
     path = tmp_path / "broken.py"
     path.write_text(BROKEN)
-    assert sortie("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
+    assert command("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
     printed = capsys.readouterr()
     assert told in printed.out + printed.err
 
@@ -215,7 +204,7 @@ def test_the_ages_at_which_a_policy_raises_are_shown_in_flight(tmp_path: Path) -
 
 
 def test_an_unknown_policy_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert sortie("verify", "loud") == 2
+    assert command("verify", "loud") == 2
     assert "unknown policy 'loud'" in capsys.readouterr().err
 
 
