@@ -15,17 +15,26 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import simpy
 
-from fleet.auth import Dropped, DropReason, Inbox, Opened, Sealer
-from fleet.compact import FULL, Form, encode_compact
-from fleet.coverage import NOVEL_FLAG, TARGET_FLAG
-from fleet.gate import Gate, Payload, make_payload
-from fleet.senses import Sensed
-from fleet.staleness import LinkHealth, cap_by_age, health
-from fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
-from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
-from perception.types import Capture
-from policies.contract import Descriptor, Directive, Disc, FleetView, Policy, TaskPhase, check_directives, nothing
-from policies.damping import LinkState, believed, damp
+from sortie.fleet.auth import Dropped, DropReason, Inbox, Opened, Sealer
+from sortie.fleet.compact import FULL, Form, encode_compact
+from sortie.fleet.coverage import NOVEL_FLAG, TARGET_FLAG
+from sortie.fleet.gate import Gate, Payload, make_payload
+from sortie.fleet.senses import Sensed
+from sortie.fleet.staleness import LinkHealth, cap_by_age, health
+from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
+from sortie.fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.perception.types import Capture
+from sortie.policies.contract import (
+    Descriptor,
+    Directive,
+    Disc,
+    FleetView,
+    Policy,
+    TaskPhase,
+    check_directives,
+    nothing,
+)
+from sortie.policies.damping import LinkState, believed, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -60,7 +69,7 @@ class PlaneRules:
     tile_limit_bytes: int | None = None
     """Features go as tiles of at most so many bytes; None: as one sample."""
     trust: bool = False
-    """Whether peers' claims are judged (`fleet.trust`)."""
+    """Whether peers' claims are judged (`sortie.fleet.trust`)."""
     publish_every: int = 1
     """A descriptor every so many frames; staleness counts in periods of that length."""
     form: Form = FULL

@@ -25,10 +25,10 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
-from fleet.cdr import MalformedDatagram
-from fleet.compact import MARK, MIN_COMPACT_BYTES
-from fleet.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
-from policies.contract import Descriptor
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.compact import MARK, MIN_COMPACT_BYTES
+from sortie.fleet.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
+from sortie.policies.contract import Descriptor
 
 TAG_BYTES = 16
 MIN_KEY_BYTES = 16

@@ -2,7 +2,7 @@
 
 `FleetBatteries` drains every pack once a frame. A pack's state is the energy left in it, in joules at open circuit;
 charge and voltage are read off it. So the ledger's sum and what left the pack are one number, up to rounding. The
-cells' chemistry is in `fleet.cell`, what the rotors draw in `fleet.rotor`.
+cells' chemistry is in `sortie.fleet.cell`, what the rotors draw in `sortie.fleet.rotor`.
 
 Proportion, wherever energy is claimed: hovering draws some 210 W electric, a Wi-Fi radio 2 to 6 W. Hover outweighs
 the radio about a hundredfold, so what is shared moves flight time mainly through compute duty cycling, hardly
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from fleet.cell import (
+from sortie.fleet.cell import (
     CELL_TABLE,
     COOLING_TIME_S,
     REFERENCE_C,
@@ -27,8 +27,8 @@ from fleet.cell import (
     open_circuit_cell_v,
     resistance_factor,
 )
-from fleet.traces import BatteryTrace
-from scenarios.schema import Battery, DroneOverride
+from sortie.fleet.traces import BatteryTrace
+from sortie.scenarios.schema import Battery, DroneOverride
 
 CAUSES = ("rotor", "avionics", "compute", "radio", "ohmic", "fault")
 """Ledger of energy: climb is part of rotor, ohmic is lost in the pack's resistance (polarisation's included), fault is

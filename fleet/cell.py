@@ -10,7 +10,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from scenarios.schema import Battery
+from sortie.scenarios.schema import Battery
 
 Array = npt.NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.cdr import MalformedDatagram
-from fleet.coverage import pack_grid, unpack_grid
-from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.coverage import pack_grid, unpack_grid
+from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
 
 MAGIC = 0xC0
 MARK = bytes([MAGIC])

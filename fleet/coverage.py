@@ -12,8 +12,8 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
-from policies.contract import COVERAGE_CELL_M as CELL_M
-from policies.contract import COVERAGE_CELLS, Coverage
+from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
+from sortie.policies.contract import COVERAGE_CELLS, Coverage
 
 Array = npt.NDArray[np.float64]
 

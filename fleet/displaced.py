@@ -8,9 +8,9 @@ from dataclasses import fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from fleet.frames import yaw_rad
-from fleet.motion import DRAG_PER_S, GRAVITY_MPS2, Motion, attitude, body_rates
-from fleet.viewpoints import Course, Plan, shifts
+from sortie.fleet.frames import yaw_rad
+from sortie.fleet.motion import DRAG_PER_S, GRAVITY_MPS2, Motion, attitude, body_rates
+from sortie.fleet.viewpoints import Course, Plan, shifts
 
 Array = npt.NDArray[np.float64]
 

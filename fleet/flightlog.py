@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fleet.dataflash import Column, RawLog, is_dataflash, read_dataflash
-from fleet.frames import swap_attitude, swap_enu_ned, to_xyzw
-from fleet.ulog import is_ulog, read_ulog
+from sortie.fleet.dataflash import Column, RawLog, is_dataflash, read_dataflash
+from sortie.fleet.frames import swap_attitude, swap_enu_ned, to_xyzw
+from sortie.fleet.ulog import is_ulog, read_ulog
 
 Array = npt.NDArray[np.float64]
 Table = Mapping[str, Column]
@@ -88,7 +88,7 @@ def read_log(path: str | Path) -> FlightLog:
     elif is_ulog(data):
         log = _assemble("ULog", read_ulog(data), _from_ulog)
     else:
-        from fleet.mavlink import is_tlog, read_tlog  # pymavlink is loaded for such a log alone
+        from sortie.fleet.mavlink import is_tlog, read_tlog  # pymavlink is loaded for such a log alone
 
         if not is_tlog(data):
             raise LogError(f"{path}: is no DataFlash log (.bin), MAVLink telemetry (.tlog) or ULog (.ulg)")
@@ -336,7 +336,7 @@ def local_m(fixes: Array) -> Array:
     """Latitudes and longitudes in degrees and altitudes in metres as ENU metres from the first, [K, 3].
 
     On the plane tangent to the WGS-84 ellipsoid at the first, with its two radii of curvature: the inverse of
-    `fleet.mavlink.geodetic`.
+    `sortie.fleet.mavlink.geodetic`.
     """
     a, e2 = 6378137.0, 6.69437999014e-3
     lat, lon, alt = (math.radians(fixes[0, 0]), fixes[0, 1], fixes[0, 2])

@@ -1,7 +1,7 @@
 """The gate: the only place that sees both a directive and a payload.
 
 It turns a directive into a payload of an exact size, at the directive's rate. Sizes: feature cells × 160 B and
-their index (perception.budget), boxes × 24 B, tracks × 20 B, raw images as rendered sizes of UAV3D's cameras;
+their index (sortie.perception.budget), boxes × 24 B, tracks × 20 B, raw images as rendered sizes of UAV3D's cameras;
 each payload carries a header with capture stamp and pose, and the directive it obeys.
 """
 
@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
-from fleet import tiles
-from fleet.wire import DIRECTIVE_BYTES
-from perception import budget
-from policies.contract import Directive, Disc, Representation
+from sortie.fleet import tiles
+from sortie.fleet.wire import DIRECTIVE_BYTES
+from sortie.perception import budget
+from sortie.policies.contract import Directive, Disc, Representation
 
 HEADER_BYTES = 40
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
@@ -61,7 +61,7 @@ def make_payload(
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
-    Args: `tile_limit_bytes`: features go as tiles of at most so many bytes (fleet.tiles); None: as one sample.
+    Args: `tile_limit_bytes`: features go as tiles of at most so many bytes (sortie.fleet.tiles); None: as one sample.
     """
     rung, rho, roi = directive.representation, directive.rho, directive.roi
     cells = boxes = index_bytes = 0

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fleet.cell import MEAN_CELL_V, terminal_voltage_v
-from fleet.flightlog import FlightLog, LogError, Series
-from scenarios.schema import Battery
+from sortie.fleet.cell import MEAN_CELL_V, terminal_voltage_v
+from sortie.fleet.flightlog import FlightLog, LogError, Series
+from sortie.scenarios.schema import Battery
 
 Array = npt.NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fleet.coverage import NOVEL_FLAG
-from policies.contract import Coverage, Descriptor
+from sortie.fleet.coverage import NOVEL_FLAG
+from sortie.policies.contract import Coverage, Descriptor
 
 About = Literal["coverage", "goodput", "battery"]
 Claim = Literal["much", "little"]

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from fleet.flightlog import GAP_S, FlightLog, LogError, Series
-from fleet.traces import ATTITUDE, BOUNDS, POSITION, VELOCITY
+from sortie.fleet.flightlog import GAP_S, FlightLog, LogError, Series
+from sortie.fleet.traces import ATTITUDE, BOUNDS, POSITION, VELOCITY
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Drone states as MAVLink 2 messages, and as a telemetry log that ground stations open.
 
-MAVLink is NED, FRD and w-first quaternions in scaled integers; `fleet.frames` does the turning. Positions on the
+MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.frames` does the turning. Positions on the
 globe lie on a plane through a stated origin, with the WGS-84 ellipsoid's two radii of curvature there: within 5 km
 of the origin the error stays below 2 m · tan(latitude) horizontally, and height is height above the plane.
 """
@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink2
 
-from fleet.dataflash import Column, RawLog
-from fleet.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
+from sortie.fleet.dataflash import Column, RawLog
+from sortie.fleet.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
 
 _SENSORS = (
     mavlink2.MAV_SYS_STATUS_SENSOR_3D_GYRO

@@ -3,7 +3,7 @@
 The formation is a rigid virtual structure that moves along the route and turns with it. A drone holds its slot
 up to a smooth random offset, in a mean wind with gusts of its own. Its attitude follows from its acceleration by
 differential flatness; no controller is simulated. Nothing here needs the clock, so the whole flight is computed
-as arrays [T frames, N drones, ...] before it begins. Frames as in `fleet.frames`.
+as arrays [T frames, N drones, ...] before it begins. Frames as in `sortie.fleet.frames`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fleet.formation import slots
-from fleet.frames import yaw_rad
-from fleet.noise import LAGS, gauss_markov, smooth
-from fleet.route import frame_path
-from scenarios import schema
-from scenarios.streams import stream
+from sortie.fleet.formation import slots
+from sortie.fleet.frames import yaw_rad
+from sortie.fleet.noise import LAGS, gauss_markov, smooth
+from sortie.fleet.route import frame_path
+from sortie.scenarios import schema
+from sortie.scenarios.streams import stream
 
 Array = npt.NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
         fleet: drones, formation, route and motion sections are read.
         duration_s: the frames that begin before it are flown (end exclusive).
         frame_s: time between frames, > 0.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
 
     Raises:
         MotionError: the asked motion needs thrust that points downwards.

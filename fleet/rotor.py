@@ -13,8 +13,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from fleet.motion import Motion
-from scenarios.schema import Airframe, Fleet
+from sortie.fleet.motion import Motion
+from sortie.scenarios.schema import Airframe, Fleet
 
 Array = npt.NDArray[np.float64]
 

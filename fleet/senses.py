@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fleet.coverage import footprint_radius_m, survey
-from fleet.motion import Motion
-from perception.types import Capture
+from sortie.fleet.coverage import footprint_radius_m, survey
+from sortie.fleet.motion import Motion
+from sortie.perception.types import Capture
 
 COVERAGE_PERIOD_S = 1.0
 """The coverage grid is renewed this often: at 5 m/s a drone crosses a 12.8 m cell in 2.6 s."""

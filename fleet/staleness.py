@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from policies.contract import Directive, Representation
+from sortie.policies.contract import Directive, Representation
 
 DEGRADED_RATE_HZ = 2.0
 """A degraded link carries detections at most this often, as the worked policy's lowest rung does."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
-from perception import budget
+from sortie.perception import budget
 
 TILE_HEADER_BYTES = 44
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16), tile number (2), fusion weight (1), rung (1)."""

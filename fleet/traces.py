@@ -28,10 +28,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from fleet.cell import energy_fraction
-from fleet.frames import yaw_rad
-from fleet.motion import Motion, body_rates
-from scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
+from sortie.fleet.cell import energy_fraction
+from sortie.fleet.frames import yaw_rad
+from sortie.fleet.motion import Motion, body_rates
+from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
 

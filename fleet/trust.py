@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.compact import FULL, Form
-from fleet.coverage import RANGE_M, unpack_grid
-from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
+from sortie.fleet.compact import FULL, Form
+from sortie.fleet.coverage import RANGE_M, unpack_grid
+from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
 JUDGED_EVERY_S = 1.0
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.dataflash import Column, RawLog
+from sortie.fleet.dataflash import Column, RawLog
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER_BYTES = 16

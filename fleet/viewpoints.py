@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fleet.formation import slots
-from fleet.motion import MotionError
-from fleet.route import FramePath, bend, frame_path, spread
-from scenarios import schema
+from sortie.fleet.formation import slots
+from sortie.fleet.motion import MotionError
+from sortie.fleet.route import FramePath, bend, frame_path, spread
+from sortie.scenarios import schema
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float]
@@ -117,7 +117,7 @@ def bounds_of(fleet: schema.Fleet) -> Bounds:
 
 
 def course_of(fleet: schema.Fleet, time_s: Array) -> Course:
-    """What the formation will do, as `fleet.motion.fly` has it.
+    """What the formation will do, as `sortie.fleet.motion.fly` has it.
 
     Raises:
         MotionError: a slot's own way leaves the fence.

@@ -12,9 +12,9 @@ from functools import lru_cache
 from importlib.resources import files
 from math import isfinite
 
-from fleet.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
-from fleet.compact import MARK, decode_compact
-from policies.contract import (
+from sortie.fleet.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
+from sortie.fleet.compact import MARK, decode_compact
+from sortie.policies.contract import (
     MAX_DEADLINE_S,
     MAX_RATE_HZ,
     Descriptor,
@@ -28,7 +28,7 @@ MAX_DESCRIPTOR_BYTES = 1024
 COVERAGE_BYTES = 64
 MAX_AGENT_ID = 254
 
-_MSGS = files("fleet") / "sortie_msgs" / "msg"
+_MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"
 DESCRIPTOR_NAME, DIRECTIVE_NAME = "sortie_msgs/msg/ContextDescriptor", "sortie_msgs/msg/DataPlaneDirective"
 DESCRIPTOR_MSG = (_MSGS / "ContextDescriptor.msg").read_text("utf-8")
 """The fields as ROS 2 defines them; `fleet/sortie_msgs` builds as a ROS 2 package."""
@@ -111,7 +111,7 @@ def encode_descriptor(d: Descriptor) -> bytes:
 
 @lru_cache(maxsize=256)  # a broadcast is the same bytes for its sender and everyone who hears it
 def decode_descriptor(data: bytes) -> Descriptor:
-    """Parse and check a descriptor, in CDR or in a compact form (`fleet.compact`).
+    """Parse and check a descriptor, in CDR or in a compact form (`sortie.fleet.compact`).
 
     Raises:
         MalformedDatagram: for anything that is not exactly one valid descriptor.

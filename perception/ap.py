@@ -18,8 +18,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
-from perception.types import Boxes
+from sortie.perception.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
+from sortie.perception.types import Boxes
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",

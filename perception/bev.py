@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.compiled import compiled, fma
-from perception.geometry import FULL, IMAGE_PX, Geometry
-from perception.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
-from perception.town import Bytes, FloatMap
-from perception.types import Capture
+from sortie.perception.compiled import compiled, fma
+from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
+from sortie.perception.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
+from sortie.perception.town import Bytes, FloatMap
+from sortie.perception.types import Capture
 
 _F = np.float32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)

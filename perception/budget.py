@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perception.geometry import CELLS as GRID
-from perception.geometry import CHANNELS, FULL
+from sortie.perception.geometry import CELLS as GRID
+from sortie.perception.geometry import CHANNELS, FULL
 
 CELLS = GRID * GRID
 CELL_M = FULL.cell_m

@@ -11,9 +11,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
-from perception.errors import InputError
-from perception.fusion.registry import FUSIONS
-from perception.model import CarNet, ModelConfig
+from sortie.perception.errors import InputError
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.model import CarNet, ModelConfig
 
 
 def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -> None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.geometry import FULL, HEAD_PX, Geometry
+from sortie.perception.geometry import FULL, HEAD_PX, Geometry
 
 REFERENCE_SIZE_M = (4.5, 1.85)
 """Length and width for which the size head says 0."""

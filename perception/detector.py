@@ -19,24 +19,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception import budget
-from perception.ap import suppress
-from perception.bev import lift
-from perception.checkpoint import load_weights
-from perception.decode import decode
-from perception.errors import InputError
-from perception.fusion.base import takes_part
-from perception.fusion.registry import FUSIONS
-from perception.geometry import CELLS, FULL, in_square
-from perception.inference import folded
-from perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
-from perception.memory import keep_freed
-from perception.render import VIEWS_SHAPE, Renderer
-from perception.scene import SceneModel
-from perception.town import Bytes
-from perception.types import Boxes, Capture, Share
-from perception.warp import arriving, rows, support
-from scenarios.schema import Perception
+from sortie.perception import budget
+from sortie.perception.ap import suppress
+from sortie.perception.bev import lift
+from sortie.perception.checkpoint import load_weights
+from sortie.perception.decode import decode
+from sortie.perception.errors import InputError
+from sortie.perception.fusion.base import takes_part
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.geometry import CELLS, FULL, in_square
+from sortie.perception.inference import folded
+from sortie.perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
+from sortie.perception.memory import keep_freed
+from sortie.perception.render import VIEWS_SHAPE, Renderer
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import Bytes
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.warp import arriving, rows, support
+from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"

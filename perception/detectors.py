@@ -12,9 +12,9 @@ from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
-from perception.scene import SceneModel
-from perception.types import Boxes, Capture, Share
-from scenarios.schema import Perception
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Perception
 
 
 class Detector(Protocol):
@@ -83,20 +83,20 @@ def make_detector(scene: SceneModel, config: Perception, seed: int, replication:
 
 
 def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from perception.detector import TorchDetector
+    from sortie.perception.detector import TorchDetector
 
     weights = None if config.weights is None else Path(config.weights)
     return TorchDetector(scene, config, seed, weights, replication)
 
 
 def _recorded(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from perception.outside.detector import RecordedDetector
+    from sortie.perception.outside.detector import RecordedDetector
 
     return RecordedDetector(config)
 
 
 def _surrogate(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from perception.surrogate.detector import SurrogateDetector
+    from sortie.perception.surrogate.detector import SurrogateDetector
 
     weights = None if config.weights is None else Path(config.weights)
     return SurrogateDetector(scene, config, seed, weights, replication)

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from perception.compiled import compiled
-from perception.model import COLOUR_GAIN, COLOUR_MEAN, CarNet, Residual, Stem, colours
-from perception.winograd import WinogradReLU, suits
+from sortie.perception.compiled import compiled
+from sortie.perception.model import COLOUR_GAIN, COLOUR_MEAN, CarNet, Residual, Stem, colours
+from sortie.perception.winograd import WinogradReLU, suits
 
 
 def folded(net: CarNet) -> CarNet:

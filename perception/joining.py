@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from perception import budget
-from perception.ap import best_first, rivals, standing
-from perception.geometry import in_square
-from perception.types import Boxes, Share
+from sortie.perception import budget
+from sortie.perception.ap import best_first, rivals, standing
+from sortie.perception.geometry import in_square
+from sortie.perception.types import Boxes, Share
 
 NMS_IOU = 0.15
 """Boxes that overlap by more are of one car."""

@@ -12,9 +12,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from perception.bev import ground_points
-from perception.fusion.registry import FUSIONS
-from perception.geometry import CHANNELS, Geometry
+from sortie.perception.bev import ground_points
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.geometry import CHANNELS, Geometry
 
 COLOUR_MEAN, COLOUR_GAIN = 0.42, 4.0
 """What brings colours, 0 … 1, about 0 and to a spread of about 1; the weights were learned so."""

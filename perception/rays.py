@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.compiled import compiled, fma
+from sortie.perception.compiled import compiled, fma
 
 COARSE, FAR, FAR_REACH = 8, 32, 2
 """Pixels a side of the blocks of the two maximum maps, the coarser in how many blocks around it."""

@@ -15,13 +15,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.rays import COARSE, FAR, FAR_REACH, REACH, see
-from perception.scene import SceneModel
-from perception.stamping import raised, restore, saved, stamp
-from perception.town import RES_M, TILE_M, Bytes, FloatMap, Floats
-from perception.traffic import Cars
-from perception.types import Capture
-from scenarios.streams import stream
+from sortie.perception.rays import COARSE, FAR, FAR_REACH, REACH, see
+from sortie.perception.scene import SceneModel
+from sortie.perception.stamping import raised, restore, saved, stamp
+from sortie.perception.town import RES_M, TILE_M, Bytes, FloatMap, Floats
+from sortie.perception.traffic import Cars
+from sortie.perception.types import Capture
+from sortie.scenarios.streams import stream
 
 CAMERAS = ("front", "left", "right", "back", "nadir")
 WIDTH_PX, HEIGHT_PX = 160, 90

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.town import Town
-from perception.traffic import TARGET_COLOUR, TARGET_ID, TARGET_SIZE_M, Cars, TargetPath, join, lanes, parked
-from scenarios.schema import Scene, Target
+from sortie.perception.town import Town
+from sortie.perception.traffic import TARGET_COLOUR, TARGET_ID, TARGET_SIZE_M, Cars, TargetPath, join, lanes, parked
+from sortie.scenarios.schema import Scene, Target
 
 MARGIN_M = 200.0
 """Cars exist this far around the bounds: the ±102.4 m grid's corner and a drone's drift fit inside."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.compiled import compiled
+from sortie.perception.compiled import compiled
 
 _F = np.float32
 _BONNET, _LOWEST = _F(0.62), _F(-1.0)

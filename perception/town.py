@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.schema import Scene
-from scenarios.streams import stream
+from sortie.scenarios.schema import Scene
+from sortie.scenarios.streams import stream
 
 Floats = NDArray[np.float64]
 FloatMap = NDArray[np.float32]

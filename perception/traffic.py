@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.town import LANE_CENTRE_M, Bytes, Floats, Town, draw_bodies, zigzag
-from scenarios.schema import Scene, Target
-from scenarios.streams import stream
+from sortie.perception.town import LANE_CENTRE_M, Bytes, Floats, Town, draw_bodies, zigzag
+from sortie.scenarios.schema import Scene, Target
+from sortie.scenarios.streams import stream
 
 SLOT_M = 10.0
 PATTERN_M = 1280.0

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.geometry import CELLS
+from sortie.perception.geometry import CELLS
 
 
 class Support(NamedTuple):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.compiled import compiled, fma
+from sortie.perception.compiled import compiled, fma
 
 TILE = 4
 BAND = 4

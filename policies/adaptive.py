@@ -16,9 +16,9 @@ from math import floor, fsum, isfinite, log2, log10
 from pathlib import Path
 from typing import NamedTuple
 
-from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
-from policies.coverage import sees
-from policies.geometry import footprint_overlap, peers_by_overlap
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.coverage import sees
+from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 
 RATE_HZ = 10.0
 MAP_MB = 8 * 4096 * 160e-6

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from typing import Any, NamedTuple, cast
 
-from policies.contract import Descriptor, Directive, FleetView, Representation
-from policies.prior import METHODS
-from policies.prior.full import full_sharing
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation
+from sortie.policies.prior import METHODS
+from sortie.policies.prior.full import full_sharing
 
 
 class Axis(Enum):

@@ -9,8 +9,8 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
-from policies.contract import Directive, FleetView, Representation, nothing
-from policies.geometry import peers_by_overlap
+from sortie.policies.contract import Directive, FleetView, Representation, nothing
+from sortie.policies.geometry import peers_by_overlap
 
 RATE_HZ = 10.0
 RESHUFFLE_S = 10

@@ -24,13 +24,15 @@ Decides = TypeVar("Decides", bound=Callable[..., Any])
 PURE = frozenset({
     "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
     "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions", "functools", "heapq", "itertools",
-    "math", "numbers", "numpy", "operator", "policies", "re", "statistics", "string", "types", "typing",
+    "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that know nothing but what they are handed; a policy may use them."""
-KEYED_RANDOMNESS = "scenarios.streams"
+KEYED_RANDOMNESS = "sortie.scenarios.streams"
 """Draws that follow from their key alone, so that the same view is the same decision."""
-ROOMS = frozenset({"sim", "fleet", "radio", "perception", "scenarios", "torch", "simpy"})
-_ONLY = {"random": {"Random"}}
+FAR = frozenset({
+    "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
+})  # fmt: skip
+_ONLY = {"random": {"Random"}, "sortie": {"policies"}}
 """Modules of which a policy may use so much: a generator with a seed of its own."""
 _BUT = {
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
@@ -215,8 +217,9 @@ def _module(module: types.ModuleType) -> Any:
 
 def _far(home: str) -> bool:
     """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
-    root = home.split(".")[0]
-    return root not in PURE and (root in ROOMS or root in sys.stdlib_module_names) and home != KEYED_RANDOMNESS
+    parts = home.split(".")
+    root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])
+    return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home != KEYED_RANDOMNESS
 
 
 def _import(name: str, *rest: Any) -> Any:

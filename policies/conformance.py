@@ -19,8 +19,8 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-from policies.confine import Reached, confined
-from policies.contract import (
+from sortie.policies.confine import Reached, confined
+from sortie.policies.contract import (
     Descriptor,
     Directive,
     FleetView,
@@ -30,8 +30,8 @@ from policies.contract import (
     check_reposition,
     kind_fault,
 )
-from policies.registry import viewpoint_of
-from policies.views import draw_view, draw_views, smaller
+from sortie.policies.registry import viewpoint_of
+from sortie.policies.views import draw_view, draw_views, smaller
 
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)

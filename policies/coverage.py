@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from math import hypot
 
-from policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc
+from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc
 
 Cells = frozenset[tuple[int, int]]
 """(row, column) in the world's lattice of 12.8 m."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from policies.contract import Descriptor, Directive, Disc, Representation
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation
 
 _NONE = Representation.NONE
 SAME_DISC_M = 1.6

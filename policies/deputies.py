@@ -2,15 +2,15 @@
 
 For each receiver the fleet appoints the k drones that add most to what it sees, as far as link and battery carry
 them. Every drone works out the same appointment from the same descriptors, so nothing is negotiated; a drone whose
-claims are false can take a place from a better one, which is what trust (`fleet.trust`) is for.
+claims are false can take a place from a better one, which is what trust (`sortie.fleet.trust`) is for.
 """
 
 from __future__ import annotations
 
-from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
-from policies.coverage import seen_well
-from policies.freshness import freshness
-from policies.geometry import footprint_overlap
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.coverage import seen_well
+from sortie.policies.freshness import freshness
+from sortie.policies.geometry import footprint_overlap
 
 HIGH_BATTERY, LOW_BATTERY = 0.60, 0.30
 FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0

@@ -12,7 +12,7 @@ def freshness(age_s: float, period_s: float) -> float:
     """1 up to three periods of age, a half up to ten, then 0: comparisons alone, so that proofs can follow it.
 
     It is the freshness half of a fusion weight; the receiver's trust in the sender is the other
-    (`fleet.trust`), and is applied where the payload is fused.
+    (`sortie.fleet.trust`), and is applied where the payload is fused.
     """
     if age_s <= FRESH_PERIODS * period_s:
         return 1.0

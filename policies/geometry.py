@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import acos, copysign, hypot, pi, sqrt
 
-from policies.contract import Descriptor, FleetView
+from sortie.policies.contract import Descriptor, FleetView
 
 OVERLAP_STEP = 0.1
 """Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
+from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
 
 Kind = Literal["number", "truth"]
 

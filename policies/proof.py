@@ -1,6 +1,6 @@
 """Proofs: whether a policy keeps its properties on every view of a fleet, or a view on which it does not.
 
-The policy runs on views whose fields are ranges (`policies.symbols`). What it compares cuts the ranges into cells,
+The policy runs on views whose fields are ranges (`sortie.policies.symbols`). What it compares cuts the ranges into cells,
 and the search visits all of them: every roster up to `max_drones`, every ego, every subset of peers heard, and
 
 | field | searched over |
@@ -29,13 +29,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from policies.confine import looks_up
-from policies.conformance import raised_part
-from policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
-from policies.invariants import Invariant, spelt, violations
-from policies.ranges import FleetOfRanges
-from policies.symbols import Path, Refused, explore
-from policies.views import draw_views, smaller
+from sortie.policies.confine import looks_up
+from sortie.policies.conformance import raised_part
+from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
+from sortie.policies.invariants import Invariant, spelt, violations
+from sortie.policies.ranges import FleetOfRanges
+from sortie.policies.symbols import Path, Refused, explore
+from sortie.policies.views import draw_views, smaller
 
 MAX_DRONES = 4
 MAX_CELLS = 200_000

@@ -1,4 +1,4 @@
-"""A fleet's view whose fields are ranges, for the search of `policies.proof`, and a plain view of any of its cells."""
+"""A fleet's view whose fields are ranges, for the search of `sortie.policies.proof`, and a plain view of any of its cells."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
-from policies.contract import Descriptor, Disc, FleetView, TaskPhase
-from policies.geometry import circle_overlap, peers_by_overlap
-from policies.symbols import Path, Ranged
-from policies.views import GRID_BYTES
+from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.geometry import circle_overlap, peers_by_overlap
+from sortie.policies.symbols import Path, Ranged
+from sortie.policies.views import GRID_BYTES
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8

@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from policies import adaptive, baselines
-from policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
-from policies.deputies import deputies
-from policies.prior import METHODS
-from policies.vantage import vantage
-from policies.worked import worked
+from sortie.policies import adaptive, baselines
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
+from sortie.policies.deputies import deputies
+from sortie.policies.prior import METHODS
+from sortie.policies.vantage import vantage
+from sortie.policies.worked import worked
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worked": worked,

@@ -16,8 +16,8 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
-from policies.invariants import (
+from sortie.policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.invariants import (
     Binary,
     Invariant,
     InvariantError,

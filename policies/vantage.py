@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import fsum, hypot
 
-from policies.baselines import everyone
-from policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
+from sortie.policies.baselines import everyone
+from sortie.policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
 
 FRESH_PERIODS = 10.0
 """Peers heard longer ago than this are detached: where they are now is not known."""

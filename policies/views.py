@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from policies.contract import Descriptor, Disc, FleetView, TaskPhase
-from scenarios.streams import stream
+from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
 GRID_BYTES = 64

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
-from policies.geometry import peers_by_overlap
+from sortie.policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.geometry import peers_by_overlap
 
 HIGH_BATTERY = 0.60
 LOW_BATTERY = 0.30

@@ -21,20 +21,20 @@ import numpy as np
 import simpy
 from numpy.typing import ArrayLike, NDArray
 
-from radio.airtime import repair_wire_bytes, sample_wire
-from radio.broadcasts import Broadcast, Broadcasts, OnHeard
-from radio.channel import Channel, FloatArray, Jammer, SampleLuck
-from radio.counters import Counters
-from radio.goodput import Goodput
-from radio.jobs import End
-from radio.medium import Medium
-from radio.overrides import Overrides
-from radio.relay import Routes
-from radio.sample import IntArray, Sample, Service
-from radio.traces import read_links
-from radio.transmission import Status, Transmission
-from scenarios.schema import Radio
-from scenarios.streams import stream
+from sortie.radio.airtime import repair_wire_bytes, sample_wire
+from sortie.radio.broadcasts import Broadcast, Broadcasts, OnHeard
+from sortie.radio.channel import Channel, FloatArray, Jammer, SampleLuck
+from sortie.radio.counters import Counters
+from sortie.radio.goodput import Goodput
+from sortie.radio.jobs import End
+from sortie.radio.medium import Medium
+from sortie.radio.overrides import Overrides
+from sortie.radio.relay import Routes
+from sortie.radio.sample import IntArray, Sample, Service
+from sortie.radio.traces import read_links
+from sortie.radio.transmission import Status, Transmission
+from sortie.scenarios.schema import Radio
+from sortie.scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample asks some ten times
 _SERVED, _DEADLINE_QUEUED = End.SERVED, End.DEADLINE_QUEUED
@@ -50,7 +50,7 @@ class Air:
         env: the clock.
         config: the scenario's radio section.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
         publish_spread: the drones' clocks are not in step, so a drone's broadcasts reach its radio a fixed time
             after the call, drawn once per drone, uniform in [0, publish_spread · frame_s). 0 hands them over at
@@ -361,7 +361,7 @@ class Air:
     # --- what senders know -----------------------------------------------------------------------
 
     def goodput_mbps(self, sender: int) -> tuple[float, ...]:
-        """Goodput to every other drone, ascending by id, as the sender measured it; see `radio.goodput`.
+        """Goodput to every other drone, ascending by id, as the sender measured it; see `sortie.radio.goodput`.
 
         Samples that are still in service or queued lower it already by how little has got through so far. Where a
         payload would go over others, it is what their hops' goodputs come to one after the other.

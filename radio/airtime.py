@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
 
-from radio.contention import DIFS_S, SIFS_S, SLOT_S, Contention
-from radio.rates import STANDARDS, Standard
+from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S, Contention
+from sortie.radio.rates import STANDARDS, Standard
 
 # Bytes (OMG DDSI-RTPS 2.5; RFC 791, 768; IEEE 802.11)
 RTPS_HEADER, INFO_TS, INFO_DST = 20, 12, 16

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence, Set
 from math import inf
 
-from radio.airtime import frame_bytes, group_frame_s
-from radio.channel import Channel
-from radio.counters import Counters
-from radio.jobs import GroupFrame
-from radio.medium import CW_CONTEXT
-from radio.overrides import Overrides
-from scenarios.schema import Radio
-from scenarios.streams import stream
+from sortie.radio.airtime import frame_bytes, group_frame_s
+from sortie.radio.channel import Channel
+from sortie.radio.counters import Counters
+from sortie.radio.jobs import GroupFrame
+from sortie.radio.medium import CW_CONTEXT
+from sortie.radio.overrides import Overrides
+from sortie.scenarios.schema import Radio
+from sortie.scenarios.streams import stream
 
 MAX_GROUP_PAYLOAD_BYTES = 2200
 """A group-addressed sample is one 802.11 frame."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.schema import Bursts
-from scenarios.streams import stream
+from sortie.scenarios.schema import Bursts
+from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -82,7 +82,7 @@ class PairStates:
     Args:
         config: the scenario's radio.bursts section.
         n: number of drones.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
     """
 

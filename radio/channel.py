@@ -1,7 +1,7 @@
 """Positions to signal-to-noise ratios: path loss, antennas, shadowing, fading, noise and jammers.
 
-Small fleets work out every link, with the random numbers of `radio.draws.StreamDraws`; large ones the links within
-earshot (`radio.crowd`).
+Small fleets work out every link, with the random numbers of `sortie.radio.draws.StreamDraws`; large ones the links within
+earshot (`sortie.radio.crowd`).
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radio.antenna import antenna_loss_db
-from radio.crowd import EPOCH, Crowd
-from radio.draws import StreamDraws, fade_table_db
-from radio.links import IntArray, Links, all_links
-from radio.pathloss import path_loss_db, range_m
-from radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
-from radio.shadowing import ShadowField
-from scenarios.schema import Radio
-from scenarios.streams import stream
+from sortie.radio.antenna import antenna_loss_db
+from sortie.radio.crowd import EPOCH, Crowd
+from sortie.radio.draws import StreamDraws, fade_table_db
+from sortie.radio.links import IntArray, Links, all_links
+from sortie.radio.pathloss import path_loss_db, range_m
+from sortie.radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
+from sortie.radio.shadowing import ShadowField
+from sortie.scenarios.schema import Radio
+from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
 AnyFloats = NDArray[np.floating[Any]]
@@ -102,7 +102,7 @@ class Channel:
     Args:
         config: the scenario's radio section.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
         up: [T, N, 3], ENU: the unit vector along each airframe's z axis; None is level flight.
 

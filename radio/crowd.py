@@ -12,12 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radio.antenna import antenna_loss_db
-from radio.draws import StreamDraws, drone_keys, fade_table_db, levels, link_keys, normal_table, numbers, uniforms
-from radio.links import IntArray, Links, both_ways, near_pairs
-from radio.pathloss import path_loss_db
-from radio.shadowing import ShadowField, gauss_markov, keep
-from scenarios.schema import Radio
+from sortie.radio.antenna import antenna_loss_db
+from sortie.radio.draws import (
+    StreamDraws,
+    drone_keys,
+    fade_table_db,
+    levels,
+    link_keys,
+    normal_table,
+    numbers,
+    uniforms,
+)
+from sortie.radio.links import IntArray, Links, both_ways, near_pairs
+from sortie.radio.pathloss import path_loss_db
+from sortie.radio.shadowing import ShadowField, gauss_markov, keep
+from sortie.scenarios.schema import Radio
 
 Array = NDArray[np.floating[Any]]
 

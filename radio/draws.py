@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chndtr, ndtri
 
-from radio.shadowing import gauss_markov, keep
-from scenarios.schema import Radio
-from scenarios.streams import stream
+from sortie.radio.shadowing import gauss_markov, keep
+from sortie.scenarios.schema import Radio
+from sortie.scenarios.streams import stream
 
 Keys = NDArray[np.uint64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import Enum
 from math import inf, nan
 
-from radio.airtime import Exchanges
-from radio.contention import DIFS_S, contention
+from sortie.radio.airtime import Exchanges
+from sortie.radio.contention import DIFS_S, contention
 
 _IDLE_ALONE_S = contention(1).idle_s
 

@@ -25,8 +25,8 @@ from typing import Generic, TypeVar
 
 import simpy
 
-from radio.contention import SIFS_S, SLOT_S, contention
-from radio.jobs import End, GroupFrame, Job
+from sortie.radio.contention import SIFS_S, SLOT_S, contention
+from sortie.radio.jobs import End, GroupFrame, Job
 
 AIFS_CONTEXT_S = SIFS_S + 2 * SLOT_S
 CW_CONTEXT = 15

@@ -1,7 +1,7 @@
 """What stands in place of the link models, or on top of them: link traces and bursts of loss.
 
 Frames of a traced link go by the trace, those of any other by the models and, where the scenario has them, bursts.
-What happens to a unicast frame's tries is worked out where its sample is served (`radio.sample`); whom a group frame
+What happens to a unicast frame's tries is worked out where its sample is served (`sortie.radio.sample`); whom a group frame
 reaches is settled here, by a uniform number for each link and frame.
 """
 
@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radio.bursts import PairNumbers, PairStates
-from radio.rates import group_mcs, rate_table
-from radio.traces import Given, LinkTrace
-from scenarios.schema import Radio
+from sortie.radio.bursts import PairNumbers, PairStates
+from sortie.radio.rates import group_mcs, rate_table
+from sortie.radio.traces import Given, LinkTrace
+from sortie.scenarios.schema import Radio
 
 FloatArray = NDArray[np.float64]
 _GOLDEN = 0.6180339887498949
@@ -41,7 +41,7 @@ class Overrides:
         config: the scenario's radio section.
         trace: None where there is none.
         n: number of drones.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
     """
 

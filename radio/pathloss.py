@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scenarios.schema import Radio
+from sortie.scenarios.schema import Radio
 
 FloatArray = NDArray[np.float64]
 

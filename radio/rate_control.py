@@ -17,7 +17,7 @@ from math import isnan, nan
 
 import numpy as np
 
-from scenarios.streams import stream
+from sortie.scenarios.streams import stream
 
 INTERVAL_S = 0.1
 KEEP = 0.75
@@ -47,7 +47,7 @@ class Minstrel:
 
     Args:
         rates_mbps: by MCS, rising.
-        seed, replication: as in `scenarios.streams.stream`; each ordered link has a stream of its own.
+        seed, replication: as in `sortie.scenarios.streams.stream`; each ordered link has a stream of its own.
     """
 
     def __init__(self, rates_mbps: Sequence[float], seed: int, replication: int) -> None:

@@ -8,7 +8,7 @@ from math import isnan, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from radio.airtime import (
+from sortie.radio.airtime import (
     ACK_S,
     Exchanges,
     ampdu_frames,
@@ -19,13 +19,13 @@ from radio.airtime import (
     sample_exchanges,
     tries,
 )
-from radio.contention import contention
-from radio.jobs import Job
-from radio.overrides import LinkNow
-from radio.rate_control import Minstrel
-from radio.rates import STANDARDS, rate_table, rescale
-from radio.transmission import Status, Transmission, losses
-from scenarios.schema import Radio
+from sortie.radio.contention import contention
+from sortie.radio.jobs import Job
+from sortie.radio.overrides import LinkNow
+from sortie.radio.rate_control import Minstrel
+from sortie.radio.rates import STANDARDS, rate_table, rescale
+from sortie.radio.transmission import Status, Transmission, losses
+from sortie.scenarios.schema import Radio
 
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.streams import stream
+from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
 Floats = TypeVar("Floats", bound=NDArray[np.floating[Any]])
@@ -28,7 +28,7 @@ class ShadowField:
     Args:
         sigma_db: standard deviation.
         distance_m, time_s: correlation distance d and time T.
-        seed, replication: as in `scenarios.streams.stream`.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
     """
 
     def __init__(self, sigma_db: float, distance_m: float, time_s: float, seed: int, replication: int) -> None:

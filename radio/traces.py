@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
+from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 FloatArray = NDArray[np.float64]
 QUALITIES = ("snr_db", "loss", "goodput_mbps")
@@ -73,7 +73,7 @@ def read_links(path: str | Path, drones: int) -> LinkTrace:
         drones: drones of the fleet; a trace of another is refused.
 
     Raises:
-        TraceError: as for `scenarios.traces.read_columns`; no quality, an unknown drone, a link to oneself, time that
+        TraceError: as for `sortie.scenarios.traces.read_columns`; no quality, an unknown drone, a link to oneself, time that
             does not increase.
     """
     path = Path(path)

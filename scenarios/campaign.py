@@ -1,6 +1,6 @@
 """The schema of a campaign: a base scenario, what is varied in it, and how much of it is flown.
 
-Names and bounds only; `scenarios.load_campaign` reads the file and holds what is varied against the base scenario.
+Names and bounds only; `sortie.scenarios.load_campaign` reads the file and holds what is varied against the base scenario.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue, model_validator
 
-from scenarios.schema import Section
-from scenarios.schema import _inconsistent as inconsistent
+from sortie.scenarios.schema import Section
+from sortie.scenarios.schema import _inconsistent as inconsistent
 
 # --- how a field is spread ------------------------------------------------------------------------
 

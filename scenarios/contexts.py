@@ -1,6 +1,6 @@
 """The schema of a set of contexts: one base scenario under many conditions, on which policies are compared.
 
-`scenarios.load.load_contexts` reads the file; `sortie compare FILE --policies …` flies it.
+`sortie.scenarios.load.load_contexts` reads the file; `sortie compare FILE --policies …` flies it.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from scenarios.schema import Section
-from scenarios.schema import _inconsistent as inconsistent
+from sortie.scenarios.schema import Section
+from sortie.scenarios.schema import _inconsistent as inconsistent
 
 Override = Annotated[str, Field(min_length=3, description="As after `--set`.")]
 

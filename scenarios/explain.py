@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from scenarios.nodes import Issue, Node, Path, child, dotted, nearest, one_of
-from scenarios.schema import Scenario
+from sortie.scenarios.nodes import Issue, Node, Path, child, dotted, nearest, one_of
+from sortie.scenarios.schema import Scenario
 
 _WANTED = {
     "model_type": "a section",

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from scenarios.schema import Scenario
-from scenarios.traces import located
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.traces import located
 
 FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.recording", "perception.recorded_fusion")
 """Fields that name a file; so do a policy's name and those of its changes where they are `file.py:function`."""

@@ -20,11 +20,11 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from scenarios.contexts import Contexts
-from scenarios.explain import explain
-from scenarios.files import found_beside
-from scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, child, nearest, plain, problems
-from scenarios.schema import Scenario
+from sortie.scenarios.contexts import Contexts
+from sortie.scenarios.explain import explain
+from sortie.scenarios.files import found_beside
+from sortie.scenarios.nodes import Issue, Node, Scalar, ScenarioError, assign, child, nearest, plain, problems
+from sortie.scenarios.schema import Scenario
 
 __all__ = ["ScenarioError", "dump", "library", "load", "loads"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scenarios.campaign import (
+from sortie.scenarios.campaign import (
     Campaign,
     Choice,
     Column,
@@ -23,10 +23,10 @@ from scenarios.campaign import (
     Triangular,
     Uniform,
 )
-from scenarios.files import found_beside
-from scenarios.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
-from scenarios.nodes import Node, ScenarioError, assign, child, dotted, plain
-from scenarios.schema import Scenario
+from sortie.scenarios.files import found_beside
+from sortie.scenarios.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
+from sortie.scenarios.nodes import Node, ScenarioError, assign, child, dotted, plain
+from sortie.scenarios.schema import Scenario
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The schema for people and editors: the tables of README.md and schema.json, both made from schema.py.
 
-`python -m scenarios.reference` writes them anew; a test holds them to the schema.
+`python -m sortie.scenarios.reference` writes them anew; a test holds them to the schema.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from scenarios.explain import sections_of
-from scenarios.schema import Scenario, json_schema
+from sortie.scenarios.explain import sections_of
+from sortie.scenarios.schema import Scenario, json_schema
 
 HERE = Path(__file__).parent
-BEGIN, END = "<!-- fields: made by python -m scenarios.reference -->", "<!-- end of fields -->"
+BEGIN, END = "<!-- fields: made by python -m sortie.scenarios.reference -->", "<!-- end of fields -->"
 _SIGNS = {Ge: ("ge", "≥"), Gt: ("gt", ">"), Le: ("le", "≤"), Lt: ("lt", "<")}
 _NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "nothing"}
 

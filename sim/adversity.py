@@ -11,13 +11,24 @@ from typing import Any
 import numpy as np
 import simpy
 
-from fleet.auth import TRAILER_BYTES, Sealer
-from fleet.lies import falsified
-from fleet.wire import decode_descriptor, encode_descriptor
-from scenarios.schema import BatteryFault, CellFailure, ClockSkew, DroneLost, Event, Jam, Lie, LinkDrop, Scenario, Spoof
-from scenarios.streams import stream
-from sim.ether import Ether
-from sim.world import World, at, with_frame
+from sortie.fleet.auth import TRAILER_BYTES, Sealer
+from sortie.fleet.lies import falsified
+from sortie.fleet.wire import decode_descriptor, encode_descriptor
+from sortie.scenarios.schema import (
+    BatteryFault,
+    CellFailure,
+    ClockSkew,
+    DroneLost,
+    Event,
+    Jam,
+    Lie,
+    LinkDrop,
+    Scenario,
+    Spoof,
+)
+from sortie.scenarios.streams import stream
+from sortie.sim.ether import Ether
+from sortie.sim.world import World, at, with_frame
 
 OVERSIZED_BYTES = 2000
 

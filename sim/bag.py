@@ -8,7 +8,7 @@
 | `/drone_0/battery` | `sensor_msgs/msg/BatteryState` | reliable, keep last 10 |
 | `/decisions` | `rcl_interfaces/msg/Log` | reliable, keep last 100 |
 
-The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sim.topics`). The
+The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sortie.sim.topics`). The
 record holds no estimated pose, so a descriptor's is the true one here.
 """
 
@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.coverage import TARGET_FLAG, footprint_radius_m
-from fleet.wire import (
+from sortie.fleet.coverage import TARGET_FLAG, footprint_radius_m
+from sortie.fleet.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
     DIRECTIVE_MSG,
@@ -31,13 +31,13 @@ from fleet.wire import (
     encode_descriptor,
     encode_directive,
 )
-from perception.traffic import TARGET_ID
-from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sim.folders import replacing
-from sim.outcome import transitions
-from sim.record import SortieRecord
-from sim.topics import CONTEXT, Kind, Topic
-from sim.words import decision_in_words, event_in_words
+from sortie.perception.traffic import TARGET_ID
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.sim.folders import replacing
+from sortie.sim.outcome import transitions
+from sortie.sim.record import SortieRecord
+from sortie.sim.topics import CONTEXT, Kind, Topic
+from sortie.sim.words import decision_in_words, event_in_words
 
 POSE, TF, BATTERY, LOG = (
     "geometry_msgs/msg/PoseStamped",

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenarios.files import named_files
-from scenarios.load import library, load
-from scenarios.schema import Scenario
-from sim.expect import Verdict, check
-from sim.folders import RunError
-from sim.golden import golden_path, moved, named_from, write_golden
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
-from sim.why import why
+from sortie.scenarios.files import named_files
+from sortie.scenarios.load import library, load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.expect import Verdict, check
+from sortie.sim.folders import RunError
+from sortie.sim.golden import golden_path, moved, named_from, write_golden
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
+from sortie.sim.why import why
 
 SHOWN = 4
 """Moved golden figures that a verdict names."""

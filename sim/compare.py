@@ -7,13 +7,13 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from perception.ap import Matched
-from perception.harness.statistics import compare as bootstrap
-from policies.registry import resolve
-from scenarios.schema import Scenario
-from sim.outcome import matched, outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.perception.ap import Matched
+from sortie.perception.harness.statistics import compare as bootstrap
+from sortie.policies.registry import resolve
+from sortie.scenarios.schema import Scenario
+from sortie.sim.outcome import matched, outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 
 @dataclass(frozen=True, slots=True)

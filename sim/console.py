@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sim.folders import RunError
+from sortie.sim.folders import RunError
 
 out = Console()
 err = Console(stderr=True, highlight=False)

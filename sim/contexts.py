@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.ap import average_precision
-from perception.detectors import make_detector
-from policies.registry import POLICIES, parameters, resolve
-from scenarios.contexts import Context, Contexts
-from scenarios.load import load
-from scenarios.schema import Scenario
-from sim.folders import RunError
-from sim.outcome import matched, outcome
-from sim.sortie import DetectorOf, run_sortie
+from sortie.perception.ap import average_precision
+from sortie.perception.detectors import make_detector
+from sortie.policies.registry import POLICIES, parameters, resolve
+from sortie.scenarios.contexts import Context, Contexts
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.outcome import matched, outcome
+from sortie.sim.sortie import DetectorOf, run_sortie
 
 FIXED = ("all-4", "best-2", "worst-2", "random-2", "fixed-compression", "silence")
 """Policies that do the same whatever the context; the best of them, and the best of them in each context, are the

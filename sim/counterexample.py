@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from policies.conformance import raised_part
-from policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
-from policies.proof import View
-from policies.views import to_json
-from scenarios.schema import Scenario
-from sim.sortie import run_sortie
+from sortie.policies.conformance import raised_part
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
+from sortie.policies.proof import View
+from sortie.policies.views import to_json
+from sortie.scenarios.schema import Scenario
+from sortie.sim.sortie import run_sortie
 
 SHOWN_AT_PERIODS = 5
 """By then every drone has heard every other."""

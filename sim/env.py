@@ -23,12 +23,12 @@ import pyarrow.compute as pc
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from perception.ap import average_precision
-from policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
-from scenarios.schema import Scenario
-from sim.outcome import matched
-from sim.record import SortieRecord
-from sim.sortie import VERSION, run_sortie
+from sortie.perception.ap import average_precision
+from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.scenarios.schema import Scenario
+from sortie.sim.outcome import matched
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import VERSION, run_sortie
 
 RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)
 BUDGETS = (0.02, 0.1, 0.25, 1.0)

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from fleet.agent import Agent, Received
-from fleet.auth import Dropped, Opened, open_datagram
-from fleet.gate import Payload
-from fleet.tiles import cells_of
-from perception.types import Capture
-from policies.contract import Representation
-from radio import Air, Transmission
-from sim.record import HANDSHAKE, REPRESENTATIONS, Recorder
+from sortie.fleet.agent import Agent, Received
+from sortie.fleet.auth import Dropped, Opened, open_datagram
+from sortie.fleet.gate import Payload
+from sortie.fleet.tiles import cells_of
+from sortie.perception.types import Capture
+from sortie.policies.contract import Representation
+from sortie.radio import Air, Transmission
+from sortie.sim.record import HANDSHAKE, REPRESENTATIONS, Recorder
 
 
 class Ether:
@@ -118,7 +118,7 @@ def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
 
 
 class _Modem:
-    """One drone's end of the air (fleet.agent.Modem)."""
+    """One drone's end of the air (sortie.fleet.agent.Modem)."""
 
     def __init__(self, ether: Ether, drone: int) -> None:
         self.broadcast = partial(ether.publish, drone)

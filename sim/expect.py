@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from scenarios.schema import DecisionExpectation, Expectation, Scenario
-from sim.outcome import describe
-from sim.record import SortieRecord
+from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
+from sortie.sim.outcome import describe
+from sortie.sim.record import SortieRecord
 
 TOLERANCE = 1e-9
 

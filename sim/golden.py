@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from sim.folders import RunError, write_text
+from sortie.sim.folders import RunError, write_text
 
 LEFT_OUT = ("fingerprint", "version", "wall_s", "realtime_factor", "policy_eval_us")
 """Wall clock, and what changes with every release."""

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.ap import Matched, average_precision
-from perception.detectors import Constructor, Detector
-from perception.scene import SceneModel
-from scenarios.contexts import Context, Contexts
-from scenarios.load import load, load_contexts
-from scenarios.schema import Perception, Scenario
-from sim.contexts import paired_interval, scenario_of
-from sim.outcome import both_matched
-from sim.sortie import run_sortie
+from sortie.perception.ap import Matched, average_precision
+from sortie.perception.detectors import Constructor, Detector
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.contexts import Context, Contexts
+from sortie.scenarios.load import load, load_contexts
+from sortie.scenarios.schema import Perception, Scenario
+from sortie.sim.contexts import paired_interval, scenario_of
+from sortie.sim.outcome import both_matched
+from sortie.sim.sortie import run_sortie
 
 POLICIES = ("silence", "all-4", "boxes")
 TOWNS_APART = 1000
@@ -110,7 +110,7 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
     Sorties that are made one after the other in one scene, under several policies, share the torch detector, its scenery
     and what it has encoded.
     """
-    from perception.detector import TorchDetector  # here: torch takes a second to import
+    from sortie.perception.detector import TorchDetector  # here: torch takes a second to import
 
     ours = _surrogate(calibration)
     last: list[tuple[object, Detector]] = []
@@ -125,7 +125,7 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
 
 
 def _surrogate(calibration: Path | None) -> Constructor:
-    from perception.surrogate.detector import SurrogateDetector
+    from sortie.perception.surrogate.detector import SurrogateDetector
 
     def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
         return SurrogateDetector(scene, config, seed, calibration, replication)

@@ -1,9 +1,9 @@
-"""Learning to spend a budget: simulated sorties under every arm of `policies.adaptive`, and what they teach.
+"""Learning to spend a budget: simulated sorties under every arm of `sortie.policies.adaptive`, and what they teach.
 
 An offline contextual bandit. Training contexts are drawn from ranges that the held-out set
 (`scenarios/library/contexts.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that
 arms differ by nothing but themselves. Per arm, ridge regression predicts the AP gained over the first arm from what a
-policy sees (`policies.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
+policy sees (`sortie.policies.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.ap import average_precision
-from perception.detectors import make_detector
-from policies.adaptive import ARMS, features, spend
-from policies.contract import Directive, FleetView
-from scenarios.load import load
-from scenarios.schema import Scenario
-from scenarios.streams import stream
-from sim.folders import write_text
-from sim.in_flight import torch_answers
-from sim.outcome import matched
-from sim.sortie import DetectorOf, run_sortie
+from sortie.perception.ap import average_precision
+from sortie.perception.detectors import make_detector
+from sortie.policies.adaptive import ARMS, features, spend
+from sortie.policies.contract import Directive, FleetView
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.streams import stream
+from sortie.sim.folders import write_text
+from sortie.sim.in_flight import torch_answers
+from sortie.sim.outcome import matched
+from sortie.sim.sortie import DetectorOf, run_sortie
 
 BUDGETS = (0.01, 0.04, 0.2, 0.6)
 SPACINGS_M = (15, 20, 30)

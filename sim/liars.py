@@ -1,4 +1,4 @@
-"""What one liar costs, with and without trust, and whom trust doubts where nobody lies: `python -m sim.liars`.
+"""What one liar costs, with and without trust, and whom trust doubts where nobody lies: `python -m sortie.sim.liars`.
 
 Each row flies the same sorties three times: everyone honest, one drone lying from the fifth second on, and the same
 with trust. AP is of the honest drones alone, from the moment of the lie, and scored by the surrogate detector.
@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from perception.harness.statistics import Difference, compare
-from scenarios.load import library, load
-from sim.compare import pair_up
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.scenarios.load import library, load
+from sortie.sim.compare import pair_up
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
 RHO = 0.1

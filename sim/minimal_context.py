@@ -1,4 +1,4 @@
-"""How small the descriptor can be: AP against context bytes, one knob at a time and together: `python -m sim.minimal_context`.
+"""How small the descriptor can be: AP against context bytes, one knob at a time and together: `python -m sortie.sim.minimal_context`.
 
 Policies that read the context (`deputies`, `where2comm`, `who2com`) fly the same sorties with descriptors of several
 forms. Bytes are those that went on the air, authentication included; AP is by the surrogate detector.
@@ -10,12 +10,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from perception.harness.statistics import Difference, compare
-from scenarios.load import load
-from sim.compare import pair_up
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.scenarios.load import load
+from sortie.sim.compare import pair_up
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 SCENARIO = "track_target"
 POLICIES = ("deputies", "who2com")

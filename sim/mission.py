@@ -6,10 +6,10 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fleet.agent import Task
-from perception.traffic import TARGET_ID, TargetPath
-from policies.contract import Disc, TaskPhase
-from scenarios.schema import Mission
+from sortie.fleet.agent import Task
+from sortie.perception.traffic import TARGET_ID, TargetPath
+from sortie.policies.contract import Disc, TaskPhase
+from sortie.scenarios.schema import Mission
 
 _PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from policies.contract import PolicyError
+from sortie.policies.contract import PolicyError
 
 
 def policy_overrides(text: str, own: str) -> list[str]:

@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from perception.ap import Matched, average_precision, judge
-from perception.types import Boxes
-from radio.transmission import Status
-from sim.outcome_fields import REASONS
-from sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
+from sortie.perception.ap import Matched, average_precision, judge
+from sortie.perception.types import Boxes
+from sortie.radio.transmission import Status
+from sortie.sim.outcome_fields import REASONS
+from sortie.sim.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 

@@ -1,6 +1,6 @@
 """The fields of `outcome.json` and what they mean: the reference in `outcome.md` is made of this.
 
-A test holds `sim.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
+A test holds `sortie.sim.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from collections.abc import Collection, Mapping
 from types import UnionType
 from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
 
-from fleet.auth import DropReason
-from fleet.battery import CAUSES, RECORDED
-from radio.transmission import Status
-from scenarios.nodes import nearest
+from sortie.fleet.auth import DropReason
+from sortie.fleet.battery import CAUSES, RECORDED
+from sortie.radio.transmission import Status
+from sortie.scenarios.nodes import nearest
 
 
 class Percentiles(TypedDict):
@@ -42,7 +42,7 @@ class Bytes(TypedDict):
     context_directives: Annotated[int, "Directives at 36 B, counted when they change."]
     data_sent: Annotated[int, "Payloads handed to the radio: delivered + lost + expired + in flight."]
     handshakes_sent: Annotated[
-        int, "What a method put on its links before payloads (`policies.prior`), part of `data_sent`."
+        int, "What a method put on its links before payloads (`sortie.policies.prior`), part of `data_sent`."
     ]
     data_delivered: Annotated[int, "Arrived; of payloads that came in part, that part."]
     data_lost: Annotated[int, "Lost on the air."]

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from policies.contract import Directive, FleetView
-from policies.registry import resolve
-from scenarios.load import load
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.registry import resolve
+from sortie.scenarios.load import load
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 SCENARIO = "search_grid"
 FLEETS = (5, 25, 100)

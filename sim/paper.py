@@ -12,16 +12,16 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from perception.harness import figure_frame, figures, report, rows
-from perception.harness.found import Asked
-from perception.harness.instrument import CarNetInstrument
-from perception.harness.paper import bench_frames, camera_views, measure
-from perception.harness.picture import PAPER_BUDGETS, Picture, picture
-from perception.harness.rows import Point, Row
-from perception.harness.sensitivity import Varied, sensitivity
-from sim.folders import ensure_folder, put_between, replacing
-from sim.plane import machine, measure_plane, measured_live
-from sim.sortie import VERSION
+from sortie.perception.harness import figure_frame, figures, report, rows
+from sortie.perception.harness.found import Asked
+from sortie.perception.harness.instrument import CarNetInstrument
+from sortie.perception.harness.paper import bench_frames, camera_views, measure
+from sortie.perception.harness.picture import PAPER_BUDGETS, Picture, picture
+from sortie.perception.harness.rows import Point, Row
+from sortie.perception.harness.sensitivity import Varied, sensitivity
+from sortie.sim.folders import ensure_folder, put_between, replacing
+from sortie.sim.plane import machine, measure_plane, measured_live
+from sortie.sim.sortie import VERSION
 
 REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
 FIGURES = {

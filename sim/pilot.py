@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import simpy
 
-from fleet.agent import Agent
-from policies.conformance import raised_part
-from policies.contract import (
+from sortie.fleet.agent import Agent
+from sortie.policies.conformance import raised_part
+from sortie.policies.contract import (
     Directive,
     FleetView,
     Policy,
@@ -25,14 +25,14 @@ from policies.contract import (
     check_directives,
     check_reposition,
 )
-from policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
-from policies.registry import handshake_bytes, resolve, told, viewpoint_of
-from policies.shield import MARK, checked, enforce
-from policies.views import ViewError, from_json
-from scenarios.schema import Policy as PolicySection
-from scenarios.schema import PolicyChange
-from sim.record import DECISIONS_OF, Recorder
-from sim.world import at, with_frame
+from sortie.policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
+from sortie.policies.registry import handshake_bytes, resolve, told, viewpoint_of
+from sortie.policies.shield import MARK, checked, enforce
+from sortie.policies.views import ViewError, from_json
+from sortie.scenarios.schema import Policy as PolicySection
+from sortie.scenarios.schema import PolicyChange
+from sortie.sim.record import DECISIONS_OF, Recorder
+from sortie.sim.world import at, with_frame
 
 _PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from sim.checking import Checked
-    from sim.expect import Verdict
+    from sortie.sim.checking import Checked
+    from sortie.sim.expect import Verdict
 
 MAX_BYTES = 1_000_000
 WRITTEN = pytest.StashKey[list[str]]()
@@ -40,8 +40,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Both options at once would write the outcome of another sortie than the scenario's."""
     if config.getoption("sortie_update") and config.getoption("sortie_set"):
-        from sim.checking import ensure_own
-        from sim.folders import RunError
+        from sortie.sim.checking import ensure_own
+        from sortie.sim.folders import RunError
 
         try:
             ensure_own(config.getoption("sortie_set"), update=True)
@@ -63,7 +63,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFi
 
 
 def _is_scenario(path: Path) -> bool:
-    from sim.golden import golden_path
+    from sortie.sim.golden import golden_path
 
     try:
         with path.open("rb") as file:
@@ -79,8 +79,8 @@ def _is_scenario(path: Path) -> bool:
 
 def _is_flow_scenario(text: str, *, golden: bool) -> bool:
     """Which keys stand on top only the reader can tell; a file that it cannot read is a scenario's if it begins as one."""
-    from scenarios.load import ScenarioError, tree
-    from scenarios.nodes import child
+    from sortie.scenarios.load import ScenarioError, tree
+    from sortie.scenarios.nodes import child
 
     try:
         root = tree(text, "")
@@ -97,9 +97,9 @@ class ScenarioFile(pytest.File):
 
     def collect(self) -> Iterator[ScenarioItem]:
         """One test an expectation, and one for the golden outcome."""
-        from scenarios.load import ScenarioError, load
-        from sim.expect import in_words
-        from sim.golden import golden_path
+        from sortie.scenarios.load import ScenarioError, load
+        from sortie.sim.expect import in_words
+        from sortie.sim.golden import golden_path
 
         try:
             scenario = load(self.path, self.config.getoption("sortie_set"))
@@ -114,7 +114,7 @@ class ScenarioFile(pytest.File):
 
     def checked(self) -> Checked:
         """The verdicts, in the order of the tests."""
-        from sim.checking import check_scenario
+        from sortie.sim.checking import check_scenario
 
         if self._checked is None:
             update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))

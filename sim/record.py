@@ -18,11 +18,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet.staleness import LinkHealth
-from fleet.trust import Standing
-from fleet.wire import DIRECTIVE_BYTES
-from policies.contract import Descriptor, Directive, Representation, TaskPhase
-from scenarios.schema import Scenario
+from sortie.fleet.staleness import LinkHealth
+from sortie.fleet.trust import Standing
+from sortie.fleet.wire import DIRECTIVE_BYTES
+from sortie.policies.contract import Descriptor, Directive, Representation, TaskPhase
+from sortie.scenarios.schema import Scenario
 
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
@@ -95,7 +95,7 @@ ABOUT = {
     "group, and the link that limits the worst-off pair (−1 and NaN where there is none).",
     "energy": "What a drone spent on a cause.",
     "events": "What happened to the fleet: scenario events, landings, policies that took over; drone −1 is the fleet.",
-    "trust": "A change of what a drone thinks of a peer (`fleet.trust`); 1 is undoubted.",
+    "trust": "A change of what a drone thinks of a peer (`sortie.fleet.trust`); 1 is undoubted.",
     "ages": "Age of a peer's descriptor when a policy read it.",
 }
 """What a row of each table is; units stand in the columns' names."""
@@ -203,7 +203,7 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
 
 
 class AgentNotes:
-    """Writes agents' acts into a recorder (fleet.agent.AgentLog)."""
+    """Writes agents' acts into a recorder (sortie.fleet.agent.AgentLog)."""
 
     def __init__(self, recorder: Recorder, deciding: Callable[[int], str]) -> None:
         """Args: `deciding` names the policy that decides on a drone."""

@@ -1,6 +1,6 @@
-"""The outcome and the record for people: `outcome.md`, made of `sim.outcome_fields` and `sim.record`.
+"""The outcome and the record for people: `outcome.md`, made of `sortie.sim.outcome_fields` and `sortie.sim.record`.
 
-`python -m sim.reference` writes it anew; a test holds it to the code, and the code to what a sortie gives.
+`python -m sortie.sim.reference` writes it anew; a test holds it to the code, and the code to what a sortie gives.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
 
 import pyarrow as pa
 
-from sim.folders import write_text
-from sim.outcome_fields import Outcome
-from sim.record import ABOUT, TABLES
+from sortie.sim.folders import write_text
+from sortie.sim.outcome_fields import Outcome
+from sortie.sim.record import ABOUT, TABLES
 
 PAGE = Path(__file__).parent / "outcome.md"
 _NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "null"}
@@ -33,7 +33,7 @@ def page() -> str:
     lines = [
         "# What a run leaves behind",
         "",
-        "Made by `python -m sim.reference`; do not edit.",
+        "Made by `python -m sortie.sim.reference`; do not edit.",
         "",
         "A run's folder holds `outcome.json`, the record's tables as Parquet, `scenario.yaml` (what was flown, every default "
         "written out), `record.json` (totals and wall clock) and `sortie.rrd` (the recording for Rerun; `sortie view` makes "

@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from perception.ap import average_precision
-from sim.folders import RunError
-from sim.outcome import matched, transitions
-from sim.record import HANDSHAKE, SortieRecord
+from sortie.perception.ap import average_precision
+from sortie.sim.folders import RunError
+from sortie.sim.outcome import matched, transitions
+from sortie.sim.record import HANDSHAKE, SortieRecord
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,13 +6,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from scenarios.load import dump
-from sim.folders import write_text
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.report_figures import colour, figures
-from sim.tables import number, percent, size
-from sim.words import decision_in_words, event_in_words
+from sortie.scenarios.load import dump
+from sortie.sim.folders import write_text
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.report_figures import colour, figures
+from sortie.sim.tables import number, percent, size
+from sortie.sim.words import decision_in_words, event_in_words
 
 STYLE = """
 :root { color-scheme: light; }

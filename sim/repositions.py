@@ -1,4 +1,4 @@
-"""What choosing viewpoints gains and costs, measured: `python -m sim.repositions`.
+"""What choosing viewpoints gains and costs, measured: `python -m sortie.sim.repositions`.
 
 `vantage` flies against `all-4`, which shares the very same and holds its slots: same seeds, same town, same draws. The
 mission is given by where its target drives; AP is by the surrogate detector, energy by the rotor model that charges
@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.coverage import footprint_radius_m
-from perception.harness.statistics import Difference, compare
-from scenarios.load import load
-from scenarios.schema import Scenario
-from sim.compare import pair_up
-from sim.contexts import paired_interval
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
-from sim.viewpoints import EVENT
+from sortie.fleet.coverage import footprint_radius_m
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.compare import pair_up
+from sortie.sim.contexts import paired_interval
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
+from sortie.sim.viewpoints import EVENT
 
 SCENARIO, RHO, RADIUS_M = "track_target", 0.1, 32.0
 STAYS, MOVES = "all-4", "vantage"

@@ -10,11 +10,11 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from scenarios.load import ScenarioError, dump, loads
-from scenarios.schema import Scenario
-from sim.folders import RunError, ensure_folder, replacing
-from sim.outcome import outcome
-from sim.record import TABLES, SortieRecord
+from sortie.scenarios.load import ScenarioError, dump, loads
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError, ensure_folder, replacing
+from sortie.sim.outcome import outcome
+from sortie.sim.record import TABLES, SortieRecord
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
 PAGE = "report.html"

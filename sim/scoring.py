@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import simpy
 
-from fleet.agent import Agent, Received
-from perception.detectors import DetectsAhead, DetectsMany
-from perception.types import Boxes, Capture, Share
-from scenarios.schema import Scenario
-from sim.record import REPRESENTATIONS, Recorder
+from sortie.fleet.agent import Agent, Received
+from sortie.perception.detectors import DetectsAhead, DetectsMany
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Scenario
+from sortie.sim.record import REPRESENTATIONS, Recorder
 
 
 class Detector(Protocol):

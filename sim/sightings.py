@@ -10,8 +10,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from perception.ap import Matched, match
-from perception.types import Boxes
+from sortie.perception.ap import Matched, match
+from sortie.perception.types import Boxes
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,29 +13,29 @@ from typing import Protocol
 import pyarrow as pa
 import simpy
 
-from fleet.agent import Agent, PlaneRules
-from fleet.auth import Sealer
-from fleet.battery import FleetBatteries
-from fleet.compact import Form
-from fleet.frames import up_vector
-from fleet.motion import fly
-from fleet.traces import follow, read_traces
-from perception.detectors import Detector, DetectsMany, make_detector
-from perception.scene import SceneModel
-from perception.types import Capture
-from policies.contract import Disc, Policy
-from radio import Air
-from radio.rates import STANDARDS
-from scenarios.schema import Perception, Scenario
-from scenarios.streams import stream
-from sim.adversity import group_key, schedule
-from sim.ether import Ether
-from sim.mission import MissionPlan
-from sim.pilot import Audit, Named, Pilot, Plan, named, plan_of, schedule_policies
-from sim.record import AgentNotes, Recorder, SortieRecord
-from sim.scoring import Scorer
-from sim.viewpoints import Choreography
-from sim.world import World, route_bounds
+from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.auth import Sealer
+from sortie.fleet.battery import FleetBatteries
+from sortie.fleet.compact import Form
+from sortie.fleet.frames import up_vector
+from sortie.fleet.motion import fly
+from sortie.fleet.traces import follow, read_traces
+from sortie.perception.detectors import Detector, DetectsMany, make_detector
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Capture
+from sortie.policies.contract import Disc, Policy
+from sortie.radio import Air
+from sortie.radio.rates import STANDARDS
+from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.streams import stream
+from sortie.sim.adversity import group_key, schedule
+from sortie.sim.ether import Ether
+from sortie.sim.mission import MissionPlan
+from sortie.sim.pilot import Audit, Named, Pilot, Plan, named, plan_of, schedule_policies
+from sortie.sim.record import AgentNotes, Recorder, SortieRecord
+from sortie.sim.scoring import Scorer
+from sortie.sim.viewpoints import Choreography
+from sortie.sim.world import World, route_bounds
 
 VERSION = version("sortie-sim")
 KEY_ID = 1
@@ -64,7 +64,7 @@ def _not_collecting() -> Iterator[None]:
 
 
 DetectorOf = Callable[[SceneModel, Perception, int, int], Detector | None]
-"""As `perception.detectors.Constructor`; None flies without."""
+"""As `sortie.perception.detectors.Constructor`; None flies without."""
 
 
 @_not_collecting()

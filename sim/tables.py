@@ -12,8 +12,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from sim.compare import Compared
-from sim.expect import Verdict
+from sortie.sim.compare import Compared
+from sortie.sim.expect import Verdict
 
 ROOMS = ("sim", "fleet", "radio", "policies", "perception", "scenarios")
 MAX_TRANSITIONS = 24
@@ -214,7 +214,7 @@ def training_table(result: Any) -> Table:
 
 def profile_table(profiler: cProfile.Profile, result: dict[str, Any]) -> Table:
     """Share of the wall time spent in each room's own code and in libraries, profiler's overhead included."""
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).parents[1]
     spent: dict[str, float] = {}
     for (file, _, _), (_, _, own_s, _, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
         path = Path(file)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet.mavlink import (
+from sortie.fleet.mavlink import (
     KEY_BYTES,
     STATUS,
     Listener,
@@ -23,10 +23,10 @@ from fleet.mavlink import (
     messages,
     write_tlog,
 )
-from perception.scene import SceneModel
-from scenarios.schema import Scenario
-from sim.folders import RunError
-from sim.record import SortieRecord
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.record import SortieRecord
 
 ORIGIN = Origin(47.397742, 8.545594, 488.0)
 """Where ENU (0, 0, 0) lies where nobody says otherwise: the field in Zurich at which PX4's simulators start."""
@@ -117,7 +117,7 @@ def save_tlog(
 
 
 class MavlinkEndpoint:
-    """Sends a sortie's telemetry as it flies (sim.sortie.Observer) and answers ground stations.
+    """Sends a sortie's telemetry as it flies (sortie.sim.sortie.Observer) and answers ground stations.
 
     The record comes a simulated second at a time; each second is sent in step with the clock, `pace` simulated seconds
     to one of the wall's, so that a ground station sees the fleet a second late and otherwise as if it flew.

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from fleet.displaced import displaced
-from fleet.viewpoints import Move, Plan, bounds_of, course_of, grant
-from policies.contract import Reposition
-from scenarios.schema import Scenario
-from sim.world import World
+from sortie.fleet.displaced import displaced
+from sortie.fleet.viewpoints import Move, Plan, bounds_of, course_of, grant
+from sortie.policies.contract import Reposition
+from sortie.scenarios.schema import Scenario
+from sortie.sim.world import World
 
 RETRY_S = 1.0
 """A wish that was refused is looked at again after so long: the others have hardly moved on before."""

@@ -8,9 +8,9 @@ from typing import Protocol, Self
 
 import pyarrow as pa
 
-from perception.scene import SceneModel
-from scenarios.schema import Scenario
-from sim.sortie import Observer
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.schema import Scenario
+from sortie.sim.sortie import Observer
 
 
 class Watcher(Observer, Protocol):
@@ -20,7 +20,7 @@ class Watcher(Observer, Protocol):
 
 
 class Watchers:
-    """Tells each of them, in their order (sim.sortie.Observer), and lets go of them when the `with` ends."""
+    """Tells each of them, in their order (sortie.sim.sortie.Observer), and lets go of them when the `with` ends."""
 
     def __init__(self, watchers: Sequence[Watcher]) -> None:
         self._watchers = watchers

@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from sim.record import SortieRecord
+from sortie.sim.record import SortieRecord
 
 FEW = 3
 

@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 import simpy
 
-from fleet.agent import Agent, Platform, Task
-from fleet.battery import FleetBatteries
-from fleet.coverage import RANGE_M
-from fleet.frames import up_vector
-from fleet.motion import Motion
-from fleet.rotor import fleet_power_w
-from fleet.senses import FlightSenses, Sensed
-from perception.scene import SceneModel
-from perception.types import Capture
-from policies.contract import Disc
-from radio import Air
-from radio.topology import connectivity, linked_drones
-from scenarios.schema import Scenario
-from sim.mission import MissionPlan
-from sim.record import Recorder
+from sortie.fleet.agent import Agent, Platform, Task
+from sortie.fleet.battery import FleetBatteries
+from sortie.fleet.coverage import RANGE_M
+from sortie.fleet.frames import up_vector
+from sortie.fleet.motion import Motion
+from sortie.fleet.rotor import fleet_power_w
+from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Capture
+from sortie.policies.contract import Disc
+from sortie.radio import Air
+from sortie.radio.topology import connectivity, linked_drones
+from sortie.scenarios.schema import Scenario
+from sortie.sim.mission import MissionPlan
+from sortie.sim.record import Recorder
 
 NAN = float("nan")
 _NO_DISC, _NOWHERE = (NAN, NAN, NAN), (NAN, NAN)
@@ -220,7 +220,7 @@ class World:
     # --- what one drone knows of itself ----------------------------------------------------------
 
     def senses(self, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> _OwnSenses:
-        """The drone's own sensors (fleet.agent.Senses); without a detector, boxes are the cars in range."""
+        """The drone's own sensors (sortie.fleet.agent.Senses); without a detector, boxes are the cars in range."""
         return _OwnSenses(self, drone, count_boxes)
 
 

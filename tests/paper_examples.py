@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.geometry import CELLS, FULL
-from perception.harness.condition import Condition
-from perception.harness.contract import Exchange, Floats
-from perception.harness.measures import Region
-from perception.harness.verdict import Measured
+from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.harness.condition import Condition
+from sortie.perception.harness.contract import Exchange, Floats
+from sortie.perception.harness.measures import Region
+from sortie.perception.harness.verdict import Measured
 
 DRAWS = 400
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fleet.motion import fly
-from perception.outside.exchange import moved
-from perception.outside.writing import write_recording
-from perception.scene import SceneModel
-from scenarios.schema import Scenario
-from sim.world import route_bounds
+from sortie.fleet.motion import fly
+from sortie.perception.outside.exchange import moved
+from sortie.perception.outside.writing import write_recording
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.schema import Scenario
+from sortie.sim.world import route_bounds
 
 REACH_M = 45.0
 

@@ -50,9 +50,14 @@ def violations(source: str, path: str) -> list[str]:
     found = []
     for node in ast.walk(ast.parse(source)):
         for name in _imported(node):
-            top = name.partition(".")[0]
-            if top in MAY_IMPORT and top != room and top not in MAY_IMPORT[room]:
-                found.append((node, f"{room} must not import {top}"))
+            top, _, rest = name.partition(".")
+            other = rest.partition(".")[0]
+            if top in MAY_IMPORT:
+                found.append((node, f"import sortie.{top}, never {top} alone"))
+            if top == "sortie" and other in MAY_IMPORT and other != room and other not in MAY_IMPORT[room]:
+                found.append((node, f"{room} must not import {other}"))
+            if name == "sortie":
+                found.append((node, f"{room} must not import the public API, which stands on it"))
             if top == "tests":
                 found.append((node, f"{room} must not import tests"))
             if top in HOMES and not any(fnmatch(path, home) for home in HOMES[top]):
@@ -68,8 +73,9 @@ def _imported(node: ast.AST) -> Iterator[str]:
     """Modules that a node imports, by statement or by name, wherever it stands."""
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names)
-    elif isinstance(node, ast.ImportFrom) and node.level != 1:  # a single dot stays in the room, two leave it
-        yield from [node.module] if node.module else (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):  # relative ones are ruff's to refuse
+        named = node.module in (None, "sortie")
+        yield from (f"sortie.{alias.name}" for alias in node.names) if named else [node.module or ""]
     elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
         called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
         if called in ("import_module", "__import__", "find_spec", "importorskip") and isinstance(
@@ -90,25 +96,29 @@ def test_a_room_keeps_to_the_rules(room: str) -> None:
 
 def test_every_package_at_the_root_is_a_room() -> None:
     packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
-    assert packages == set(MAY_IMPORT)
+    assert packages == {*MAY_IMPORT, "sortie"}
+    assert {path.name: str(path.readlink()) for path in (ROOT / "sortie").iterdir() if path.is_symlink()} == {
+        room: f"../{room}" for room in MAY_IMPORT
+    }
 
 
 @pytest.mark.parametrize(
     ("path", "source", "what"),
     [
-        ("radio/rates.py", "import fleet", "radio must not import fleet"),
-        ("radio/rates.py", "from policies.contract import Disc", "radio must not import policies"),
-        ("radio/rates.py", "import perception.ap as ap", "radio must not import perception"),
-        ("policies/worked.py", "from perception import ap", "policies must not import perception"),
-        ("perception/ap.py", "from radio.air import Air", "perception must not import radio"),
-        ("scenarios/load.py", "import policies", "scenarios must not import policies"),
-        ("fleet/agent.py", "import numpy, sim.record", "fleet must not import sim"),
-        ("fleet/agent.py", "def f():\n    from sim import record", "fleet must not import sim"),
-        ("fleet/agent.py", "if TYPE_CHECKING:\n    import sim", "fleet must not import sim"),
-        ("fleet/agent.py", "from ..sim import record", "fleet must not import sim"),
-        ("fleet/agent.py", "from .. import sim", "fleet must not import sim"),
-        ("fleet/agent.py", "importlib.import_module('sim.record')", "fleet must not import sim"),
-        ("fleet/agent.py", "__import__('sim')", "fleet must not import sim"),
+        ("radio/rates.py", "import sortie.fleet", "radio must not import fleet"),
+        ("radio/rates.py", "from sortie.policies.contract import Disc", "radio must not import policies"),
+        ("radio/rates.py", "import sortie.perception.ap as ap", "radio must not import perception"),
+        ("policies/worked.py", "from sortie.perception import ap", "policies must not import perception"),
+        ("perception/ap.py", "from sortie.radio.air import Air", "perception must not import radio"),
+        ("scenarios/load.py", "import sortie.policies", "scenarios must not import policies"),
+        ("fleet/agent.py", "import numpy, sortie.sim.record", "fleet must not import sim"),
+        ("fleet/agent.py", "def f():\n    from sortie.sim import record", "fleet must not import sim"),
+        ("fleet/agent.py", "if TYPE_CHECKING:\n    import sortie.sim", "fleet must not import sim"),
+        ("fleet/agent.py", "from sortie import sim", "fleet must not import sim"),
+        ("fleet/agent.py", "from sim import record", "import sortie.sim, never sim alone"),
+        ("radio/air.py", "import sortie", "radio must not import the public API, which stands on it"),
+        ("fleet/agent.py", "importlib.import_module('sortie.sim.record')", "fleet must not import sim"),
+        ("fleet/agent.py", "__import__('sortie.sim')", "fleet must not import sim"),
         ("sim/sortie.py", "import tests.helpers", "sim must not import tests"),
         ("fleet/motion.py", "import simpy", "simpy is at home in sim/*, fleet/agent.py, radio/medium.py, radio/air.py"),
         ("policies/worked.py", "import torch", "torch is at home in perception/*"),
@@ -132,9 +142,12 @@ def test_a_planted_violation_is_found(path: str, source: str, what: str) -> None
 @pytest.mark.parametrize(
     ("path", "source"),
     [
-        ("sim/sortie.py", "import fleet, radio, policies, perception, scenarios, simpy, sim.record"),
-        ("fleet/agent.py", "import radio, policies, perception, scenarios, simpy"),
-        ("fleet/wire.py", "from .cdr import encode\nfrom . import cdr\nfrom fleet.cdr import decode"),
+        (
+            "sim/sortie.py",
+            "import sortie.fleet, sortie.radio, sortie.policies, sortie.perception, sortie.scenarios, simpy",
+        ),
+        ("fleet/agent.py", "import sortie.radio, sortie.policies, sortie.perception, sortie.scenarios, simpy"),
+        ("fleet/wire.py", "from .cdr import encode\nfrom . import cdr\nfrom sortie.fleet.cdr import decode"),
         ("perception/model.py", "import torch\nmodel.eval()\nconsole.print(x)"),
         ("perception/nets/head.py", "import torch"),
         ("radio/air.py", "import simpy, numpy, simulator, yamlish"),

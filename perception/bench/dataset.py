@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from perception.bench import manifest
-from perception.bench.difficulty import Difficulty, Layout, Split
-from perception.bench.manifest import COLUMNS, BenchmarkError
-from perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
-from perception.bev import lift
-from perception.geometry import FULL, IMAGE_PX, Geometry
-from perception.render import Renderer
-from perception.scene import SceneModel
+from sortie.perception.bench import manifest
+from sortie.perception.bench.difficulty import Difficulty, Layout, Split
+from sortie.perception.bench.manifest import COLUMNS, BenchmarkError
+from sortie.perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.bev import lift
+from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
+from sortie.perception.render import Renderer
+from sortie.perception.scene import SceneModel
 
 FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""

@@ -34,7 +34,7 @@ class Layout:
     """How a town is laid out."""
 
     styles: tuple[str, ...]
-    """Names of `perception.town.STYLES`, taken in turn."""
+    """Names of `sortie.perception.town.STYLES`, taken in turn."""
     block_m: Range
     """Distance between parallel roads."""
 

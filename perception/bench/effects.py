@@ -20,17 +20,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.ap import Matched
-from perception.bench.dataset import FORMAT, Frames, start_worker
-from perception.bench.difficulty import Difficulty
-from perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
-from perception.bev import lift
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.evaluate import evaluate
-from perception.harness.instrument import CarNetInstrument
-from perception.harness.statistics import Difference, compare
-from perception.render import Renderer
-from perception.scene import SceneModel
+from sortie.perception.ap import Matched
+from sortie.perception.bench.dataset import FORMAT, Frames, start_worker
+from sortie.perception.bench.difficulty import Difficulty
+from sortie.perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.bev import lift
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.harness.instrument import CarNetInstrument
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.perception.render import Renderer
+from sortie.perception.scene import SceneModel
 
 SEED = 7
 SCENES = 12

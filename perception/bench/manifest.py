@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.bench.difficulty import Split
+from sortie.perception.bench.difficulty import Split
 
 MANIFEST = "manifest.json"
 COLUMNS = ("images", "true_pose", "est_pose", "cars")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.bench.difficulty import DENSITIES, Difficulty, Range, Split
-from perception.types import Capture
-from scenarios.schema import Scene
-from scenarios.streams import stream
+from sortie.perception.bench.difficulty import DENSITIES, Difficulty, Range, Split
+from sortie.perception.types import Capture
+from sortie.scenarios.schema import Scene
+from sortie.scenarios.streams import stream
 
 DRONES = 5
 AREA_M = 60.0

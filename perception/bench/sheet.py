@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perception.bench.dataset import Benchmark
-from perception.bench.difficulty import Split
-from perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
-from perception.bench.visibility import SEEN, inside, visible
-from perception.bev import lift
-from perception.render import CAMERAS, Renderer
-from perception.scene import SceneModel
+from sortie.perception.bench.dataset import Benchmark
+from sortie.perception.bench.difficulty import Split
+from sortie.perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.bench.visibility import SEEN, inside, visible
+from sortie.perception.bev import lift
+from sortie.perception.render import CAMERAS, Renderer
+from sortie.perception.scene import SceneModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

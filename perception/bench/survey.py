@@ -7,11 +7,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from perception.bench.dataset import Benchmark
-from perception.bench.difficulty import Split
-from perception.bench.scenes import AREA_M, draw_captures, draw_scene
-from perception.bench.visibility import SEEN, inside, visible
-from perception.scene import SceneModel
+from sortie.perception.bench.dataset import Benchmark
+from sortie.perception.bench.difficulty import Split
+from sortie.perception.bench.scenes import AREA_M, draw_captures, draw_scene
+from sortie.perception.bench.visibility import SEEN, inside, visible
+from sortie.perception.scene import SceneModel
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.render import AXES, HALF_H, HALF_V, rotation
-from perception.scene import SceneModel
-from perception.town import Floats
-from perception.traffic import Cars
-from perception.types import Capture
+from sortie.perception.render import AXES, HALF_H, HALF_V, rotation
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import Floats
+from sortie.perception.traffic import Cars
+from sortie.perception.types import Capture
 
 _ROOF = np.array([(0.0, 0.0), (0.3, 0.3), (0.3, -0.3), (-0.3, 0.3), (-0.3, -0.3)])
 """Points on a roof, as parts of its length and width."""

@@ -1,4 +1,4 @@
-"""What age costs, and what moving late features by the known ego motion gives back: `python -m perception.fusion.age`.
+"""What age costs, and what moving late features by the known ego motion gives back: `python -m sortie.perception.fusion.age`.
 
 Five drones fly straight at a given speed. Each ego has its own features of now and its peers' of `age` ago, all cells;
 they are placed by the pose that the peer had then (compensated), or by the one it has now, as if they were fresh
@@ -15,21 +15,21 @@ import numpy as np
 import torch
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.ap import Matched, match, suppress
-from perception.bench.dataset import Benchmark
-from perception.bench.difficulty import Split
-from perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene
-from perception.bev import lift
-from perception.decode import decode
-from perception.detector import ground_truth
-from perception.fusion.base import takes_part
-from perception.harness.statistics import Difference, compare
-from perception.inference import folded
-from perception.model import CarNet
-from perception.render import Renderer
-from perception.scene import SceneModel
-from perception.types import Boxes, Capture
-from perception.warp import warp
+from sortie.perception.ap import Matched, match, suppress
+from sortie.perception.bench.dataset import Benchmark
+from sortie.perception.bench.difficulty import Split
+from sortie.perception.bench.scenes import AREA_M, DRONES, draw_captures, draw_scene
+from sortie.perception.bev import lift
+from sortie.perception.decode import decode
+from sortie.perception.detector import ground_truth
+from sortie.perception.fusion.base import takes_part
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.perception.inference import folded
+from sortie.perception.model import CarNet
+from sortie.perception.render import Renderer
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Boxes, Capture
+from sortie.perception.warp import warp
 
 AGES_S = (0.0, 0.1, 0.2, 0.5, 1.0)
 SPEED_MPS = 10.0
@@ -169,8 +169,8 @@ if __name__ == "__main__":
     import argparse
     import sys
 
-    from perception.checkpoint import load_weights
-    from perception.detector import SHIPPED_WEIGHTS
+    from sortie.perception.checkpoint import load_weights
+    from sortie.perception.detector import SHIPPED_WEIGHTS
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("weights", type=Path, nargs="?", default=SHIPPED_WEIGHTS)

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from perception.fusion.traffic import LinkBytes, features_of
+from sortie.perception.fusion.traffic import LinkBytes, features_of
 
 UnsentCells = Literal["masked", "zero"]
 Shares = Literal["features", "boxes", "nothing"]

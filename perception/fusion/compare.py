@@ -1,4 +1,4 @@
-"""The fusion methods beside each other on the same frames, with their bytes: `python -m perception.fusion.compare`."""
+"""The fusion methods beside each other on the same frames, with their bytes: `python -m sortie.perception.fusion.compare`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from perception.ap import suppress
-from perception.decode import decode
-from perception.fusion.registry import FUSIONS
-from perception.fusion.traffic import boxes_of
-from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
-from perception.harness.contract import Exchange, FleetFrames, Floats
-from perception.harness.evaluate import evaluate
-from perception.harness.instrument import CarNetInstrument
-from perception.harness.selection import link_bytes
-from perception.harness.statistics import Difference, compare
-from perception.inference import folded
-from perception.joining import NMS_IOU, Pose, Rule, Told, joined, sendable
-from perception.model import CarNet
-from perception.types import Boxes
+from sortie.perception.ap import suppress
+from sortie.perception.decode import decode
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.fusion.traffic import boxes_of
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.harness.contract import Exchange, FleetFrames, Floats
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.harness.instrument import CarNetInstrument
+from sortie.perception.harness.selection import link_bytes
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.perception.inference import folded
+from sortie.perception.joining import NMS_IOU, Pose, Rule, Told, joined, sendable
+from sortie.perception.model import CarNet
+from sortie.perception.types import Boxes
 
 TAU = 0.1
 STARVED = Condition(0.05, unsent="masked")
@@ -144,8 +144,8 @@ if __name__ == "__main__":
     import argparse
     import sys
 
-    from perception.bench.dataset import Benchmark, load_frames, make_split
-    from perception.checkpoint import load_weights
+    from sortie.perception.bench.dataset import Benchmark, load_frames, make_split
+    from sortie.perception.checkpoint import load_weights
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("weights", type=Path, nargs="+", help="weights files, one a method")

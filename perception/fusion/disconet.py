@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from perception.fusion.base import PerCell, weighted_sum
-from perception.geometry import CHANNELS
+from sortie.perception.fusion.base import PerCell, weighted_sum
+from sortie.perception.geometry import CHANNELS
 
 
 class EdgeWeights(nn.Module):

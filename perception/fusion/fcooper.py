@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.fusion.base import PerCell
+from sortie.perception.fusion.base import PerCell
 
 
 class FCooper(PerCell):

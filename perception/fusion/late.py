@@ -1,10 +1,10 @@
-"""Late fusion: every drone detects alone, and boxes are joined in the world (`perception.joining`)."""
+"""Late fusion: every drone detects alone, and boxes are joined in the world (`sortie.perception.joining`)."""
 
 from __future__ import annotations
 
-from perception.fusion.none import Alone
-from perception.fusion.traffic import LinkBytes, boxes_of
-from perception.joining import SURE
+from sortie.perception.fusion.none import Alone
+from sortie.perception.fusion.traffic import LinkBytes, boxes_of
+from sortie.perception.joining import SURE
 
 
 class Late(Alone):

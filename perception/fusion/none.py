@@ -6,8 +6,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from perception.fusion.base import Fusion, Shares
-from perception.fusion.traffic import LinkBytes
+from sortie.perception.fusion.base import Fusion, Shares
+from sortie.perception.fusion.traffic import LinkBytes
 
 
 class Alone(Fusion):

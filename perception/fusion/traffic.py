@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perception.budget import CELLS, DETECTION_BYTES, index_bytes, payload_bytes
+from sortie.perception.budget import CELLS, DETECTION_BYTES, index_bytes, payload_bytes
 
 REQUEST_BYTES = CELLS * 2
 """A request map R = 1 − C for one receiver: one float16 a cell."""

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.fusion.base import Fusion
-from perception.geometry import CHANNELS
+from sortie.perception.fusion.base import Fusion
+from sortie.perception.geometry import CHANNELS
 
 ROUNDS = 2
 MESSAGE = 40

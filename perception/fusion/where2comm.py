@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.fusion.base import PerCell, weighted_sum
-from perception.fusion.traffic import LinkBytes, features_of
-from perception.geometry import CHANNELS
+from sortie.perception.fusion.base import PerCell, weighted_sum
+from sortie.perception.fusion.traffic import LinkBytes, features_of
+from sortie.perception.geometry import CHANNELS
 
 HEADS = 4
 

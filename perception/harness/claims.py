@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from perception.harness import verdict
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.measures import (
+from sortie.perception.harness import verdict
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.measures import (
     Contrast,
     Crossover,
     Elsewhere,
@@ -29,7 +29,7 @@ from perception.harness.measures import (
     Widest,
     WrongChoice,
 )
-from perception.harness.verdict import Judgement, Measured, Paper
+from sortie.perception.harness.verdict import Judgement, Measured, Paper
 
 CURVE = (0.01, 0.02, 0.05, 0.1, 0.25, 1.0)
 BUDGETS = (0.02, 0.05, 0.1, 0.25)

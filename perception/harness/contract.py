@@ -8,14 +8,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.geometry import Geometry
-from perception.harness.condition import CellsBy, Unsent
+from sortie.perception.geometry import Geometry
+from sortie.perception.harness.condition import CellsBy, Unsent
 
 Floats = NDArray[np.float64]
 
 
 class FleetFrames(Protocol):
-    """n fleet-frames of d drones: where they were, what was there. `perception.bench.dataset.Frames` is one."""
+    """n fleet-frames of d drones: where they were, what was there. `sortie.perception.bench.dataset.Frames` is one."""
 
     @property
     def true_pose(self) -> Floats:

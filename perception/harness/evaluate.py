@@ -15,15 +15,24 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.ap import CONVENTIONS, Matched, best_first, hits, suppressed
-from perception.geometry import CELLS, Geometry
-from perception.harness import selection
-from perception.harness.condition import Condition
-from perception.harness.contract import Exchange, FleetFrames, Floats, Instrument, View
-from perception.harness.evaluation import FLOOR, NMS_IOU, Evaluation, FrameResult, Region, Settings, Store, assemble
-from perception.overlap import overlapping
-from perception.types import Boxes
-from scenarios.streams import stream
+from sortie.perception.ap import CONVENTIONS, Matched, best_first, hits, suppressed
+from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.harness import selection
+from sortie.perception.harness.condition import Condition
+from sortie.perception.harness.contract import Exchange, FleetFrames, Floats, Instrument, View
+from sortie.perception.harness.evaluation import (
+    FLOOR,
+    NMS_IOU,
+    Evaluation,
+    FrameResult,
+    Region,
+    Settings,
+    Store,
+    assemble,
+)
+from sortie.perception.overlap import overlapping
+from sortie.perception.types import Boxes
+from sortie.scenarios.streams import stream
 
 __all__ = ["FLOOR", "NMS_IOU", "REGION_M", "Evaluation", "Region", "Settings", "evaluate", "mission_target", "truth"]
 

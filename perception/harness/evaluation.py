@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from perception.ap import CONVENTIONS, Matched, average_precision
-from perception.harness.condition import Condition
+from sortie.perception.ap import CONVENTIONS, Matched, average_precision
+from sortie.perception.harness.condition import Condition
 
 Region = Literal["full", "mission", "ego"]
 Floats = NDArray[np.float64]

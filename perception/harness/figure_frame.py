@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perception.geometry import CELLS
-from perception.harness.contract import Floats
-from perception.harness.picture import Picture, to_world
-from perception.overlap import corners
-from perception.types import Boxes
+from sortie.perception.geometry import CELLS
+from sortie.perception.harness.contract import Floats
+from sortie.perception.harness.picture import Picture, to_world
+from sortie.perception.overlap import corners
+from sortie.perception.types import Boxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

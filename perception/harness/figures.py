@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perception.harness.claims import BUDGETS, CURVE
-from perception.harness.rows import INSTRUMENTS, Point, Row
-from perception.harness.verdict import Verdict
+from sortie.perception.harness.claims import BUDGETS, CURVE
+from sortie.perception.harness.rows import INSTRUMENTS, Point, Row
+from sortie.perception.harness.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from perception.harness.condition import CellsBy, Unsent
-from perception.harness.evaluation import FLOOR, Evaluation
-from perception.harness.scores import Bootstrap, By
-from perception.harness.statistics import DRAWS
+from sortie.perception.harness.condition import CellsBy, Unsent
+from sortie.perception.harness.evaluation import FLOOR, Evaluation
+from sortie.perception.harness.scores import Bootstrap, By
+from sortie.perception.harness.statistics import DRAWS
 
 TAU = 0.1
 """UAV3D's head cuts its scores there."""

@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.checkpoint import load_weights
-from perception.decode import decode
-from perception.fusion.base import PerCell
-from perception.geometry import CELLS, Geometry
-from perception.harness.condition import CellsBy
-from perception.harness.contract import Exchange, FleetFrames, Floats
-from perception.inference import folded
-from perception.model import CarNet
-from perception.warp import Support, arriving, rows, support
+from sortie.perception.checkpoint import load_weights
+from sortie.perception.decode import decode
+from sortie.perception.fusion.base import PerCell
+from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.harness.condition import CellsBy
+from sortie.perception.harness.contract import Exchange, FleetFrames, Floats
+from sortie.perception.inference import folded
+from sortie.perception.model import CarNet
+from sortie.perception.warp import Support, arriving, rows, support
 
 CPU = torch.device("cpu")
 BATCH = 5

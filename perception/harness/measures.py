@@ -13,9 +13,9 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition, Unsent
-from perception.harness.statistics import interval, p_value
-from perception.harness.verdict import Measured
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition, Unsent
+from sortie.perception.harness.statistics import interval, p_value
+from sortie.perception.harness.verdict import Measured
 
 Region = Literal["full", "mission"]
 Floats = NDArray[np.float64]

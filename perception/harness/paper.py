@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.bench.dataset import SIZES, Benchmark, Frames, load_frames, make_split
-from perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
-from perception.harness.claims import conditions
-from perception.harness.contract import FleetFrames, Instrument
-from perception.harness.evaluate import Region, evaluate
-from perception.harness.found import Asked, Found
-from perception.harness.measures import under
-from perception.render import Renderer
-from perception.scene import SceneModel
+from sortie.perception.bench.dataset import SIZES, Benchmark, Frames, load_frames, make_split
+from sortie.perception.bench.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.harness.claims import conditions
+from sortie.perception.harness.contract import FleetFrames, Instrument
+from sortie.perception.harness.evaluate import Region, evaluate
+from sortie.perception.harness.found import Asked, Found
+from sortie.perception.harness.measures import under
+from sortie.perception.render import Renderer
+from sortie.perception.scene import SceneModel
 
 
 def measure(

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.ap import suppress
-from perception.geometry import CELLS, Geometry
-from perception.harness.condition import FULL_SHARING, Condition
-from perception.harness.contract import Exchange, FleetFrames, Floats, Instrument
-from perception.harness.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
-from perception.types import Boxes
+from sortie.perception.ap import suppress
+from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.harness.condition import FULL_SHARING, Condition
+from sortie.perception.harness.contract import Exchange, FleetFrames, Floats, Instrument
+from sortie.perception.harness.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
+from sortie.perception.types import Boxes
 
 PAPER_BUDGETS = (0.25, 0.02)
 

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from perception.harness.rows import INSTRUMENTS, Row
-from perception.harness.sensitivity import Varied
-from perception.harness.verdict import Verdict
+from sortie.perception.harness.rows import INSTRUMENTS, Row
+from sortie.perception.harness.sensitivity import Varied
+from sortie.perception.harness.verdict import Verdict
 
 BEGIN, END = "<!-- paper:begin -->", "<!-- paper:end -->"
 MINUS = "−"

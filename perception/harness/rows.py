@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
-from perception.harness.claims import CLAIMS, SECTIONS, Claim, conditions
-from perception.harness.condition import Unsent
-from perception.harness.measures import Elsewhere, Level, Region, Scores
-from perception.harness.statistics import benjamini_hochberg
-from perception.harness.verdict import Measured
+from sortie.perception.harness.claims import CLAIMS, SECTIONS, Claim, conditions
+from sortie.perception.harness.condition import Unsent
+from sortie.perception.harness.measures import Elsewhere, Level, Region, Scores
+from sortie.perception.harness.statistics import benjamini_hochberg
+from sortie.perception.harness.verdict import Measured
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
 """What a cell that was not sent counts as, and the column that shows it."""

@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from perception.harness.condition import CellsBy, Condition, Unsent
-from perception.harness.evaluation import Evaluation
-from perception.harness.evaluation import Region as Evaluated
-from perception.harness.measures import Floats, Region, under
-from perception.harness.statistics import DRAWS, Ranked, rank, resamples
-from scenarios.streams import stream
+from sortie.perception.harness.condition import CellsBy, Condition, Unsent
+from sortie.perception.harness.evaluation import Evaluation
+from sortie.perception.harness.evaluation import Region as Evaluated
+from sortie.perception.harness.measures import Floats, Region, under
+from sortie.perception.harness.statistics import DRAWS, Ranked, rank, resamples
+from sortie.scenarios.streams import stream
 
 By = Literal["frame", "scene"]
 

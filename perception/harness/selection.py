@@ -9,11 +9,11 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.budget import index_bytes, payload_bytes
-from perception.geometry import CELLS as GRID
-from perception.geometry import FULL, Geometry
-from perception.harness.condition import Allocation, Condition
-from scenarios.streams import stream
+from sortie.perception.budget import index_bytes, payload_bytes
+from sortie.perception.geometry import CELLS as GRID
+from sortie.perception.geometry import FULL, Geometry
+from sortie.perception.harness.condition import Allocation, Condition
+from sortie.scenarios.streams import stream
 
 CELLS = GRID * GRID
 FOOTPRINT_M = 60.0 * math.tan(math.radians(35.0))

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from perception.harness.claims import CLAIMS, Claim
-from perception.harness.condition import Unsent
-from perception.harness.found import Disc, Found
+from sortie.perception.harness.claims import CLAIMS, Claim
+from sortie.perception.harness.condition import Unsent
+from sortie.perception.harness.found import Disc, Found
 
 TAUS = (0.01, 0.1, 0.2, 0.3, 0.5)
 DISCS: dict[Disc, str] = {"mission": "around the target", "ego": "around the ego"}

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.ap import Matched, area, average_precision
-from scenarios.streams import stream
+from sortie.perception.ap import Matched, area, average_precision
+from sortie.scenarios.streams import stream
 
 Floats = NDArray[np.float64]
 BINS = 2000

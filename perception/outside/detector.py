@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from perception import budget
-from perception.ap import suppress
-from perception.errors import InputError
-from perception.geometry import CELLS, CHANNELS, FULL, in_square
-from perception.joining import NMS_IOU, Told, joined, sendable, told
-from perception.outside.exchange import Sent, fused, load_fusion, reaching
-from perception.outside.recorded import RecordingError, open_recording
-from perception.types import Boxes, Capture, Share
-from scenarios.schema import Perception
+from sortie.perception import budget
+from sortie.perception.ap import suppress
+from sortie.perception.errors import InputError
+from sortie.perception.geometry import CELLS, CHANNELS, FULL, in_square
+from sortie.perception.joining import NMS_IOU, Told, joined, sendable, told
+from sortie.perception.outside.exchange import Sent, fused, load_fusion, reaching
+from sortie.perception.outside.recorded import RecordingError, open_recording
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Perception
 
 MAPS = ("features", "raw")
 NEAR_M = 5.0

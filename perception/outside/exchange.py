@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.geometry import CELLS, Geometry
-from perception.outside.recorded import Floats, Recording, RecordingError, cells_of
+from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.outside.recorded import Floats, Recording, RecordingError, cells_of
 
 Fuse = Callable[[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]], Any]
 """`fuse(agents, takes_part, weight)` → boxes [m, 6] in the ego's frame.
@@ -117,8 +117,8 @@ def fused(
     """
     import torch
 
-    from perception.fusion.base import takes_part
-    from perception.warp import warp
+    from sortie.perception.fusion.base import takes_part
+    from sortie.perception.warp import warp
 
     if recording.grid[1:] != (CELLS, CELLS):
         c, h, w = recording.grid

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
-from perception.harness.contract import Exchange, FleetFrames
-from perception.harness.evaluate import FLOOR, evaluate
-from perception.harness.evaluation import Evaluation
-from perception.outside.exchange import Fuse, Sent, fused, fusion_hash, load_fusion, reaching
-from perception.outside.recorded import Floats, Ints, Recording, RecordingError, open_recording
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.harness.contract import Exchange, FleetFrames
+from sortie.perception.harness.evaluate import FLOOR, evaluate
+from sortie.perception.harness.evaluation import Evaluation
+from sortie.perception.outside.exchange import Fuse, Sent, fused, fusion_hash, load_fusion, reaching
+from sortie.perception.outside.recorded import Floats, Ints, Recording, RecordingError, open_recording
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.errors import InputError
-from perception.geometry import CELLS, CHANNELS, Geometry
+from sortie.perception.errors import InputError
+from sortie.perception.geometry import CELLS, CHANNELS, Geometry
 
 FORMAT = 1
 NEEDED = ("format", "cell_m", "t_s", "pose", "boxes", "boxes_offset", "truth", "truth_offset")

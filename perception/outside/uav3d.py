@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.errors import InputError
-from perception.geometry import FULL
-from perception.outside.recorded import Floats
-from perception.outside.unpickle import UnpickleError, load_data
-from perception.outside.writing import write_recording
+from sortie.perception.errors import InputError
+from sortie.perception.geometry import FULL
+from sortie.perception.outside.recorded import Floats
+from sortie.perception.outside.unpickle import UnpickleError, load_data
+from sortie.perception.outside.writing import write_recording
 
 UAVS = 5
 SIDES = ("FRONT", "BACK", "LEFT", "RIGHT", "BOTTOM")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.outside.recorded import FORMAT, Floats, RecordingError, checked, from_zarr
+from sortie.perception.outside.recorded import FORMAT, Floats, RecordingError, checked, from_zarr
 
 
 def write_recording(

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perception.harness.figures import INK, PAPER, figure_of, legend_below, save
-from perception.study.measure import Row
-from perception.study.plan import Plan
-from perception.study.report import UNSENT, Found, View
+from sortie.perception.harness.figures import INK, PAPER, figure_of, legend_below, save
+from sortie.perception.study.measure import Row
+from sortie.perception.study.plan import Plan
+from sortie.perception.study.report import UNSENT, Found, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

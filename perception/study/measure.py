@@ -9,14 +9,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from perception.ap import Matched
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.evaluation import Evaluation
-from perception.harness.measures import POINTS, Contrast, Level, Oracle
-from perception.harness.scores import Bootstrap
-from perception.harness.statistics import interval
-from perception.harness.verdict import Measured as Measurement
-from perception.study.plan import Measured, Tau, Variant
+from sortie.perception.ap import Matched
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.evaluation import Evaluation
+from sortie.perception.harness.measures import POINTS, Contrast, Level, Oracle
+from sortie.perception.harness.scores import Bootstrap
+from sortie.perception.harness.statistics import interval
+from sortie.perception.harness.verdict import Measured as Measurement
+from sortie.perception.study.plan import Measured, Tau, Variant
 
 MODEL_TAU = 0.1
 

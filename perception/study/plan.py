@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from perception.bench.difficulty import Density
-from perception.harness.condition import CellsBy, Condition, Unsent
-from perception.training.recipe import Recipe
+from sortie.perception.bench.difficulty import Density
+from sortie.perception.harness.condition import CellsBy, Condition, Unsent
+from sortie.perception.training.recipe import Recipe
 
 PLAN = Path(__file__).parent / "variants.toml"
 Tau = float | str

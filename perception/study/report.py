@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from perception.bench.dataset import SIZES
-from perception.study.measure import MODEL_TAU, Row
-from perception.study.plan import Plan
+from sortie.perception.bench.dataset import SIZES
+from sortie.perception.study.measure import MODEL_TAU, Row
+from sortie.perception.study.plan import Plan
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
 MINUS = "−"

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.bench.dataset import Benchmark, load_frames, make_split
-from perception.bench.difficulty import Density, Difficulty
-from perception.checkpoint import load_weights
-from perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
-from perception.harness.evaluate import evaluate
-from perception.harness.evaluation import FLOOR, Evaluation
-from perception.harness.instrument import CarNetInstrument
-from perception.harness.measures import under
-from perception.model import ModelConfig
-from perception.study.measure import F1, Row, optimal_f1, rows_of
-from perception.study.plan import Measured, Plan, Variant
-from perception.training.train import TrainResult, train
+from sortie.perception.bench.dataset import Benchmark, load_frames, make_split
+from sortie.perception.bench.difficulty import Density, Difficulty
+from sortie.perception.checkpoint import load_weights
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.harness.evaluation import FLOOR, Evaluation
+from sortie.perception.harness.instrument import CarNetInstrument
+from sortie.perception.harness.measures import under
+from sortie.perception.model import ModelConfig
+from sortie.perception.study.measure import F1, Row, optimal_f1, rows_of
+from sortie.perception.study.plan import Measured, Plan, Variant
+from sortie.perception.training.train import TrainResult, train
 
 log_to_nowhere = logging.getLogger("sortie.study")
 Progress = Callable[[str, int, int], None]

@@ -13,11 +13,20 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.detector import TorchDetector
-from perception.scene import SceneModel
-from perception.surrogate.plan import THRESHOLD, Job, Split, draw_scene, draw_target, moment, scene_model, scene_seed
-from perception.types import Boxes, Capture
-from scenarios.schema import Perception
+from sortie.perception.detector import TorchDetector
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.plan import (
+    THRESHOLD,
+    Job,
+    Split,
+    draw_scene,
+    draw_target,
+    moment,
+    scene_model,
+    scene_seed,
+)
+from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.schema import Perception
 
 FLOOR = 0.02
 """Boxes are kept down to this score: what the surrogate knows of weaker ones is that they are."""

@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from perception import budget
-from perception.errors import InputError
-from perception.geometry import FULL
-from perception.joining import Heard, joined_many, told
-from perception.scene import SceneModel
-from perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
-from perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
-from perception.surrogate.luck import Drawn, Luck
-from perception.surrogate.mirages import Mirages
-from perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
-from perception.surrogate.words import mixed, uniform
-from perception.town import Floats
-from perception.types import Boxes, Capture, Share
-from scenarios.schema import Perception
+from sortie.perception import budget
+from sortie.perception.errors import InputError
+from sortie.perception.geometry import FULL
+from sortie.perception.joining import Heard, joined_many, told
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
+from sortie.perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
+from sortie.perception.surrogate.luck import Drawn, Luck
+from sortie.perception.surrogate.mirages import Mirages
+from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
+from sortie.perception.surrogate.words import mixed, uniform
+from sortie.perception.town import Floats
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Perception
 
 Job = tuple[Capture, Sequence[Share]]
 LATE = ("detections", "tracks")

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from perception import budget
-from perception.geometry import CELLS, FULL
-from perception.surrogate.features import LOOK_COVARIATES, Fleet, Ints, Looks, beside, square
-from perception.town import Floats
-from perception.types import Capture, Share
-from scenarios.schema import Scene
+from sortie.perception import budget
+from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.surrogate.features import LOOK_COVARIATES, Fleet, Ints, Looks, beside, square
+from sortie.perception.town import Floats
+from sortie.perception.types import Capture, Share
+from sortie.scenarios.schema import Scene
 
 MAPS = ("features", "raw")
 _ALL = slice(None)

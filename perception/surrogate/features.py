@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.geometry import FULL
-from perception.scene import SceneModel
-from perception.surrogate.sight import HeightField, Kerbs, next_of
-from perception.town import Floats
-from perception.traffic import TARGET_COLOUR, TARGET_SIZE_M
-from perception.types import Capture
+from sortie.perception.geometry import FULL
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.sight import HeightField, Kerbs, next_of
+from sortie.perception.town import Floats
+from sortie.perception.traffic import TARGET_COLOUR, TARGET_SIZE_M
+from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]
 HALF_H = float(np.tan(np.radians(35.0)))

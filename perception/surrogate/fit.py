@@ -14,10 +14,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import expit, logit, ndtr, ndtri
 from torch import Tensor
 
-from perception.overlap import iou_pairs
-from perception.surrogate.exchange import ALARM_COVARIATES
-from perception.surrogate.features import axes, on_axes
-from perception.surrogate.model import (
+from sortie.perception.overlap import iou_pairs
+from sortie.perception.surrogate.exchange import ALARM_COVARIATES
+from sortie.perception.surrogate.features import axes, on_axes
+from sortie.perception.surrogate.model import (
     BAND,
     KINDS,
     NETS,
@@ -30,8 +30,8 @@ from perception.surrogate.model import (
     rank_covariates,
     vague,
 )
-from perception.surrogate.rows import Rows
-from scenarios.streams import stream
+from sortie.perception.surrogate.rows import Rows
+from sortie.scenarios.streams import stream
 
 Array = NDArray[Any]
 HIDDEN = {"look": (32, 32), "rank": (16,), "rank_norm": (16,), "find": (32, 24), "place": (48, 32), "alarms": (24,)}

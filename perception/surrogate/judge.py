@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from perception.ap import Matched, average_precision, match
-from perception.harness.statistics import compare, interval, rank, resamples
-from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.model import Parameters
-from perception.surrogate.plan import THRESHOLD, Disc, Job, scene_model
-from scenarios.schema import Perception
+from sortie.perception.ap import Matched, average_precision, match
+from sortie.perception.harness.statistics import compare, interval, rank, resamples
+from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.model import Parameters
+from sortie.perception.surrogate.plan import THRESHOLD, Disc, Job, scene_model
+from sortie.scenarios.schema import Perception
 
 WITHIN = 0.02
 """The error of AP that a calibration is to keep."""

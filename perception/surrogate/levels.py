@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.ap import Matched, average_precision, match
-from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.features import square
-from perception.surrogate.model import FEW, KINDS, SQUARE, WHOLE, Parameters
-from perception.surrogate.plan import Job
-from perception.surrogate.together import towns_of
-from perception.types import Boxes
-from scenarios.schema import Perception
+from sortie.perception.ap import Matched, average_precision, match
+from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.features import square
+from sortie.perception.surrogate.model import FEW, KINDS, SQUARE, WHOLE, Parameters
+from sortie.perception.surrogate.plan import Job
+from sortie.perception.surrogate.together import towns_of
+from sortie.perception.types import Boxes
+from sortie.scenarios.schema import Perception
 
 Floats = NDArray[np.float64]
 

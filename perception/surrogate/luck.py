@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from perception.surrogate.features import Looks
-from perception.surrogate.words import GAMMA, Words, mixed, uniform
-from perception.types import Capture
-from scenarios.streams import stream
+from sortie.perception.surrogate.features import Looks
+from sortie.perception.surrogate.words import GAMMA, Words, mixed, uniform
+from sortie.perception.types import Capture
+from sortie.scenarios.streams import stream
 
 BANDS, ALARMS = 8, 24
 """The most bands of scores, and the most false alarms of one that a moment can have."""

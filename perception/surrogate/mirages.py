@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.geometry import FULL, in_square
-from perception.surrogate.features import Fleet
-from perception.surrogate.words import GAMMA, Words, mixed, uniform
-from perception.town import Floats
-from scenarios.streams import stream
+from sortie.perception.geometry import FULL, in_square
+from sortie.perception.surrogate.features import Fleet
+from sortie.perception.surrogate.words import GAMMA, Words, mixed, uniform
+from sortie.perception.town import Floats
+from sortie.scenarios.streams import stream
 
 TILE_M = 25.6
 THINGS = 6

@@ -23,11 +23,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
-from perception.errors import InputError
-from perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
-from perception.surrogate.features import LOOK_COVARIATES, beside
-from perception.surrogate.luck import BANDS
-from perception.town import Floats
+from sortie.perception.errors import InputError
+from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
+from sortie.perception.surrogate.features import LOOK_COVARIATES, beside
+from sortie.perception.surrogate.luck import BANDS
+from sortie.perception.town import Floats
 
 Singles = NDArray[np.float32]
 FORMAT = 6

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from perception.joining import Rule
-from perception.scene import SceneModel
-from perception.traffic import TargetPath
-from perception.types import Capture, Share
-from scenarios.schema import Scene, Target
-from scenarios.streams import stream
+from sortie.perception.joining import Rule
+from sortie.perception.scene import SceneModel
+from sortie.perception.traffic import TargetPath
+from sortie.perception.types import Capture, Share
+from sortie.scenarios.schema import Scene, Target
+from sortie.scenarios.streams import stream
 
 Split = Literal["fit", "held-out"]
 SPLITS: dict[Split, int] = {"fit": 1, "held-out": 2}

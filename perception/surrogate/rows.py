@@ -8,13 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception import budget
-from perception.surrogate.collect import Asked, captures_of
-from perception.surrogate.exchange import Exchange, Pairs, alarm_covariates, cell_of, covariates, mean_shift, pair
-from perception.surrogate.features import Eyes, Fleet, Looks
-from perception.surrogate.plan import scene_model
-from perception.town import Floats
-from perception.types import Boxes
+from sortie.perception import budget
+from sortie.perception.surrogate.collect import Asked, captures_of
+from sortie.perception.surrogate.exchange import (
+    Exchange,
+    Pairs,
+    alarm_covariates,
+    cell_of,
+    covariates,
+    mean_shift,
+    pair,
+)
+from sortie.perception.surrogate.features import Eyes, Fleet, Looks
+from sortie.perception.surrogate.plan import scene_model
+from sortie.perception.town import Floats
+from sortie.perception.types import Boxes
 
 REACH_M = 2.5
 """A box within this of a car is of that car."""

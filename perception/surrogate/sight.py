@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from perception.scene import SceneModel
-from perception.town import Floats, shadow_m
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import Floats, shadow_m
 
 RES_M = 0.8
 STEP_M = 1.0

@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from perception.ap import Matched, average_precision, match
-from perception.geometry import in_square
-from perception.joining import NMS_IOU, Rule, Told, joined
-from perception.overlap import iou_pairs, near_pairs
-from perception.scene import SceneModel
-from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.features import Eyes, Fleet
-from perception.surrogate.mirages import in_common
-from perception.surrogate.model import Parameters
-from perception.surrogate.plan import scene_model
-from perception.surrogate.rows import claim
-from perception.types import Boxes
-from scenarios.schema import Perception
+from sortie.perception.ap import Matched, average_precision, match
+from sortie.perception.geometry import in_square
+from sortie.perception.joining import NMS_IOU, Rule, Told, joined
+from sortie.perception.overlap import iou_pairs, near_pairs
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.features import Eyes, Fleet
+from sortie.perception.surrogate.mirages import in_common
+from sortie.perception.surrogate.model import Parameters
+from sortie.perception.surrogate.plan import scene_model
+from sortie.perception.surrogate.rows import claim
+from sortie.perception.types import Boxes
+from sortie.scenarios.schema import Perception
 
 Change = Callable[[Parameters, float], Parameters]
 

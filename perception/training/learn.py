@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.bench.dataset import Frames
-from perception.bench.scenes import DRONES
-from perception.decode import REFERENCE_SIZE_M
-from perception.fusion.base import UnsentCells, takes_part
-from perception.geometry import CELLS, FULL, HEAD_PX, Geometry
-from perception.model import CarNet
-from perception.training.recipe import Recipe
-from perception.warp import warp
-from scenarios.streams import stream
+from sortie.perception.bench.dataset import Frames
+from sortie.perception.bench.scenes import DRONES
+from sortie.perception.decode import REFERENCE_SIZE_M
+from sortie.perception.fusion.base import UnsentCells, takes_part
+from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry
+from sortie.perception.model import CarNet
+from sortie.perception.training.recipe import Recipe
+from sortie.perception.warp import warp
+from sortie.scenarios.streams import stream
 
 SHARDS = 2
 SHARD_FRAMES = 2

@@ -23,14 +23,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perception.bench.dataset import Benchmark, Frames, load_frames, make_split
-from perception.checkpoint import load_weights, read_config
-from perception.harness.statistics import Difference
-from perception.model import CarNet, ModelConfig
-from perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
-from perception.training.recipe import PEAK_LR, Recipe, benchmark_root
-from perception.training.validation import history, publish, validate, validate_all
-from scenarios.streams import stream
+from sortie.perception.bench.dataset import Benchmark, Frames, load_frames, make_split
+from sortie.perception.checkpoint import load_weights, read_config
+from sortie.perception.harness.statistics import Difference
+from sortie.perception.model import CarNet, ModelConfig
+from sortie.perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
+from sortie.perception.training.recipe import PEAK_LR, Recipe, benchmark_root
+from sortie.perception.training.validation import history, publish, validate, validate_all
+from sortie.scenarios.streams import stream
 
 CHECK_STEPS, CHECK_FRAMES, CHECK_EGOS = 100, 12, 2
 """Validation AP is looked at every so many steps, on so many frames with so many egos each."""

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.bench.dataset import SIZES, Benchmark, Frames
-from perception.checkpoint import read_facts, save_weights
-from perception.harness.condition import FULL_SHARING, SINGLE
-from perception.harness.evaluate import evaluate
-from perception.harness.instrument import CarNetInstrument
-from perception.harness.statistics import Difference, compare
-from perception.model import CarNet
-from perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
-from perception.training.recipe import command, of_benchmark
+from sortie.perception.bench.dataset import SIZES, Benchmark, Frames
+from sortie.perception.checkpoint import read_facts, save_weights
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.harness.instrument import CarNetInstrument
+from sortie.perception.harness.statistics import Difference, compare
+from sortie.perception.model import CarNet
+from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
+from sortie.perception.training.recipe import command, of_benchmark
 
 TAU = 0.1
 """The score below which boxes are dropped: the schema's default, and UAV3D's own head's."""

@@ -1,6 +1,6 @@
 """Prior sharing methods as policies: each is one file here and one line in `METHODS`.
 
-A method reads the context that the paper's table says it reads and no more (`policies.axes` watches it), and takes
+A method reads the context that the paper's table says it reads and no more (`sortie.policies.axes` watches it), and takes
 everything else as full sharing has it. What it learned in a network stands in for by its rule, which its file tells;
 fusions of their own are `perception.fusion`.
 """
@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from policies.contract import Directive
-from policies.prior.disconet import disconet
-from policies.prior.fixed_compression import fixed_compression
-from policies.prior.hydracollab import hydracollab
-from policies.prior.syncnet import syncnet
-from policies.prior.v2vnet import v2vnet
-from policies.prior.when2com import MATCH_BYTES, when2com
-from policies.prior.where2comm import request_bytes, where2comm
-from policies.prior.who2com import who2com
+from sortie.policies.contract import Directive
+from sortie.policies.prior.disconet import disconet
+from sortie.policies.prior.fixed_compression import fixed_compression
+from sortie.policies.prior.hydracollab import hydracollab
+from sortie.policies.prior.syncnet import syncnet
+from sortie.policies.prior.v2vnet import v2vnet
+from sortie.policies.prior.when2com import MATCH_BYTES, when2com
+from sortie.policies.prior.where2comm import request_bytes, where2comm
+from sortie.policies.prior.who2com import who2com
 
 
 def _none(params: Mapping[str, object]) -> int:

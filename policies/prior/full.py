@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from policies.contract import Directive, Representation
+from sortie.policies.contract import Directive, Representation
 
 RATE_HZ = 10.0
 

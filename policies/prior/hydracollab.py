@@ -7,9 +7,9 @@ what the chosen rung is about: what both see, or what only the sender does.
 
 from __future__ import annotations
 
-from policies.contract import Directive, FleetView, Representation
-from policies.coverage import centre_cell, disc_around, seen_well
-from policies.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.coverage import centre_cell, disc_around, seen_well
+from sortie.policies.prior.full import full_sharing
 
 AGREEMENT = 0.3
 """Shared over joint cells; two footprints of 42 m agree this far at about 40 m."""

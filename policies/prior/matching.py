@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from policies.contract import FleetView
-from policies.coverage import answered, seen_well
+from sortie.policies.contract import FleetView
+from sortie.policies.coverage import answered, seen_well
 
 
 def scores_for(view: FleetView, receiver: int) -> dict[int, float]:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from math import exp
 
-from policies.contract import Directive, FleetView
-from policies.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.prior.full import full_sharing
 
 MAP_MEGABITS = 4096 * 80 * 2 * 8e-6
 """A full map."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from policies.contract import Directive, FleetView
-from policies.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.prior.full import full_sharing
 
 
 def v2vnet(view: FleetView, *, rho: float = 1.0) -> list[Directive]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from math import exp
 
-from policies.contract import Directive, FleetView, nothing
-from policies.prior.full import full_sharing
-from policies.prior.matching import scores_for
+from sortie.policies.contract import Directive, FleetView, nothing
+from sortie.policies.prior.full import full_sharing
+from sortie.policies.prior.matching import scores_for
 
 KEPT_ABOVE = 0.2
 """The attention above which a link is kept when the method is tested."""

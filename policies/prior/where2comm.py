@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from policies.contract import Directive, FleetView
-from policies.coverage import centre_cell, disc_around, seen_well
-from policies.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.coverage import centre_cell, disc_around, seen_well
+from sortie.policies.prior.full import full_sharing
 
 REQUEST_MAP_BYTES = 4096 * 2
-"""R = 1 − C as one float16 a feature cell (`perception.fusion.traffic`)."""
+"""R = 1 − C as one float16 a feature cell (`sortie.perception.fusion.traffic`)."""
 
 
 def where2comm(view: FleetView, *, rho: float = 1.0, rounds: int = 1) -> list[Directive]:

@@ -6,9 +6,9 @@ somebody always sends.
 
 from __future__ import annotations
 
-from policies.contract import Directive, FleetView, nothing
-from policies.prior.full import full_sharing
-from policies.prior.matching import scores_for
+from sortie.policies.contract import Directive, FleetView, nothing
+from sortie.policies.prior.full import full_sharing
+from sortie.policies.prior.matching import scores_for
 
 _IDS = 256
 

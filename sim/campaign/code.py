@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from sim.sortie import VERSION
+from sortie.sim.sortie import VERSION
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 ROOMS = ("scenarios", "radio", "policies", "perception", "fleet", "sim")
@@ -16,7 +16,7 @@ SUFFIXES = (".py", ".json", ".safetensors")
 """Sources, and what is learned and shipped beside them."""
 LIBRARIES = ("numpy", "scipy", "simpy", "networkx", "numba", "torch")
 LOOKS = (
-    "sim/__main__.py", "sim/cli/*", "sim/playback/*", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py",
+    "sim/cli/*", "sim/playback/*", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py",
     "sim/expect.py", "sim/golden.py", "sim/compare.py", "sim/paper.py", "sim/campaign/*.py", "perception/study/*",
     "scenarios/library/*", "scenarios/schema.json",
 )  # fmt: skip

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.campaign.rows import Rows, sign
-from sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
+from sortie.sim.campaign.rows import Rows, sign
+from sortie.sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from sim.campaign.engine import Engine
-from sim.campaign.plan import Plan
-from sim.campaign.statistics import Mean, t_interval
-from sim.campaign.store import Store
-from sim.campaign.work import Task
+from sortie.sim.campaign.engine import Engine
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.statistics import Mean, t_interval
+from sortie.sim.campaign.store import Store
+from sortie.sim.campaign.work import Task
 
 
 @dataclass(frozen=True, slots=True)

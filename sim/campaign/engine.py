@@ -18,8 +18,8 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
-from sim.campaign.work import Result, Task, fly_batch, task_key
-from sim.folders import RunError
+from sortie.sim.campaign.work import Result, Task, fly_batch, task_key
+from sortie.sim.folders import RunError
 
 BATCH_S = 1.0
 """A task of the engine is about this long, so that its overhead of some milliseconds is below a hundredth."""

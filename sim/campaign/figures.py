@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sim.campaign.rows import Rows, is_accuracy
-from sim.campaign.statistics import estimate
+from sortie.sim.campaign.rows import Rows, is_accuracy
+from sortie.sim.campaign.statistics import estimate
 
 MAX_METRICS, MAX_FIELDS = 8, 6
 APART = 0.012

@@ -18,10 +18,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from scenarios.campaign import Choice, Column, Grid
-from sim.campaign.plan import FORMAT, Plan
-from sim.campaign.work import Result
-from sim.folders import RunError
+from sortie.scenarios.campaign import Choice, Column, Grid
+from sortie.sim.campaign.plan import FORMAT, Plan
+from sortie.sim.campaign.work import Result
+from sortie.sim.folders import RunError
 
 MANIFEST, RUNS, JOURNAL = "campaign.json", "runs", "journal"
 FIXED: dict[str, pa.DataType] = {

@@ -17,24 +17,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perception.surrogate.model import SHIPPED
-from policies.contract import PolicyError
-from policies.registry import resolve
-from scenarios.campaign import PARAMS, Campaign
-from scenarios.files import FIELDS, found_beside, named_files, placed, with_files
-from scenarios.load import loads
-from scenarios.load_campaign import Study, as_node, extremes
-from scenarios.nodes import ScenarioError, assign, plain
-from scenarios.schema import Perception, Scenario
-from scenarios.traces import located
-from sim.campaign.code import code_version, file_digest
-from sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
-from sim.campaign.work import task_key
-from sim.folders import RunError
-from sim.named import policy_overrides
-from sim.outcome_fields import check_number, open_keys
-from sim.pilot import named
-from sim.sortie import run_sortie
+from sortie.perception.surrogate.model import SHIPPED
+from sortie.policies.contract import PolicyError
+from sortie.policies.registry import resolve
+from sortie.scenarios.campaign import PARAMS, Campaign
+from sortie.scenarios.files import FIELDS, found_beside, named_files, placed, with_files
+from sortie.scenarios.load import loads
+from sortie.scenarios.load_campaign import Study, as_node, extremes
+from sortie.scenarios.nodes import ScenarioError, assign, plain
+from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.traces import located
+from sortie.sim.campaign.code import code_version, file_digest
+from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
+from sortie.sim.campaign.work import task_key
+from sortie.sim.folders import RunError
+from sortie.sim.named import policy_overrides
+from sortie.sim.outcome_fields import check_number, open_keys
+from sortie.sim.pilot import named
+from sortie.sim.sortie import run_sortie
 
 FORMAT = 1
 

@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sim.campaign.parts import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
-from sim.campaign.plan import Plan
-from sim.folders import RunError
+from sortie.sim.campaign.parts import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.folders import RunError
 
 Floats = NDArray[np.float64]
 BINS = 4

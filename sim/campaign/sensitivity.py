@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.campaign.rows import Rows
-from sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
-from sim.campaign.statistics import Floats
-from sim.folders import RunError
+from sortie.sim.campaign.rows import Rows
+from sortie.sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
+from sortie.sim.campaign.statistics import Floats
+from sortie.sim.folders import RunError
 
 COLUMNS = {
     "morris": ("μ*", "95 % of μ*", "σ"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.campaign import (
+from sortie.scenarios.campaign import (
     SAMPLED,
     Campaign,
     Choice,
@@ -24,8 +24,8 @@ from scenarios.campaign import (
     Triangular,
     Uniform,
 )
-from scenarios.load_campaign import whole
-from scenarios.streams import stream
+from sortie.scenarios.load_campaign import whole
+from sortie.scenarios.streams import stream
 
 Floats = NDArray[np.float64]
 MORRIS_LEVELS = 4

@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sim.campaign.parts import (
+from sortie.sim.campaign.parts import (
     JOURNAL,
     MANIFEST,
     RUNS,
@@ -31,9 +31,9 @@ from sim.campaign.parts import (
     schema_of,
     shards,
 )
-from sim.campaign.plan import Plan
-from sim.campaign.work import Result
-from sim.folders import RunError, ensure_folder, partial_file, sync_folder, write_durably
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.work import Result
+from sortie.sim.folders import RunError, ensure_folder, partial_file, sync_folder, write_durably
 
 LOCK = ".lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

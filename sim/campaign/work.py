@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from perception.memory import keep_freed
-from scenarios.schema import Scenario
-from sim.campaign.code import code_version, file_digest
-from sim.expect import metric
-from sim.folders import RunError
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.perception.memory import keep_freed
+from sortie.scenarios.schema import Scenario
+from sortie.sim.campaign.code import code_version, file_digest
+from sortie.sim.expect import metric
+from sortie.sim.folders import RunError
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 Task = tuple[int, str]
 """A run's number and its task."""

@@ -10,13 +10,13 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from fleet.motion import MotionError
-from fleet.wire import DescriptorTooLarge
-from perception.errors import InputError
-from policies.contract import PolicyError
-from scenarios.load import ScenarioError
-from scenarios.traces import TraceError
-from sim.cli import (
+from sortie.fleet.motion import MotionError
+from sortie.fleet.wire import DescriptorTooLarge
+from sortie.perception.errors import InputError
+from sortie.policies.contract import PolicyError
+from sortie.scenarios.load import ScenarioError
+from sortie.scenarios.traces import TraceError
+from sortie.sim.cli import (
     bench,
     calibrate,
     campaign,
@@ -36,9 +36,9 @@ from sim.cli import (
     verify,
     view,
 )
-from sim.console import err, out
-from sim.folders import RunError
-from sim.sortie import VERSION
+from sortie.sim.console import err, out
+from sortie.sim.folders import RunError
+from sortie.sim.sortie import VERSION
 
 
 class _Commands(TyperGroup):
@@ -78,7 +78,7 @@ USER_ERRORS = (ScenarioError, PolicyError, MotionError, TraceError, DescriptorTo
 
 
 def main() -> None:
-    """The `sortie` command, once it is imported (sim.__main__)."""
+    """The `sortie` command, once it is imported (sortie.__main__)."""
     try:
         app()
     except USER_ERRORS as error:

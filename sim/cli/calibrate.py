@@ -10,15 +10,15 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
-from policies.registry import resolve
-from scenarios.load import load, load_contexts
-from sim.console import out, stages, user_errors
-from sim.folders import ensure_files
-from sim.in_flight import REGIONS, Level, flights, means
-from sim.tables import points
+from sortie.policies.registry import resolve
+from sortie.scenarios.load import load, load_contexts
+from sortie.sim.console import out, stages, user_errors
+from sortie.sim.folders import ensure_files
+from sortie.sim.in_flight import REGIONS, Level, flights, means
+from sortie.sim.tables import points
 
 if TYPE_CHECKING:
-    from perception.surrogate.judge import Verdict
+    from sortie.perception.surrogate.judge import Verdict
 
 
 def calibrate(
@@ -41,7 +41,7 @@ def calibrate(
     towns: Annotated[int, typer.Option(help="In how many towns each of them is flown.", min=1, max=1000)] = 1,
 ) -> None:
     """Fit the surrogate to the torch detector's own runs and judge it on held-out scenes; goes on where it was cut off."""
-    from perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
+    from sortie.perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
 
     chosen = [p.strip() for p in policies.split(",")]
     with user_errors():
@@ -69,7 +69,7 @@ def calibrate(
 
 def _tell(verdict: Verdict, out_file: Path) -> None:
     """Levels, orders, and where they are kept."""
-    from perception.surrogate.judge import WITHIN
+    from sortie.perception.surrogate.judge import WITHIN
 
     table = Table("condition", "torch", "surrogate", "error", title="AP@0.5 on held-out scenes")
     for v in verdict.levels:

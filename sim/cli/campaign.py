@@ -14,11 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bar
 from typer.core import TyperGroup
 
-from sim.console import err, out, user_errors
+from sortie.sim.console import err, out, user_errors
 
 if TYPE_CHECKING:
-    from scenarios.schema import Scenario
-    from sim.campaign.drive import Progress
+    from sortie.scenarios.schema import Scenario
+    from sortie.sim.campaign.drive import Progress
 
 
 class _RunIsMeant(TyperGroup):
@@ -52,12 +52,12 @@ def run(
     """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
     folder = out_dir
     try:
-        from scenarios.load_campaign import load_campaign
-        from sim.campaign.drive import run_campaign
-        from sim.campaign.engine import open_engine
-        from sim.campaign.plan import make_plan
-        from sim.campaign.store import ensure_usable
-        from sim.folders import RunError
+        from sortie.scenarios.load_campaign import load_campaign
+        from sortie.sim.campaign.drive import run_campaign
+        from sortie.sim.campaign.engine import open_engine
+        from sortie.sim.campaign.plan import make_plan
+        from sortie.sim.campaign.store import ensure_usable
+        from sortie.sim.folders import RunError
 
         if scheduler is not None and workers is not None:
             raise RunError("--workers and --scheduler: name one of them")
@@ -86,7 +86,7 @@ def run(
 def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
     """Write report.md and its figures from what is finished."""
     with user_errors():
-        from sim.campaign.report import write_report
+        from sortie.sim.campaign.report import write_report
 
         path = write_report(folder)
     out.print(f"told in [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
@@ -98,11 +98,11 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     Raises:
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
-    from sim.campaign.code import code_version
-    from sim.campaign.parts import read_plan
-    from sim.campaign.rows import find_row
-    from sim.campaign.work import unpack
-    from sim.folders import RunError
+    from sortie.sim.campaign.code import code_version
+    from sortie.sim.campaign.parts import read_plan
+    from sortie.sim.campaign.rows import find_row
+    from sortie.sim.campaign.work import unpack
+    from sortie.sim.folders import RunError
 
     if folder is None or run is None:
         raise RunError("--from-campaign DIR and --run ID go together")

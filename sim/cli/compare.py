@@ -8,17 +8,17 @@ from typing import Annotated
 
 import typer
 
-from policies.contract import PolicyError
-from policies.registry import POLICIES
-from policies.registry import own_fusion as own_fusion_of
-from scenarios.load import load_contexts
-from scenarios.schema import Scenario
-from sim import tables
-from sim.cli.contexts import compare_contexts, refuse
-from sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
-from sim.compare import compare as compare_policies
-from sim.console import bars, out
-from sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+from sortie.policies.contract import PolicyError
+from sortie.policies.registry import POLICIES
+from sortie.policies.registry import own_fusion as own_fusion_of
+from sortie.scenarios.load import load_contexts
+from sortie.scenarios.schema import Scenario
+from sortie.sim import tables
+from sortie.sim.cli.contexts import compare_contexts, refuse
+from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
+from sortie.sim.compare import compare as compare_policies
+from sortie.sim.console import bars, out
+from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 
 
 def compare(
@@ -69,7 +69,7 @@ def compare(
         put_between(readme, section, tables.COMPARE_BEGIN, tables.COMPARE_END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
-        from sim.playback.recording import save_comparison
+        from sortie.sim.playback.recording import save_comparison
 
         save_comparison([(r.policy, r.record) for r in rows], recording)
         out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)

@@ -13,15 +13,15 @@ import typer
 from rich.box import SIMPLE
 from rich.table import Table
 
-from perception.detectors import make_detector
-from policies.adaptive import ARMS
-from policies.registry import resolve
-from scenarios.contexts import Contexts
-from sim.console import bars, out
-from sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
-from sim.folders import RunError, ensure_files, write_text
-from sim.in_flight import torch_answers
-from sim.tables import number, points, size
+from sortie.perception.detectors import make_detector
+from sortie.policies.adaptive import ARMS
+from sortie.policies.registry import resolve
+from sortie.scenarios.contexts import Contexts
+from sortie.sim.console import bars, out
+from sortie.sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
+from sortie.sim.folders import RunError, ensure_files, write_text
+from sortie.sim.in_flight import torch_answers
+from sortie.sim.tables import number, points, size
 
 
 def refuse(options: Mapping[str, object]) -> None:
@@ -121,7 +121,7 @@ def learn(
     ] = Path("runs/learned.json"),
 ) -> None:
     """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""
-    from sim.learn import BUDGETS, fly_lessons, gains, save, thresholds
+    from sortie.sim.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     ensure_files(out_file)
     with bars() as bar:

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from sim import rundir, tables
-from sim.cli.campaign import again
-from sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
-from sim.cli.view import view
-from sim.console import bars, out
-from sim.folders import RunError
-from sim.sortie import run_sortie
-from sim.watchers import Watcher, Watchers
+from sortie.sim import rundir, tables
+from sortie.sim.cli.campaign import again
+from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
+from sortie.sim.cli.view import view
+from sortie.sim.console import bars, out
+from sortie.sim.folders import RunError
+from sortie.sim.sortie import run_sortie
+from sortie.sim.watchers import Watcher, Watchers
 
 
 def fly(
@@ -63,7 +63,7 @@ def fly(
         record = run_sortie(flown, None, seed, replication=number, progress=ticker, observer=watchers or None)
 
     def save_recording(folder: Path) -> None:
-        from sim.playback.recording import save_rrd
+        from sortie.sim.playback.recording import save_rrd
 
         save_rrd(record, folder / rundir.RECORDING)
 
@@ -87,11 +87,11 @@ def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) ->
         raise RunError("--mavlink-key without --mavlink: there is nothing to sign")
     watchers: list[Watcher] = []
     if live:
-        from sim.playback.viewer import LiveViewer
+        from sortie.sim.playback.viewer import LiveViewer
 
         watchers.append(LiveViewer())
     if mavlink is not None:
-        from sim.telemetry import MavlinkEndpoint, read_key
+        from sortie.sim.telemetry import MavlinkEndpoint, read_key
 
         watchers.append(MavlinkEndpoint(mavlink, pace or None, key=None if key is None else read_key(key)))
     return Watchers(watchers)

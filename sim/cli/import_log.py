@@ -12,10 +12,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from fleet.cell import MEAN_CELL_V
-from scenarios.load import loads
-from sim.console import out, user_errors
-from sim.folders import RunError, ensure_folder, replacing, write_text
+from sortie.fleet.cell import MEAN_CELL_V
+from sortie.scenarios.load import loads
+from sortie.sim.console import out, user_errors
+from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
 
 Array = np.ndarray[Any, Any]
 
@@ -49,8 +49,8 @@ def import_log(
 
     Gaps, restarts, damaged and missing messages are told and survived; gaps are empty cells of the trace.
     """
-    from fleet.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
-    from fleet.logtrace import context_trace, write_trace
+    from sortie.fleet.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
+    from sortie.fleet.logtrace import context_trace, write_trace
 
     folder = out_dir or Path(slug(log))
     ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO})

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from scenarios.load import load
-from sim.console import err, out, stages, user_errors
-from sim.folders import RunError, ensure_files, write_text
-from sim.named import policy_overrides
+from sortie.scenarios.load import load
+from sortie.sim.console import err, out, stages, user_errors
+from sortie.sim.folders import RunError, ensure_files, write_text
+from sortie.sim.named import policy_overrides
 
 if TYPE_CHECKING:
-    from sim.live.result import LiveResult
+    from sortie.sim.live.result import LiveResult
 
 MAX_DOMAIN = 230
 """Of DDS: above, ports would run out."""
@@ -61,7 +61,7 @@ def live(
     if policy is not None:
         flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
     with user_errors():
-        from sim.live.session import fly_live
+        from sortie.sim.live.session import fly_live
 
     ensure_files(out_file)
     with stages() as report:
@@ -98,8 +98,8 @@ def _share(value: float | None) -> str:
 
 
 def _show(result: LiveResult) -> None:
-    from sim.live.result import overhead_rows
-    from sim.live.words import changes_in_words
+    from sortie.sim.live.result import overhead_rows
+    from sortie.sim.live.words import changes_in_words
 
     where = f"{result.begin_s:g}–{result.begin_s + result.flown_s:.0f} s"
     losses = f", {result.loss:.0%} of descriptors lost" if result.loss else ""

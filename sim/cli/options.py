@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from scenarios.load import load
-from scenarios.schema import Scenario
-from sim.console import err
-from sim.named import policy_overrides
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.console import err
+from sortie.sim.named import policy_overrides
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
 SetOption = Annotated[

@@ -11,14 +11,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from perception.harness import report
-from perception.harness.rows import INSTRUMENTS, Row, differ_by_chance
-from perception.harness.verdict import Verdict
-from sim.console import out, stages
-from sim.folders import RunError, ensure_between
+from sortie.perception.harness import report
+from sortie.perception.harness.rows import INSTRUMENTS, Row, differ_by_chance
+from sortie.perception.harness.verdict import Verdict
+from sortie.sim.console import out, stages
+from sortie.sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
-    from perception.harness.picture import Picture
+    from sortie.perception.harness.picture import Picture
 
 NARROW, PIPED_WIDTH = 150, 170
 """Columns of a terminal that show both instruments, and those that a pipe or file is given."""
@@ -61,10 +61,10 @@ def paper(
 
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
-    from perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from perception.harness import figures, rows
-    from perception.harness.found import Asked
-    from sim import paper as making
+    from sortie.perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
+    from sortie.perception.harness import figures, rows
+    from sortie.perception.harness.found import Asked
+    from sortie.sim import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
     if chosen is None:
@@ -171,8 +171,8 @@ def _safe(text: str) -> str:
 
 
 def _open_frame(picture: Picture, path: Path, out: Console, *, show: bool) -> None:
-    from sim.playback.frame import save_frame
-    from sim.playback.viewer import open_viewer
+    from sortie.sim.playback.frame import save_frame
+    from sortie.sim.playback.viewer import open_viewer
 
     save_frame(picture, path)
     out.print(

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sim import rundir
-from sim.console import out
+from sortie.sim import rundir
+from sortie.sim.console import out
 
 PAGE = "report.html"
 
@@ -20,7 +20,7 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one HTML page that needs nothing else: figures, outcome, and the decisions in words."""
-    from sim.report_page import save_page
+    from sortie.sim.report_page import save_page
 
     record = rundir.load(run)
     path = out_path or run / PAGE

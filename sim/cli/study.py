@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.console import out, stages, user_errors
-from sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
+from sortie.sim.console import out, stages, user_errors
+from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
 
 if TYPE_CHECKING:
-    from perception.study.measure import Row
+    from sortie.perception.study.measure import Row
 
 study = typer.Typer(
     no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
@@ -29,8 +29,8 @@ def study_train(
     bench_dir: BenchOption = Path("runs/bench"),
 ) -> None:
     """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
-    from perception.study.plan import read_plan
-    from perception.study.run import SHIPPED, train_job
+    from sortie.perception.study.plan import read_plan
+    from sortie.perception.study.run import SHIPPED, train_job
 
     plan = read_plan()
     with user_errors():
@@ -52,9 +52,9 @@ def study_run(
     workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
 ) -> None:
     """Measure every network that has weights, and write the rows."""
-    from perception.study.measure import Row, to_table
-    from perception.study.plan import read_plan
-    from perception.study.run import SHIPPED, measure
+    from sortie.perception.study.measure import Row, to_table
+    from sortie.perception.study.plan import read_plan
+    from sortie.perception.study.run import SHIPPED, measure
 
     plan, rows = read_plan(), list[Row]()
     with user_errors(), stages() as progress:
@@ -82,10 +82,10 @@ def study_report(
     ] = None,
 ) -> None:
     """Tell the study: a Markdown report with figures, the rows beside it, and the README's sentences."""
-    from perception.harness import figures as common
-    from perception.study import figures, report
-    from perception.study.measure import to_table
-    from perception.study.plan import read_plan
+    from sortie.perception.harness import figures as common
+    from sortie.perception.study import figures, report
+    from sortie.perception.study.measure import to_table
+    from sortie.perception.study.plan import read_plan
 
     plan = read_plan()
     drawn: list[tuple[str, str]] = []
@@ -114,7 +114,7 @@ def _read_rows(path: Path) -> list[Row]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    from perception.study.measure import from_table
+    from sortie.perception.study.measure import from_table
 
     try:
         return from_table(pq.read_table(path))

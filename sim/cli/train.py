@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from sim.console import out, stages, user_errors
-from sim.folders import ensure_files
+from sortie.sim.console import out, stages, user_errors
+from sortie.sim.folders import ensure_files
 
 
 class Exchange(StrEnum):
@@ -57,15 +57,15 @@ def train(
 
     Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
     """
-    from perception.bench.dataset import Benchmark  # here: torch takes a second to import
-    from perception.fusion.registry import FUSIONS
-    from perception.geometry import Geometry
-    from perception.model import ModelConfig
-    from perception.training.recipe import Recipe
-    from perception.training.train import device_named
-    from perception.training.train import train as train_detector
-    from sim import tables
-    from sim.playback.training import TrainingLog
+    from sortie.perception.bench.dataset import Benchmark  # here: torch takes a second to import
+    from sortie.perception.fusion.registry import FUSIONS
+    from sortie.perception.geometry import Geometry
+    from sortie.perception.model import ModelConfig
+    from sortie.perception.training.recipe import Recipe
+    from sortie.perception.training.train import device_named
+    from sortie.perception.training.train import train as train_detector
+    from sortie.sim import tables
+    from sortie.sim.playback.training import TrainingLog
 
     half_extent_m = float(range_.value)
     with user_errors():  # before scenes are rendered, which takes minutes

@@ -15,21 +15,21 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from policies.conformance import VIEWS, Check, conform, failing
-from policies.contract import FleetView, Policy
-from policies.invariants import Invariant, InvariantError, parse
-from policies.proof import PLANE, Verdict, prove
-from policies.properties import PROMISES
-from policies.registry import resolve
-from policies.views import to_json
-from scenarios.load import dump, loads
-from scenarios.schema import Policy as PolicySection
-from scenarios.schema import Scenario
-from sim.console import bars, err, out
-from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
-from sim.folders import RunError, write_text
-from sim.overhead import SCENARIO, SECONDS, host_s, measure
-from sim.plane import machine
+from sortie.policies.conformance import VIEWS, Check, conform, failing
+from sortie.policies.contract import FleetView, Policy
+from sortie.policies.invariants import Invariant, InvariantError, parse
+from sortie.policies.proof import PLANE, Verdict, prove
+from sortie.policies.properties import PROMISES
+from sortie.policies.registry import resolve
+from sortie.policies.views import to_json
+from sortie.scenarios.load import dump, loads
+from sortie.scenarios.schema import Policy as PolicySection
+from sortie.scenarios.schema import Scenario
+from sortie.sim.console import bars, err, out
+from sortie.sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
+from sortie.sim.folders import RunError, write_text
+from sortie.sim.overhead import SCENARIO, SECONDS, host_s, measure
+from sortie.sim.plane import machine
 
 COLOURS = {"holds": "green", "proved": "green", "fails": "red", "refuted": "red", "not proved": "yellow"}
 OWN_INVARIANTS = "INVARIANTS"

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sim import rundir
-from sim.console import err, out
-from sim.folders import RunError
+from sortie.sim import rundir
+from sortie.sim.console import err, out
+from sortie.sim.folders import RunError
 
 
 def view(
@@ -20,8 +20,8 @@ def view(
     at_s: Annotated[float, typer.Option("--at", help="The picture's simulated time, s.", min=0)] = 0.0,
 ) -> None:
     """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
-    from sim.playback.recording import save_rrd
-    from sim.playback.viewer import open_viewer
+    from sortie.sim.playback.recording import save_rrd
+    from sortie.sim.playback.viewer import open_viewer
 
     if at_s and picture is None:
         raise RunError("--at goes with --picture: the viewer has a time line of its own")
@@ -31,7 +31,7 @@ def view(
     if picture is None:
         open_viewer(path)
         return
-    from sim.playback.picture import take_picture
+    from sortie.sim.playback.picture import take_picture
 
     for complaint in take_picture(path, picture, at_s):
         err.print(complaint, soft_wrap=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 
-from fleet.auth import Opened
-from fleet.cdr import MalformedDatagram
-from sim.live.bus import MAX_DEPTH, Bus, Reader
-from sim.live.messages import unpack_bytes
-from sim.live.node import opened
-from sim.live.reports import Count, News, Report
-from sim.topics import CONTEXT, PAYLOADS, Kind, Topic, links
+from sortie.fleet.auth import Opened
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
+from sortie.sim.live.messages import unpack_bytes
+from sortie.sim.live.node import opened
+from sortie.sim.live.reports import Count, News, Report
+from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic, links
 
 PAYLOAD_DEPTH = 16
 """Samples kept of a payload topic until they are taken: a bench that is late by more loses count."""

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
-from fleet.agent import Platform, Task
-from fleet.motion import fly
-from fleet.senses import FlightSenses, Sensed
-from fleet.traces import follow, read_traces
-from perception.scene import SceneModel
-from perception.types import Capture
-from policies.contract import Disc
-from scenarios.schema import Scenario
-from sim.mission import MissionPlan
-from sim.sortie import run_sortie
-from sim.world import cars_in_reach, route_bounds
+from sortie.fleet.agent import Platform, Task
+from sortie.fleet.motion import fly
+from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.fleet.traces import follow, read_traces
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Capture
+from sortie.policies.contract import Disc
+from sortie.scenarios.schema import Scenario
+from sortie.sim.mission import MissionPlan
+from sortie.sim.sortie import run_sortie
+from sortie.sim.world import cars_in_reach, route_bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
 
 
 class ReplaySenses:
-    """One drone's own sensors (fleet.agent.Senses), frame 0 being the one of `begin_s`."""
+    """One drone's own sensors (sortie.fleet.agent.Senses), frame 0 being the one of `begin_s`."""
 
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
         motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)

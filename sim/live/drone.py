@@ -7,19 +7,19 @@ import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from fleet.agent import Agent, PlaneRules
-from policies.contract import PolicyError
-from scenarios.schema import Scenario
-from scenarios.streams import stream
-from sim.live.bus import Bus
-from sim.live.clock import WallClock
-from sim.live.context import ReplaySenses, Trace
-from sim.live.node import LiveNode
-from sim.live.reports import Failed, Go, Home, Notice, Ready, Report
-from sim.pilot import Audit, Pilot, plan_of, schedule_policies
-from sim.record import Recorder
-from sim.sortie import PHASE_SHARE
-from sim.world import at
+from sortie.fleet.agent import Agent, PlaneRules
+from sortie.policies.contract import PolicyError
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.streams import stream
+from sortie.sim.live.bus import Bus
+from sortie.sim.live.clock import WallClock
+from sortie.sim.live.context import ReplaySenses, Trace
+from sortie.sim.live.node import LiveNode
+from sortie.sim.live.reports import Failed, Go, Home, Notice, Ready, Report
+from sortie.sim.pilot import Audit, Pilot, plan_of, schedule_policies
+from sortie.sim.record import Recorder
+from sortie.sim.sortie import PHASE_SHARE
+from sortie.sim.world import at
 
 POLL_S = 0.02
 """How often a process that waits for others looks at its pipe."""

@@ -1,9 +1,9 @@
 """One drone's nodes on the bus: context publisher, policy node and gate, around the simulator's own `Agent`.
 
-    publisher    /fleet/context                      what `fleet.agent` broadcasts
+    publisher    /fleet/context                      what `sortie.fleet.agent` broadcasts
     policy node  /fleet/context → /…/directive       staleness rules and damping as in the simulator; every directive in
                                                      force again with every tick, as the paper's node does
-    gate         /…/directive → /…/features, compact payloads of the size that `fleet.gate` gives them
+    gate         /…/directive → /…/features, compact payloads of the size that `sortie.fleet.gate` gives them
 
 Policy node and gate speak through DDS alone, though they share a process.
 """
@@ -17,23 +17,23 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from fleet.agent import Agent, PlaneRules
-from fleet.auth import Dropped, DropReason, Opened, open_datagram
-from fleet.cdr import MalformedDatagram
-from fleet.gate import HEADER_BYTES, Gate, Payload
-from fleet.staleness import LinkHealth, health
-from fleet.trust import Standing
-from fleet.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
-from perception.types import Capture
-from policies.contract import Descriptor, Directive, FleetView, Policy
-from scenarios.streams import stream
-from sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
-from sim.live.messages import pack_bytes, unpack_bytes
-from sim.live.reports import Count, HealthChange, News, Order, Report
-from sim.topics import CONTEXT, PAYLOADS, Kind, Topic
+from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.auth import Dropped, DropReason, Opened, open_datagram
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.gate import HEADER_BYTES, Gate, Payload
+from sortie.fleet.staleness import LinkHealth, health
+from sortie.fleet.trust import Standing
+from sortie.fleet.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
+from sortie.perception.types import Capture
+from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
+from sortie.scenarios.streams import stream
+from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
+from sortie.sim.live.messages import pack_bytes, unpack_bytes
+from sortie.sim.live.reports import Count, HealthChange, News, Order, Report
+from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
 _HEADER = struct.Struct("<qI3f4f")
-"""Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `fleet.gate`."""
+"""Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
 
 
 class Link:
@@ -145,7 +145,7 @@ class LiveNode:
             dict(self._refused), self._late_s, dict(self._sent), dict(self._received), new,
         )  # fmt: skip
 
-    # --- fleet.agent.Modem -----------------------------------------------------------------------
+    # --- sortie.fleet.agent.Modem -----------------------------------------------------------------------
 
     goodput_mbps: Callable[[], tuple[float, ...]]
 
@@ -166,7 +166,7 @@ class LiveNode:
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
         self._write(peer, Kind.FEATURES, bytes(size_bytes))
 
-    # --- fleet.agent.AgentLog --------------------------------------------------------------------
+    # --- sortie.fleet.agent.AgentLog --------------------------------------------------------------------
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None:
         clock_s = t_s + self.agent.clock_skew_s

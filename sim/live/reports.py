@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from fleet.staleness import LinkHealth
-from sim.topics import Kind
+from sortie.fleet.staleness import LinkHealth
+from sortie.sim.topics import Kind
 
 
 class HealthChange(NamedTuple):

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.staleness import LinkHealth
-from perception.harness.claims import OVERHEAD
-from scenarios.schema import Scenario
-from sim.live.bench import Bench, Fleet
-from sim.live.reports import HealthChange, Notice, Order
-from sim.pilot import named
-from sim.plane import machine
-from sim.topics import CONTEXT, PAYLOADS, Kind, Topic
+from sortie.fleet.staleness import LinkHealth
+from sortie.perception.harness.claims import OVERHEAD
+from sortie.scenarios.schema import Scenario
+from sortie.sim.live.bench import Bench, Fleet
+from sortie.sim.live.reports import HealthChange, Notice, Order
+from sortie.sim.pilot import named
+from sortie.sim.plane import machine
+from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
 PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
 """The paper's figures, by the claim that states them."""

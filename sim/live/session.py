@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from policies.contract import PolicyError
-from scenarios.schema import Scenario
-from sim.folders import RunError
-from sim.live.bench import Bench, Fleet
-from sim.live.context import traces
-from sim.live.drone import Orders, fly_one
-from sim.live.reports import Failed, Go, Home, Ready, Report
-from sim.live.result import LiveResult, Lost, summary
+from sortie.policies.contract import PolicyError
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.live.bench import Bench, Fleet
+from sortie.sim.live.context import traces
+from sortie.sim.live.drone import Orders, fly_one
+from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
+from sortie.sim.live.result import LiveResult, Lost, summary
 
 MAX_DRONES = 20
 """As many processes as this starts on one host."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from fleet.staleness import LinkHealth
-from sim.live.result import LiveResult, Noticed
+from sortie.fleet.staleness import LinkHealth
+from sortie.sim.live.result import LiveResult, Noticed
 
 
 def changes_in_words(result: LiveResult) -> list[str]:

@@ -1,6 +1,6 @@
 """The plots, lanes and logs of a playback: what was carried, what it cost, and who decided what, and why.
 
-As in `sim.playback.scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
+As in `sortie.sim.playback.scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from perception.ap import Matched, average_precision
-from scenarios.schema import Scenario
-from sim.outcome import transitions
-from sim.playback import canvas as c
-from sim.playback.canvas import Canvas, Floats, line
-from sim.sightings import Sighting
-from sim.words import decision_in_words, event_in_words
+from sortie.perception.ap import Matched, average_precision
+from sortie.scenarios.schema import Scenario
+from sortie.sim.outcome import transitions
+from sortie.sim.playback import canvas as c
+from sortie.sim.playback.canvas import Canvas, Floats, line
+from sortie.sim.sightings import Sighting
+from sortie.sim.words import decision_in_words, event_in_words
 
 AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")

@@ -14,12 +14,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from perception.geometry import CELLS
-from perception.harness.picture import Picture, to_world
-from perception.render import CAMERAS
-from perception.types import Boxes
-from sim.playback.canvas import MISSION, drone_colour
-from sim.playback.recording import new_file
+from sortie.perception.geometry import CELLS
+from sortie.perception.harness.picture import Picture, to_world
+from sortie.perception.render import CAMERAS
+from sortie.perception.types import Boxes
+from sortie.sim.playback.canvas import MISSION, drone_colour
+from sortie.sim.playback.recording import new_file
 
 APPLICATION = "sortie-frame"
 TRUTH, FOUND = (150, 152, 158, 255), (80, 150, 255, 255)

@@ -8,10 +8,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from fleet.coverage import footprint_radius_m
-from fleet.formation import slots
-from scenarios.schema import Scenario
-from sim.playback.canvas import SIM_TIME, SPAN_M
+from sortie.fleet.coverage import footprint_radius_m
+from sortie.fleet.formation import slots
+from sortie.scenarios.schema import Scenario
+from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
 
 SEEN = """
 **Boxes**: what drone {ego} makes of the scene: green, a car found; yellow, missed; red, a false alarm; the darker,

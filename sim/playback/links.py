@@ -1,6 +1,6 @@
 """Links in the scene of a playback: arrows as wide as their traffic and as green as their goodput, broken ones crossed.
 
-As in `sim.playback.scene`: tables come whole or by whole seconds, and a row at time t shows what was known before t.
+As in `sortie.sim.playback.scene`: tables come whole or by whole seconds, and a row at time t shows what was known before t.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from sim.playback import canvas as c
-from sim.playback.canvas import SPAN_M, Canvas, Floats
+from sortie.sim.playback import canvas as c
+from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
 
 RECENT_S = 1.0
 MANY_DRONES = 8

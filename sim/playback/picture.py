@@ -16,9 +16,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim.folders import RunError
-from sim.playback.canvas import SIM_TIME
-from sim.playback.viewer import end, listens, viewer_binary
+from sortie.sim.folders import RunError
+from sortie.sim.playback.canvas import SIM_TIME
+from sortie.sim.playback.viewer import end, listens, viewer_binary
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

@@ -18,11 +18,11 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from fleet.frames import yaw_rad
-from perception.budget import CELL_M, roi_mask
-from perception.geometry import CELLS
-from sim.playback import canvas as c
-from sim.playback.canvas import Canvas, Floats
+from sortie.fleet.frames import yaw_rad
+from sortie.perception.budget import CELL_M, roi_mask
+from sortie.perception.geometry import CELLS
+from sortie.sim.playback import canvas as c
+from sortie.sim.playback.canvas import Canvas, Floats
 
 STEP_S = 0.5
 """The hatching is drawn anew so often."""

@@ -1,7 +1,7 @@
 """A sortie drawn into a Rerun recording, and recordings as files.
 
-Saved and streamed sorties (`sim.playback.viewer`) go through the same `Playback`; it reads tables and changes none.
-Entity paths and colours: `sim.playback.scene`, `sim.playback.charts`; layout: `sim.playback.layout`.
+Saved and streamed sorties (`sortie.sim.playback.viewer`) go through the same `Playback`; it reads tables and changes none.
+Entity paths and colours: `sortie.sim.playback.scene`, `sortie.sim.playback.charts`; layout: `sortie.sim.playback.layout`.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 
-from perception.scene import SceneModel
-from scenarios.schema import Scenario
-from sim.folders import RunError, partial_file
-from sim.playback.canvas import Canvas, Floats
-from sim.playback.charts import Charts
-from sim.playback.comparison import comparison, roots
-from sim.playback.layout import blueprint, legend
-from sim.playback.scene import Drawing
-from sim.record import SortieRecord
-from sim.sightings import sightings
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError, partial_file
+from sortie.sim.playback.canvas import Canvas, Floats
+from sortie.sim.playback.charts import Charts
+from sortie.sim.playback.comparison import comparison, roots
+from sortie.sim.playback.layout import blueprint, legend
+from sortie.sim.playback.scene import Drawing
+from sortie.sim.record import SortieRecord
+from sortie.sim.sightings import sightings
 
 APPLICATION = "sortie"
 

@@ -2,8 +2,8 @@
 
 World frame ENU, metres; radii are metres where positive and widths on the screen where negative (Rerun's own sign). Everything takes tables, so that the whole record and one second of it are drawn alike;
 what a slice needs from before it (trails, goodput, recent bytes) is kept. A row at time t shows what was
-known before t, which is why slices of whole seconds draw the same as the whole. Links are in `sim.playback.links`,
-the cells that peers sent in `sim.playback.received`.
+known before t, which is why slices of whole seconds draw the same as the whole. Links are in `sortie.sim.playback.links`,
+the cells that peers sent in `sortie.sim.playback.received`.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from fleet.coverage import footprint_radius_m
-from perception.scene import SceneModel
-from perception.town import KERB_M, LANE_M, PAVEMENT_M
-from perception.traffic import Cars
-from perception.types import Boxes
-from scenarios.schema import Scenario
-from sim.playback import canvas as c
-from sim.playback.canvas import SPAN_M, Canvas, Floats
-from sim.playback.links import Links
-from sim.playback.received import Received
-from sim.sightings import Sighting
+from sortie.fleet.coverage import footprint_radius_m
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import KERB_M, LANE_M, PAVEMENT_M
+from sortie.perception.traffic import Cars
+from sortie.perception.types import Boxes
+from sortie.scenarios.schema import Scenario
+from sortie.sim.playback import canvas as c
+from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
+from sortie.sim.playback.links import Links
+from sortie.sim.playback.received import Received
+from sortie.sim.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
 CARS_WITHIN_M = 160.0

@@ -20,7 +20,7 @@ class TrainingLog:
 
     @property
     def scalars(self) -> Callable[[int, dict[str, float]], None]:
-        """What `perception.training.train` calls: (step, values by entity path)."""
+        """What `sortie.perception.training.train` calls: (step, values by entity path)."""
         return self.log
 
     def log(self, step: int, values: dict[str, float]) -> None:

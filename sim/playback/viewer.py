@@ -18,11 +18,11 @@ from pathlib import Path
 import pyarrow as pa
 import rerun as rr
 
-from perception.scene import SceneModel
-from scenarios.schema import Scenario
-from sim.folders import RunError
-from sim.playback.layout import blueprint
-from sim.playback.recording import APPLICATION, Playback
+from sortie.perception.scene import SceneModel
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.playback.layout import blueprint
+from sortie.sim.playback.recording import APPLICATION, Playback
 
 Sink = Callable[[rr.RecordingStream, Scenario], None]
 """Connects a new recording to where it goes, with the layout for the scenario."""
@@ -31,7 +31,7 @@ START_TIMEOUT_S = 15.0
 
 
 class LiveViewer:
-    """A viewer that follows a sortie while it flies (sim.sortie.Observer).
+    """A viewer that follows a sortie while it flies (sortie.sim.sortie.Observer).
 
     Args:
         sink: where the recording goes; left out, a viewer is started for it when the sortie begins.

@@ -15,14 +15,14 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
-from perception.bev import lift
-from perception.detector import TorchDetector
-from perception.fusion.base import takes_part
-from perception.fusion.registry import FUSIONS
-from perception.scene import SceneModel
-from perception.types import Share
-from perception.winograd import WinogradReLU
-from scenarios.schema import Perception, Scene
+from sortie.perception.bev import lift
+from sortie.perception.detector import TorchDetector
+from sortie.perception.fusion.base import takes_part
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Share
+from sortie.perception.winograd import WinogradReLU
+from sortie.scenarios.schema import Perception, Scene
 
 ROI = (10.0, 20.0, 32.0)
 QUESTIONS: dict[str, tuple[float, tuple[float, float, float] | None] | None] = {

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from fleet.auth import Inbox, Sealer, open_datagram
-from fleet.battery import FleetBatteries
-from fleet.motion import fly
-from fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
-from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from scenarios.schema import Battery, Fleet, Route
+from sortie.fleet.auth import Inbox, Sealer, open_datagram
+from sortie.fleet.battery import FleetBatteries
+from sortie.fleet.motion import fly
+from sortie.fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.scenarios.schema import Battery, Fleet, Route
 
 KEY = bytes(range(32))
 DESCRIPTOR = Descriptor(

@@ -14,17 +14,17 @@ import shapely
 import torch
 from numpy.typing import NDArray
 
-from perception.ap import Matched, average_precision, match, suppress
-from perception.fusion.base import takes_part
-from perception.geometry import FULL
-from perception.harness import selection
-from perception.harness.evaluate import Settings, match_all
-from perception.harness.statistics import rank, resamples
-from perception.inference import folded
-from perception.model import CarNet
-from perception.overlap import corners, iou_pairs
-from perception.types import Boxes
-from perception.warp import warp
+from sortie.perception.ap import Matched, average_precision, match, suppress
+from sortie.perception.fusion.base import takes_part
+from sortie.perception.geometry import FULL
+from sortie.perception.harness import selection
+from sortie.perception.harness.evaluate import Settings, match_all
+from sortie.perception.harness.statistics import rank, resamples
+from sortie.perception.inference import folded
+from sortie.perception.model import CarNet
+from sortie.perception.overlap import corners, iou_pairs
+from sortie.perception.types import Boxes
+from sortie.perception.warp import warp
 
 EGOS = [e for e in range(5) for p in range(5) if p != e]
 PEERS = [p for e in range(5) for p in range(5) if p != e]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import simpy
 
-from radio import Air
-from scenarios.schema import Radio
+from sortie.radio import Air
+from sortie.scenarios.schema import Radio
 
 CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60]], float)
 FRAMES = 1200

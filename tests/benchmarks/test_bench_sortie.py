@@ -12,8 +12,8 @@ import sys
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from scenarios.load import load
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.sim.sortie import run_sortie
 
 JAMMED = "events=[{kind: jam, at_s: 0, position_m: [0, 0, 2000], power_dbm: 0}]"
 
@@ -40,7 +40,7 @@ def test_what_a_fleet_costs(benchmark: BenchmarkFixture, drones: int, extra: tup
 
 
 @pytest.mark.benchmark(group="starting Python")
-@pytest.mark.parametrize("what", ["numpy", "sim.sortie"])
+@pytest.mark.parametrize("what", ["numpy", "sortie.sim.sortie"])
 def test_importing(benchmark: BenchmarkFixture, what: str) -> None:
     done = benchmark.pedantic(subprocess.run, ([sys.executable, "-c", f"import {what}"],), rounds=5, warmup_rounds=1)
     assert done.returncode == 0

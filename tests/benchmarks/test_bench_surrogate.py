@@ -12,12 +12,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
-from perception.detectors import Detector
-from perception.scene import SceneModel
-from perception.types import Capture, Share
-from scenarios.load import load
-from scenarios.schema import Perception, Scene
-from sim.sortie import run_sortie
+from sortie.perception.detectors import Detector
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Capture, Share
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Perception, Scene
+from sortie.sim.sortie import run_sortie
 
 Moments = list[list[tuple[Capture, list[Share]]]]
 
@@ -30,8 +30,8 @@ def moments(count: int, begin_s: float) -> Moments:
 @pytest.mark.benchmark(group="five egos of four moments")
 @pytest.mark.parametrize("which", ["torch", "surrogate"])
 def test_five_egos_of_four_moments(benchmark: Any, which: str) -> None:
-    from perception.detector import TorchDetector
-    from perception.surrogate.detector import SurrogateDetector
+    from sortie.perception.detector import TorchDetector
+    from sortie.perception.surrogate.detector import SurrogateDetector
 
     scene = SceneModel(Scene(), None, (-50, -50, 50, 50))
     detector: Detector = (
@@ -47,7 +47,7 @@ def test_five_egos_of_four_moments(benchmark: Any, which: str) -> None:
 
 @pytest.mark.benchmark(group="scoring of a sortie of 120 s at 2 Hz")
 def test_a_whole_sorties_moments_at_once(benchmark: Any) -> None:
-    from perception.surrogate.detector import SurrogateDetector
+    from sortie.perception.surrogate.detector import SurrogateDetector
 
     detector = SurrogateDetector(SceneModel(Scene(), None, (-50, -50, 50, 50)), Perception(), 1)
     assert len(list(benchmark.pedantic(detector.detect_many, (moments(240, 0.0),), rounds=3, warmup_rounds=1))) == 1200

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 
 DESCRIPTOR = Descriptor(
     stamp_ns=61_300_000_001,

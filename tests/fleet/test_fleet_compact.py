@@ -9,9 +9,9 @@ from fleet_examples import DESCRIPTOR, descriptors
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from fleet.auth import Dropped, DropReason, open_datagram
-from fleet.cdr import MalformedDatagram
-from fleet.compact import (
+from sortie.fleet.auth import Dropped, DropReason, open_datagram
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.compact import (
     GRID_BITS,
     GRID_CELLS,
     MIN_COMPACT_BYTES,
@@ -20,9 +20,9 @@ from fleet.compact import (
     decode_compact,
     encode_compact,
 )
-from fleet.coverage import pack_grid, survey, unpack_grid
-from fleet.wire import decode_descriptor
-from policies.contract import Coverage
+from sortie.fleet.coverage import pack_grid, survey, unpack_grid
+from sortie.fleet.wire import decode_descriptor
+from sortie.policies.contract import Coverage
 
 forms = st.builds(Form, st.sampled_from(GRID_CELLS), st.sampled_from(GRID_BITS), st.sampled_from(NUMBER_BITS))
 SANE = DESCRIPTOR._replace(priority_target_ids=(7, 65535), novelty_flags=3)

@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fleet.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, to_xyzw, up_vector, yaw_rad
+from sortie.fleet.frames import (
+    compass_deg,
+    swap_attitude,
+    swap_enu_ned,
+    swap_flu_frd,
+    to_wxyz,
+    to_xyzw,
+    up_vector,
+    yaw_rad,
+)
 
 HALF = np.sqrt(0.5)
 quaternions = (

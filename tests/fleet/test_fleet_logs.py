@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.dataflash import RawLog, read_dataflash
-from fleet.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
-from fleet.identify import predicted_voltage
-from fleet.mavlink import geodetic, read_tlog
-from fleet.ulog import read_ulog
-from scenarios.schema import Battery
+from sortie.fleet.dataflash import RawLog, read_dataflash
+from sortie.fleet.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
+from sortie.fleet.identify import predicted_voltage
+from sortie.fleet.mavlink import geodetic, read_tlog
+from sortie.fleet.ulog import read_ulog
+from sortie.scenarios.schema import Battery
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")

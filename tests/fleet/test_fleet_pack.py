@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.battery import CAUSES, RECORDED, FleetBatteries
-from fleet.cell import (
+from sortie.fleet.battery import CAUSES, RECORDED, FleetBatteries
+from sortie.fleet.cell import (
     MEAN_CELL_V,
     ageing,
     energy_fraction,
@@ -19,8 +19,8 @@ from fleet.cell import (
     resistance_factor,
     terminal_voltage_v,
 )
-from fleet.traces import BatteryTrace
-from scenarios.schema import Battery, DroneOverride
+from sortie.fleet.traces import BatteryTrace
+from sortie.scenarios.schema import Battery, DroneOverride
 
 HOVER_W = 168.48
 ELECTRIC_W = HOVER_W / 0.8 + 8 + 25 + 2.4  # of steady()

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.motion import fly
-from fleet.rotor import (
+from sortie.fleet.motion import fly
+from sortie.fleet.rotor import (
     climb_power_w,
     figure_of_merit,
     fleet_power_w,
@@ -18,7 +18,7 @@ from fleet.rotor import (
     momentum_power_w,
     rotor_power_w,
 )
-from scenarios.schema import Airframe, DroneOverride, Fleet, Motion, Route
+from sortie.scenarios.schema import Airframe, DroneOverride, Fleet, Motion, Route
 
 speeds = st.floats(0, 25)
 airframes = st.builds(

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.gate import make_payload
-from fleet.tiles import TILE_HEADER_BYTES, cells_of, cut
-from perception import budget
-from policies.contract import Directive, Representation
-from radio.airtime import fragments
-from scenarios.schema import MIN_TILE_BYTES, Radio
+from sortie.fleet.gate import make_payload
+from sortie.fleet.tiles import TILE_HEADER_BYTES, cells_of, cut
+from sortie.perception import budget
+from sortie.policies.contract import Directive, Representation
+from sortie.radio.airtime import fragments
+from sortie.scenarios.schema import MIN_TILE_BYTES, Radio
 
 FULL = Directive(0, 1, Representation.FEATURES, 0.1, None, 10.0)
 

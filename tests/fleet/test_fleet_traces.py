@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fleet.motion import fly
-from fleet.traces import COLUMNS, TraceError, follow, read_traces
-from scenarios.schema import Fleet, Route
+from sortie.fleet.motion import fly
+from sortie.fleet.traces import COLUMNS, TraceError, follow, read_traces
+from sortie.scenarios.schema import Fleet, Route
 
 FLEET = Fleet(route=Route(waypoints_m=((0, 0), (200, 0))))
 
@@ -147,6 +147,6 @@ def test_no_file_and_no_table(tmp_path: Path) -> None:
 
 
 def test_the_columns_are_told_in_the_modules_words() -> None:
-    import fleet.traces
+    import sortie.fleet.traces
 
-    assert all(name in (fleet.traces.__doc__ or "") for name in COLUMNS)
+    assert all(name in (sortie.fleet.traces.__doc__ or "") for name in COLUMNS)

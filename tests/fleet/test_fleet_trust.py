@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.compact import Form, decode_compact, encode_compact
-from fleet.coverage import survey
-from fleet.lies import falsified
-from fleet.trust import (
+from sortie.fleet.compact import Form, decode_compact, encode_compact
+from sortie.fleet.coverage import survey
+from sortie.fleet.lies import falsified
+from sortie.fleet.trust import (
     Arrival,
     Standing,
     battery_doubt,
@@ -22,7 +22,7 @@ from fleet.trust import (
     goodput_doubt,
     judge,
 )
-from policies.contract import COVERAGE_CELL_M, Descriptor, TaskPhase
+from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, TaskPhase
 
 SEEN_PER_METRE = 0.7
 

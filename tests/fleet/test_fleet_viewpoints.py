@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.displaced import displaced
-from fleet.motion import Motion, MotionError, fly
-from fleet.rotor import fleet_power_w
-from fleet.viewpoints import (
+from sortie.fleet.displaced import displaced
+from sortie.fleet.motion import Motion, MotionError, fly
+from sortie.fleet.rotor import fleet_power_w
+from sortie.fleet.viewpoints import (
     LEAST_MOVE_M,
     Bounds,
     Course,
@@ -26,7 +26,7 @@ from fleet.viewpoints import (
     shift_m,
     shifts,
 )
-from scenarios.schema import Fleet
+from sortie.scenarios.schema import Fleet
 
 FRAME_S = 0.1
 SHAPES = ("cross", "line", "wedge", "grid", "circle")

@@ -12,8 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from fleet.cdr import ENCAPSULATION, MalformedDatagram, layout
-from fleet.wire import (
+from sortie.fleet.cdr import ENCAPSULATION, MalformedDatagram, layout
+from sortie.fleet.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
     DIRECTIVE_BYTES,
@@ -26,7 +26,7 @@ from fleet.wire import (
     encode_descriptor,
     encode_directive,
 )
-from policies.contract import Descriptor, Directive, Disc
+from sortie.policies.contract import Descriptor, Directive, Disc
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 ROS.register(get_types_from_msg(DESCRIPTOR_MSG, DESCRIPTOR_NAME))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from scipy.spatial.transform import Rotation
 
-from perception.scene import SceneModel
-from perception.types import Capture
-from scenarios.schema import Scene, Target
+from sortie.perception.scene import SceneModel
+from sortie.perception.types import Capture
+from sortie.scenarios.schema import Scene, Target
 
 EMPTY = Scene(building_density=0, tree_density=0, parked_density=0, moving_cars_per_km=0)
 """Roads and grass alone."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from perception.surrogate.collect import Asked
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.model import Parameters
-from perception.surrogate.plan import Job, moment, scene_model
-from scenarios.schema import Perception
+from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.model import Parameters
+from sortie.perception.surrogate.plan import Job, moment, scene_model
+from sortie.scenarios.schema import Perception
 
 
 def asked(

@@ -13,7 +13,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from shapely import affinity
 
-from perception.ap import (
+from sortie.perception.ap import (
     CONVENTIONS,
     Convention,
     Matched,
@@ -25,8 +25,8 @@ from perception.ap import (
     suppress,
     suppressed,
 )
-from perception.overlap import near_pairs, overlapping
-from perception.types import Boxes
+from sortie.perception.overlap import near_pairs, overlapping
+from sortie.perception.types import Boxes
 
 box = st.tuples(
     st.floats(-3, 3), st.floats(-3, 3), st.floats(0.5, 6), st.floats(0.5, 3), st.floats(-7, 7)

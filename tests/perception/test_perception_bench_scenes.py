@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perception_examples import EMPTY, capture, only_target
 
-from perception.bench.dataset import SIZES, Benchmark
-from perception.bench.difficulty import DENSITIES, Difficulty, Layout
-from perception.bench.scenes import AREA_M, DRONES, SPLITS, draw_captures, draw_scene, scene_id
-from perception.bench.survey import Counts, by_style, survey
-from perception.bench.visibility import in_a_camera, inside, past_houses, past_trees, visible
-from perception.scene import SceneModel
-from perception.town import STYLES
-from scenarios.schema import Scene
+from sortie.perception.bench.dataset import SIZES, Benchmark
+from sortie.perception.bench.difficulty import DENSITIES, Difficulty, Layout
+from sortie.perception.bench.scenes import AREA_M, DRONES, SPLITS, draw_captures, draw_scene, scene_id
+from sortie.perception.bench.survey import Counts, by_style, survey
+from sortie.perception.bench.visibility import in_a_camera, inside, past_houses, past_trees, visible
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import STYLES
+from sortie.scenarios.schema import Scene
 
 split_names = st.sampled_from(sorted(SPLITS))
 indices = st.integers(0, 99_999)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perception import budget
+from sortie.perception import budget
 
 rois = st.none() | st.tuples(st.floats(-150, 150), st.floats(-150, 150), st.floats(0.5, 200))
 poses = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-4, 4))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from paper_examples import ELSEWHERE, FACTS, MadeInstrument, made_frames
 
-from perception.ap import average_precision
-from perception.bench.dataset import SIZES
-from perception.harness import report, rows
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.found import Asked, Found
-from perception.harness.measures import under
-from perception.harness.paper import bench_frames, measure
-from perception.harness.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
+from sortie.perception.ap import average_precision
+from sortie.perception.bench.dataset import SIZES
+from sortie.perception.harness import report, rows
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.found import Asked, Found
+from sortie.perception.harness.measures import under
+from sortie.perception.harness.paper import bench_frames, measure
+from sortie.perception.harness.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
 
 N = 6
 

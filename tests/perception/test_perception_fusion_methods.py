@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
 
-from perception.fusion.base import Fusion, takes_part
-from perception.fusion.registry import DEFAULT, FUSIONS
-from perception.fusion.traffic import LinkBytes
-from perception.fusion.v2vnet import V2VNet
-from perception.fusion.where2comm import HEADS, Where2comm, asked_for, confidence_map
-from perception.geometry import CHANNELS
+from sortie.perception.fusion.base import Fusion, takes_part
+from sortie.perception.fusion.registry import DEFAULT, FUSIONS
+from sortie.perception.fusion.traffic import LinkBytes
+from sortie.perception.fusion.v2vnet import V2VNet
+from sortie.perception.fusion.where2comm import HEADS, Where2comm, asked_for, confidence_map
+from sortie.perception.geometry import CHANNELS
 
 SIDE = 12
 LEARNED = ("disconet", "v2vnet", "where2comm")
@@ -232,7 +232,7 @@ def test_bytes_of_what_is_not_features() -> None:
 
 
 def test_the_registry_is_what_a_scenario_may_name() -> None:
-    from scenarios.schema import Perception
+    from sortie.scenarios.schema import Perception
 
     allowed = Perception.model_json_schema()["properties"]["fusion"]
     assert set(allowed["enum"]) == set(FUSIONS)

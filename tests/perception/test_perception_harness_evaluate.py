@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
-from perception.ap import CONVENTIONS, match, suppress
-from perception.harness import selection
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.contract import Exchange
-from perception.harness.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
-from perception.harness.scores import Bootstrap
-from perception.types import Boxes
+from sortie.perception.ap import CONVENTIONS, match, suppress
+from sortie.perception.harness import selection
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.contract import Exchange
+from sortie.perception.harness.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
+from sortie.perception.harness.scores import Bootstrap
+from sortie.perception.types import Boxes
 
 BEST = Condition(0.1, "best-2", roi=True)
 THREE = (SINGLE, BEST, FULL_SHARING)

@@ -12,17 +12,17 @@ from harness_examples import MadeFrames, made_frames
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from perception.checkpoint import save_weights
-from perception.decode import decode
-from perception.fusion.base import takes_part
-from perception.fusion.registry import FUSIONS
-from perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from perception.harness.contract import Exchange
-from perception.harness.evaluate import evaluate
-from perception.harness.instrument import CarNetInstrument, fingerprint
-from perception.inference import folded
-from perception.model import CarNet, ModelConfig
-from perception.warp import warp
+from sortie.perception.checkpoint import save_weights
+from sortie.perception.decode import decode
+from sortie.perception.fusion.base import takes_part
+from sortie.perception.fusion.registry import FUSIONS
+from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.harness.contract import Exchange
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.harness.instrument import CarNetInstrument, fingerprint
+from sortie.perception.inference import folded
+from sortie.perception.model import CarNet, ModelConfig
+from sortie.perception.warp import warp
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perception import budget
-from perception.geometry import FULL, SMALL
-from perception.harness import selection
-from perception.harness.condition import Condition
-from policies.geometry import circle_overlap
+from sortie.perception import budget
+from sortie.perception.geometry import FULL, SMALL
+from sortie.perception.harness import selection
+from sortie.perception.harness.condition import Condition
+from sortie.policies.geometry import circle_overlap
 
 CROSS = np.array([(0.0, 0.0), (20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)])
 RADII = np.full(5, selection.FOOTPRINT_M)

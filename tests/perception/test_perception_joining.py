@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perception_examples import cross
 
-from perception.ap import suppress
-from perception.detector import TorchDetector
-from perception.joining import NMS_IOU, OWN_SAY, Heard, Rule, Told, joined, joined_many, told
-from perception.overlap import iou_pairs
-from perception.scene import SceneModel
-from perception.surrogate.detector import SurrogateDetector
-from perception.types import Boxes, Share
-from scenarios.schema import Perception, Scene
+from sortie.perception.ap import suppress
+from sortie.perception.detector import TorchDetector
+from sortie.perception.joining import NMS_IOU, OWN_SAY, Heard, Rule, Told, joined, joined_many, told
+from sortie.perception.overlap import iou_pairs
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.types import Boxes, Share
+from sortie.scenarios.schema import Perception, Scene
 
 HERE = (0.0, 0.0, 0.0)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception import ap
-from perception.types import Boxes
+from sortie.perception import ap
+from sortie.perception.types import Boxes
 
 
 def boxes(rng: np.random.Generator, count: int) -> Boxes:

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from perception_examples import cross
 
-from perception import budget
-from perception.detector import TorchDetector
-from perception.scene import SceneModel
-from perception.surrogate.detector import SurrogateDetector
-from perception.types import Boxes, Share
-from scenarios.schema import Perception, Scene
+from sortie.perception import budget
+from sortie.perception.detector import TorchDetector
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.types import Boxes, Share
+from sortie.scenarios.schema import Perception, Scene
 
 POSE = (0.0, 0.0, 0.3)
 BOUNDS = (-50.0, -50.0, 50.0, 50.0)

@@ -12,16 +12,16 @@ import pytest
 from perception_examples import capture, only_target
 from recording_examples import small
 
-from perception.detectors import DETECTORS, make_detector
-from perception.harness.condition import SINGLE, Condition
-from perception.harness.contract import Exchange
-from perception.harness.evaluate import evaluate
-from perception.outside.detector import RecordedDetector
-from perception.outside.exchange import load_fusion
-from perception.outside.instrument import RecordedInstrument, evaluate_recording, frames_of
-from perception.outside.recorded import RecordingError, open_recording
-from perception.types import Share
-from scenarios.schema import Perception
+from sortie.perception.detectors import DETECTORS, make_detector
+from sortie.perception.harness.condition import SINGLE, Condition
+from sortie.perception.harness.contract import Exchange
+from sortie.perception.harness.evaluate import evaluate
+from sortie.perception.outside.detector import RecordedDetector
+from sortie.perception.outside.exchange import load_fusion
+from sortie.perception.outside.instrument import RecordedInstrument, evaluate_recording, frames_of
+from sortie.perception.outside.recorded import RecordingError, open_recording
+from sortie.perception.types import Share
+from sortie.scenarios.schema import Perception
 
 GREEDY = """
 import numpy as np
@@ -235,10 +235,10 @@ def test_a_recording_flies_without_torch(tmp_path: Path) -> None:
     path = small(tmp_path / "r.npz", features=None)
     code = f"""
 import sys
-from perception.detectors import make_detector
-from perception.harness.condition import SINGLE
-from perception.outside.instrument import evaluate_recording
-from scenarios.schema import Perception
+from sortie.perception.detectors import make_detector
+from sortie.perception.harness.condition import SINGLE
+from sortie.perception.outside.instrument import evaluate_recording
+from sortie.scenarios.schema import Perception
 make_detector(None, Perception(detector="recorded", recording={str(path)!r}), 1)
 evaluate_recording({str(path)!r} and __import__("pathlib").Path({str(path)!r}), [SINGLE])
 assert "torch" not in sys.modules

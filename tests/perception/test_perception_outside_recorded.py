@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from recording_examples import score_map, small
 
-from perception.outside.exchange import moved
-from perception.outside.recorded import RecordingError, cells_of, open_recording
-from perception.outside.writing import write_recording
+from sortie.perception.outside.exchange import moved
+from sortie.perception.outside.recorded import RecordingError, cells_of, open_recording
+from sortie.perception.outside.writing import write_recording
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def test_moved_is_its_own_inverse_and_cells_follow_the_grid() -> None:
     np.testing.assert_allclose(moved(moved(boxes, a, b), b, a), boxes, atol=1e-12)
     here = moved(np.array([(1.0, 0, 4, 2, 0, 1)]), (10.0, 5.0, np.pi / 2), (10.0, 0.0, 0.0))
     np.testing.assert_allclose(here[0, [0, 1, 4]], (0, 6, np.pi / 2), atol=1e-12)
-    from perception.geometry import FULL
+    from sortie.perception.geometry import FULL
 
     row, column, inside = cells_of(np.array([(-102.4, 102.3, 4, 2, 0, 1), (102.4, 0, 4, 2, 0, 1)]), FULL)
     assert (row[0], column[0], inside.tolist()) == (0, 63, [True, False])

@@ -11,9 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.outside.instrument import frames_of
-from perception.outside.recorded import open_recording
-from perception.outside.uav3d import CAMERAS, UAVS, Uav3dError, boxes_enu, convert, read_image, read_infos, read_tables
+from sortie.perception.outside.instrument import frames_of
+from sortie.perception.outside.recorded import open_recording
+from sortie.perception.outside.uav3d import (
+    CAMERAS,
+    UAVS,
+    Uav3dError,
+    boxes_enu,
+    convert,
+    read_image,
+    read_infos,
+    read_tables,
+)
 
 SCENES = ("scene_0001", "scene_0861")
 STAMP = 1701498620885503488

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 
-from perception.harness import figures, report, rows
-from perception.harness.claims import CLAIMS, SECTIONS
-from perception.harness.rows import Row
-from perception.harness.scores import split
-from perception.harness.verdict import Measured
+from sortie.perception.harness import figures, report, rows
+from sortie.perception.harness.claims import CLAIMS, SECTIONS
+from sortie.perception.harness.rows import Row
+from sortie.perception.harness.scores import split
+from sortie.perception.harness.verdict import Measured
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from perception.ap import Matched
-from perception.study.measure import Row, from_table, optimal_f1, threshold, to_table
-from perception.study.plan import PLAN, read_plan
-from perception.study.report import Found, View, answers, flips, on_frames, report, sign
-from perception.study.run import SHIPPED, train_job, weights_of
+from sortie.perception.ap import Matched
+from sortie.perception.study.measure import Row, from_table, optimal_f1, threshold, to_table
+from sortie.perception.study.plan import PLAN, read_plan
+from sortie.perception.study.report import Found, View, answers, flips, on_frames, report, sign
+from sortie.perception.study.run import SHIPPED, train_job, weights_of
 
 BUDGETS = (0.02, 0.05, 0.1, 0.25)
 ONE = Row("full", 0, "default", "zero", "confidence", "model", 0.1, "contrast", 0.02, 1.0, 0.5, 1.5, 80)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from perception_examples import EMPTY, capture, cross
 
-from perception.ap import match
-from perception.detector import ground_truth
-from perception.detectors import DetectsMany
-from perception.geometry import in_square
-from perception.scene import SceneModel
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.exchange import (
+from sortie.perception.ap import match
+from sortie.perception.detector import ground_truth
+from sortie.perception.detectors import DetectsMany
+from sortie.perception.geometry import in_square
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.exchange import (
     ALARM_COVARIATES,
     FUSED_COVARIATES,
     Exchange,
@@ -23,12 +23,12 @@ from perception.surrogate.exchange import (
     covariates,
     pair,
 )
-from perception.surrogate.features import Eyes, Fleet
-from perception.surrogate.luck import Luck
-from perception.surrogate.rows import claim
-from perception.surrogate.words import uniform
-from perception.types import Boxes, Capture, Share
-from scenarios.schema import Perception, Scene, Target
+from sortie.perception.surrogate.features import Eyes, Fleet
+from sortie.perception.surrogate.luck import Luck
+from sortie.perception.surrogate.rows import claim
+from sortie.perception.surrogate.words import uniform
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Perception, Scene, Target
 
 BOUNDS = (-50.0, -50.0, 50.0, 50.0)
 TIMES = np.arange(2.0, 26.0, 2.0)

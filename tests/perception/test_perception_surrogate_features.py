@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.scene import SceneModel
-from perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
-from perception.surrogate.sight import NEAR_M, RES_M, Kerbs, next_of
-from perception.types import Capture
-from scenarios.schema import Scene, Target
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
+from sortie.perception.surrogate.sight import NEAR_M, RES_M, Kerbs, next_of
+from sortie.perception.types import Capture
+from sortie.scenarios.schema import Scene, Target
 
 COLUMN = {name: k for k, name in enumerate(LOOK_COVARIATES)}
 TARGET = Target(waypoints_m=((-60.0, -1.75), (200.0, -1.75)), speed_mps=5)

@@ -9,10 +9,10 @@ import pytest
 from perception_examples import capture
 from surrogate_examples import asked
 
-from perception.surrogate.levels import BOUNDS, group_of, level, longer
-from perception.surrogate.model import KINDS, SHIPPED, load
-from perception.surrogate.plan import Job
-from perception.types import Share
+from sortie.perception.surrogate.levels import BOUNDS, group_of, level, longer
+from sortie.perception.surrogate.model import KINDS, SHIPPED, load
+from sortie.perception.surrogate.plan import Job
+from sortie.perception.types import Share
 
 EGO, ASKEW = capture(0.0, 0.0), capture(0.0, 0.0, yaw=0.5)
 PEER, OLD = capture(10.0, 0.0, drone=1), capture(10.0, 0.0, drone=1, t_s=4.8)
@@ -57,7 +57,7 @@ def test_two_budgets_are_no_plain_job() -> None:
 def test_residuals_that_are_too_short_or_too_long_get_their_length_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drones alone and with whole maps, whose boxes lie off by 1.2 times, and 0.9 times, what the fit says; by the same luck, so
     that nothing else tells them apart."""
-    monkeypatch.setattr("perception.surrogate.levels.DRAWS", 1)
+    monkeypatch.setattr("sortie.perception.surrogate.levels.DRAWS", 1)
     parameters = load(SHIPPED)
     planted = np.ones(KINDS)
     planted[[0, 1]], planted[[6, 7]] = 1.2, 0.9

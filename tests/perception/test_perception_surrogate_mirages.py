@@ -7,14 +7,14 @@ import pytest
 from perception_examples import capture, cross
 from surrogate_examples import asked
 
-from perception.surrogate.detector import SurrogateDetector
-from perception.surrogate.features import Fleet
-from perception.surrogate.mirages import Mirages, in_common
-from perception.surrogate.model import SHIPPED, load
-from perception.surrogate.plan import scene_model
-from perception.surrogate.together import seen_by_several
-from perception.types import Capture
-from scenarios.schema import Perception
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.features import Fleet
+from sortie.perception.surrogate.mirages import Mirages, in_common
+from sortie.perception.surrogate.model import SHIPPED, load
+from sortie.perception.surrogate.plan import scene_model
+from sortie.perception.surrogate.together import seen_by_several
+from sortie.perception.types import Capture
+from sortie.scenarios.schema import Perception
 
 
 def fleet(*at: tuple[float, float]) -> Fleet:

@@ -15,13 +15,13 @@ from perception_examples import EMPTY, cross
 from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
-from perception.scene import SceneModel
-from perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
-from perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
-from perception.surrogate.fit import BANDS as QUANTILES
-from perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
-from perception.surrogate.luck import BANDS
-from perception.surrogate.model import (
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
+from sortie.perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
+from sortie.perception.surrogate.fit import BANDS as QUANTILES
+from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
+from sortie.perception.surrogate.luck import BANDS
+from sortie.perception.surrogate.model import (
     BAND,
     FORMAT,
     KINDS,
@@ -36,8 +36,8 @@ from perception.surrogate.model import (
     load,
     save,
 )
-from perception.surrogate.sight import CAR_TOP_M, HeightField
-from scenarios.schema import Scene
+from sortie.perception.surrogate.sight import CAR_TOP_M, HeightField
+from sortie.scenarios.schema import Scene
 
 RNG = np.random.Generator(np.random.PCG64(5))
 START = RNG.bit_generator.state
@@ -340,7 +340,7 @@ def test_scores_are_found_as_they_are_spread_above_the_floor_below_which_they_ar
 
 def test_a_fit_returns_the_network_that_it_fitted() -> None:
     """Inputs of another scale are folded into the first layer, and the mean and spread are learned."""
-    from perception.surrogate.fit import _normal_loss
+    from sortie.perception.surrogate.fit import _normal_loss
 
     x = RNG.normal(size=(4000, NETS["rank"][0])) * 3 + 1
     net, out = _train("rank", x, {"y": 0.5 * x[:, 0] + 0.2 * RNG.normal(size=4000)}, _normal_loss, 0, 400)

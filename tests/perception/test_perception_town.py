@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from perception_examples import capture
 
-from perception.render import Renderer
-from perception.scene import SceneModel
-from perception.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, _shadows, block, zigzag
-from scenarios.schema import Scene
+from sortie.perception.render import Renderer
+from sortie.perception.scene import SceneModel
+from sortie.perception.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, _shadows, block, zigzag
+from sortie.scenarios.schema import Scene
 
 
 def same(a: object, b: object) -> bool:

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perception.scene import SceneModel
-from perception.traffic import TARGET_ID, TargetPath
-from scenarios.schema import Scene, Target
+from sortie.perception.scene import SceneModel
+from sortie.perception.traffic import TARGET_ID, TargetPath
+from sortie.scenarios.schema import Scene, Target
 
 BOUNDS = (-100.0, -100.0, 200.0, 150.0)
 

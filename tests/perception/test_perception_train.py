@@ -10,14 +10,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from perception.bench.dataset import Benchmark, Frames, load_frames, make_scene_file
-from perception.checkpoint import load_weights, read_facts, save_weights
-from perception.model import CarNet, ModelConfig
-from perception.training import train as training
-from perception.training.learn import Thinning, draw_batch, local_cars
-from perception.training.recipe import Recipe, command
-from perception.training.train import learning_rate, train
-from perception.training.validation import card
+from sortie.perception.bench.dataset import Benchmark, Frames, load_frames, make_scene_file
+from sortie.perception.checkpoint import load_weights, read_facts, save_weights
+from sortie.perception.model import CarNet, ModelConfig
+from sortie.perception.training import train as training
+from sortie.perception.training.learn import Thinning, draw_batch, local_cars
+from sortie.perception.training.recipe import Recipe, command
+from sortie.perception.training.train import learning_rate, train
+from sortie.perception.training.validation import card
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +34,8 @@ def frames(scene_file: Path) -> Frames:
 def small(monkeypatch: pytest.MonkeyPatch, scene_file: Path) -> None:
     """Training and validation on the two frames."""
     monkeypatch.setattr(training, "make_split", lambda *_, **__: [scene_file])
-    monkeypatch.setattr("perception.training.validation.LEVELS", ((1.0, 1.0),))
-    monkeypatch.setattr("perception.training.learn.SHARD_FRAMES", 1)
+    monkeypatch.setattr("sortie.perception.training.validation.LEVELS", ((1.0, 1.0),))
+    monkeypatch.setattr("sortie.perception.training.learn.SHARD_FRAMES", 1)
 
 
 def test_turning_and_mirroring_keep_cars_on_their_pixels(frames: Frames) -> None:

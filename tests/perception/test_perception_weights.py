@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from perception.ap import Matched, match
-from perception.bench.difficulty import Difficulty
-from perception.bench.scenes import draw_captures, draw_scene
-from perception.checkpoint import read_facts
-from perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
-from perception.harness.statistics import compare
-from perception.scene import SceneModel
-from perception.study.plan import read_plan
-from perception.study.run import SHIPPED
-from perception.types import Share
-from scenarios.schema import Perception
+from sortie.perception.ap import Matched, match
+from sortie.perception.bench.difficulty import Difficulty
+from sortie.perception.bench.scenes import draw_captures, draw_scene
+from sortie.perception.checkpoint import read_facts
+from sortie.perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
+from sortie.perception.harness.statistics import compare
+from sortie.perception.scene import SceneModel
+from sortie.perception.study.plan import read_plan
+from sortie.perception.study.run import SHIPPED
+from sortie.perception.types import Share
+from sortie.scenarios.schema import Perception
 
 SCENES = range(6)
 """Of the test split: no layout of theirs is in any other split."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
 
 
 def fleet_of(n: int, *, soc: float = 0.9, goodput: float = 100.0, phase: TaskPhase = TaskPhase.SEARCH) -> FleetView:

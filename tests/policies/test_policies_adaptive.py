@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from policies import adaptive as a
-from policies.baselines import everyone
-from policies.contract import Coverage, Disc, FleetView, Representation, TaskPhase
+from sortie.policies import adaptive as a
+from sortie.policies.baselines import everyone
+from sortie.policies.contract import Coverage, Disc, FleetView, Representation, TaskPhase
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from policies.damping import LinkState, believed, damp
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.damping import LinkState, believed, damp
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")

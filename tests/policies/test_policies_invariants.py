@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from policies_examples import fleet_of
 
-from policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
-from policies.invariants import WORDS, InvariantError, complaint, just_heard, parse, violations
+from sortie.policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
+from sortie.policies.invariants import WORDS, InvariantError, complaint, just_heard, parse, violations
 
 VIEW = fleet_of(3, soc=0.2, goodput=4.0)
 SHARED = [

@@ -13,11 +13,11 @@ from dataclasses import replace
 import pytest
 from policies_examples import fleet_of
 
-from policies import conformance
-from policies.conformance import RULES, Check, conform, failing
-from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
-from policies.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
-from policies.worked import worked
+from sortie.policies import conformance
+from sortie.policies.conformance import RULES, Check, conform, failing
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.policies.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
+from sortie.policies.worked import worked
 
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
 calls = itertools.count()

@@ -7,14 +7,14 @@ from functools import partial
 
 import pytest
 
-from policies.baselines import everyone, random_k
-from policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
-from policies.geometry import footprint_overlap
-from policies.invariants import parse
-from policies.proof import Verdict, complaint_on, property_of, prove
-from policies.properties import PROMISES
-from policies.views import from_json, to_json
-from policies.worked import worked
+from sortie.policies.baselines import everyone, random_k
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.policies.geometry import footprint_overlap
+from sortie.policies.invariants import parse
+from sortie.policies.proof import Verdict, complaint_on, property_of, prove
+from sortie.policies.properties import PROMISES
+from sortie.policies.views import from_json, to_json
+from sortie.policies.worked import worked
 
 Decide = Callable[[FleetView], Sequence[Directive]]
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"

@@ -19,13 +19,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies_examples import fleet_of
 
-from fleet.auth import Dropped, Inbox, Sealer, open_datagram
-from fleet.gate import Gate
-from fleet.staleness import cap_by_age, health
-from fleet.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
-from policies.confine import Reached, confined
-from policies.conformance import RULES, full_view, raised_part
-from policies.contract import (
+from sortie.fleet.auth import Dropped, Inbox, Sealer, open_datagram
+from sortie.fleet.gate import Gate
+from sortie.fleet.staleness import cap_by_age, health
+from sortie.fleet.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
+from sortie.policies.confine import Reached, confined
+from sortie.policies.conformance import RULES, full_view, raised_part
+from sortie.policies.contract import (
     Descriptor,
     Directive,
     Disc,
@@ -35,10 +35,10 @@ from policies.contract import (
     Representation,
     check_directives,
 )
-from policies.damping import LinkState, damp
-from policies.registry import POLICIES
-from policies.views import draw_view, draw_views
-from scenarios.load import ScenarioError, loads
+from sortie.policies.damping import LinkState, damp
+from sortie.policies.registry import POLICIES
+from sortie.policies.views import draw_view, draw_views
+from sortie.scenarios.load import ScenarioError, loads
 
 FLEET = fleet_of(5)
 MINE = FLEET.descriptors[0]
@@ -279,7 +279,7 @@ def throws_numpys_dice(view: FleetView) -> list[Directive]:
 
 
 def imports_the_fleet(view: FleetView) -> list[Directive]:
-    from fleet.gate import RAW_BYTES
+    from sortie.fleet.gate import RAW_BYTES
 
     return share(view, float(RAW_BYTES % 7))
 
@@ -307,9 +307,9 @@ def holds_the_fleet(gate: Gate) -> Policy:
         (asks_the_system, "os"),
         (throws_dice, "random.random"),
         (throws_numpys_dice, "numpy.random"),
-        (imports_the_fleet, "fleet.gate"),
+        (imports_the_fleet, "sortie.fleet.gate"),
         (hides_it, "time"),
-        (holds_the_fleet(Gate()), "fleet.gate.gate"),
+        (holds_the_fleet(Gate()), "sortie.fleet.gate.gate"),
         (functools.partial(looks_at_the_clock), "time"),
     ],
     ids=lambda p: getattr(p, "__name__", ""),

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from policies.baselines import everyone, silence
-from policies.conformance import conform, failing
-from policies.contract import (
+from sortie.policies.baselines import everyone, silence
+from sortie.policies.conformance import conform, failing
+from sortie.policies.contract import (
     Directive,
     Disc,
     FleetView,
@@ -22,8 +22,8 @@ from policies.contract import (
     check_reposition,
     looks_from,
 )
-from policies.registry import POLICIES, resolve, viewpoint_of
-from policies.vantage import MOST_M, over_region
+from sortie.policies.registry import POLICIES, resolve, viewpoint_of
+from sortie.policies.vantage import MOST_M, over_region
 
 
 def tracking(view: FleetView, region: Disc) -> FleetView:

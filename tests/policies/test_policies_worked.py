@@ -5,10 +5,18 @@ from __future__ import annotations
 import pytest
 from policies_examples import fleet_of
 
-from policies.contract import Directive, Disc, FleetView, PolicyError, Representation, TaskPhase, check_directives
-from policies.geometry import circle_overlap, peers_by_overlap
-from policies.registry import parameters, resolve
-from policies.worked import worked
+from sortie.policies.contract import (
+    Directive,
+    Disc,
+    FleetView,
+    PolicyError,
+    Representation,
+    TaskPhase,
+    check_directives,
+)
+from sortie.policies.geometry import circle_overlap, peers_by_overlap
+from sortie.policies.registry import parameters, resolve
+from sortie.policies.worked import worked
 
 
 def to_peer_1(view: FleetView) -> Directive:

@@ -9,8 +9,8 @@ import numpy as np
 import simpy
 from radio_examples import CROSS_M, still
 
-from radio import Air, Transmission
-from scenarios.schema import Radio
+from sortie.radio import Air, Transmission
+from sortie.scenarios.schema import Radio
 
 
 class Hover:

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from radio_examples import CROSS_M, still
 from scipy import stats
 
-from radio import Air, Status, Transmission
-from radio.rates import STANDARDS
-from radio.transmission import losses
-from scenarios.schema import Radio
+from sortie.radio import Air, Status, Transmission
+from sortie.radio.rates import STANDARDS
+from sortie.radio.transmission import losses
+from sortie.scenarios.schema import Radio
 
 DEFAULT = Radio()
 STILL = Radio(shadowing_sigma_db=0.0)

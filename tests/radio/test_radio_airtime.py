@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from radio import airtime
-from radio.airtime import frames_exchanges, legacy_ppdu_s
-from radio.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
-from radio.rates import STANDARDS, Standard
+from sortie.radio import airtime
+from sortie.radio.airtime import frames_exchanges, legacy_ppdu_s
+from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
+from sortie.radio.rates import STANDARDS, Standard
 
 
 def test_a_descriptor_on_the_wire() -> None:

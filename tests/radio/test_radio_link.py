@@ -7,10 +7,19 @@ import pytest
 from radio_examples import CROSS_M, still
 from scipy import integrate, stats
 
-from radio.channel import Channel, noise_dbm
-from radio.pathloss import free_space_loss_db, log_distance_loss_db
-from radio.rates import LEGACY_RATES_MBPS, NO_LINK_PER, STANDARDS, choose_mcs, group_mcs, per, rate_table, rescale
-from scenarios.schema import Radio
+from sortie.radio.channel import Channel, noise_dbm
+from sortie.radio.pathloss import free_space_loss_db, log_distance_loss_db
+from sortie.radio.rates import (
+    LEGACY_RATES_MBPS,
+    NO_LINK_PER,
+    STANDARDS,
+    choose_mcs,
+    group_mcs,
+    per,
+    rate_table,
+    rescale,
+)
+from sortie.scenarios.schema import Radio
 
 
 def step(channel: Channel, *args: object) -> np.ndarray:

@@ -7,10 +7,10 @@ import pytest
 import simpy
 from radio_examples import CROSS_M, still
 
-from radio import Air, Transmission
-from radio.rate_control import INTERVAL_S, KEEP, Minstrel
-from radio.rates import STANDARDS, rate_table
-from scenarios.schema import Radio
+from sortie.radio import Air, Transmission
+from sortie.radio.rate_control import INTERVAL_S, KEEP, Minstrel
+from sortie.radio.rates import STANDARDS, rate_table
+from sortie.scenarios.schema import Radio
 
 RATES = STANDARDS["ax"].rates_mbps[80]
 TABLE = rate_table(80, 12.0, 1494)

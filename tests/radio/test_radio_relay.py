@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from radio_flights import Hover, trace
 
-from radio import Status
-from radio.relay import Routes, cheapest
-from radio.topology import bottleneck, connectivity, link_graph, widest_path, widths
-from scenarios.schema import Radio
+from sortie.radio import Status
+from sortie.radio.relay import Routes, cheapest
+from sortie.radio.topology import bottleneck, connectivity, link_graph, widest_path, widths
+from sortie.scenarios.schema import Radio
 
 LINE_M = np.array([[0.0, 0.0, 60.0], [150.0, 0.0, 60.0], [300.0, 0.0, 60.0]])
 """Three in a row: either end is heard badly by the other, well by the middle."""

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from radio.topology import bottleneck, cut_drones, is_connected, link_graph, linked_drones, widest_path
+from sortie.radio.topology import bottleneck, cut_drones, is_connected, link_graph, linked_drones, widest_path
 
 NAN = np.nan
 CHAIN = np.array([[NAN, 9.0, 1.0, 0.0], [9.0, NAN, 6.0, 0.0], [1.0, 6.0, NAN, 0.0], [0.0, 0.0, 0.0, NAN]])

@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from radio_flights import Hover, trace
 
-from radio import Status
-from radio.traces import read_links
-from scenarios.schema import Bursts, Radio
-from scenarios.traces import TraceError
+from sortie.radio import Status
+from sortie.radio.traces import read_links
+from sortie.scenarios.schema import Bursts, Radio
+from sortie.scenarios.traces import TraceError
 
 
 def test_csv_and_parquet_say_the_same(tmp_path: Path) -> None:

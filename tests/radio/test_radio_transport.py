@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from radio_flights import Hover, trace
 from scipy import stats
 
-from radio import Status
-from radio.airtime import frame_bytes, sample_wire
-from scenarios.schema import Bursts, Radio
+from sortie.radio import Status
+from sortie.radio.airtime import frame_bytes, sample_wire
+from sortie.scenarios.schema import Bursts, Radio
 
 
 def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> Radio:  # type: ignore[no-untyped-def]

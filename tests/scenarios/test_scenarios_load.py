@@ -14,9 +14,9 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import scenarios.load as loader
-from scenarios.load import ScenarioError, dump, library, load, loads
-from scenarios.schema import Policy, Scenario
+import sortie.scenarios.load as loader
+from sortie.scenarios.load import ScenarioError, dump, library, load, loads
+from sortie.scenarios.schema import Policy, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
 PARSERS = {"python": yaml.SafeLoader, "libyaml": getattr(yaml, "CSafeLoader", None)}

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from scenarios import reference
-from scenarios.load import library, loads
-from scenarios.schema import Scenario
+from sortie.scenarios import reference
+from sortie.scenarios.load import library, loads
+from sortie.scenarios.schema import Scenario
 
-REMEDY = "run python -m scenarios.reference"
+REMEDY = "run python -m sortie.scenarios.reference"
 
 
 def test_schema_json_is_current() -> None:
@@ -60,7 +60,7 @@ def test_write_makes_both_files_anew(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_library_files_point_editors_to_the_schema(name: str) -> None:
     first = library()[name].read_text("utf-8").split("\n", 1)[0]
     assert first == "# yaml-language-server: $schema=../schema.json"
-    assert (library()[name].parent / "../schema.json").resolve() == (reference.HERE / "schema.json")
+    assert (library()[name].parent / "../schema.json").samefile(reference.HERE / "schema.json")
 
 
 def test_units_stand_in_names() -> None:

@@ -6,9 +6,9 @@ import csv
 
 import pytest
 
-from scenarios import context_traces as ct
-from scenarios.load import load
-from scenarios.traces import TraceError, located, read_columns
+from sortie.scenarios import context_traces as ct
+from sortie.scenarios.load import load
+from sortie.scenarios.traces import TraceError, located, read_columns
 
 
 def rows(name: str) -> list[dict[str, str]]:

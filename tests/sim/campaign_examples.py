@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from scenarios.load_campaign import load_campaign
-from sim.campaign.plan import Plan, make_plan
-from sim.campaign.rows import Rows
-from sim.campaign.work import Result, Task, task_key
+from sortie.scenarios.load_campaign import load_campaign
+from sortie.sim.campaign.plan import Plan, make_plan
+from sortie.sim.campaign.rows import Rows
+from sortie.sim.campaign.work import Result, Task, task_key
 
 CLUSTER = pytest.mark.filterwarnings(
     "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"

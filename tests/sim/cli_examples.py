@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sim.cli.app import main
+from sortie.sim.cli.app import main
 
 
 def command(*arguments: object) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from scenarios.load import loads
-from scenarios.schema import Scenario
+from sortie.scenarios.load import loads
+from sortie.scenarios.schema import Scenario
 
 BASE = """
 name: example

@@ -6,23 +6,23 @@ from typing import Any
 
 import pytest
 
-import fleet.agent
-from fleet.agent import Agent
-from scenarios.load import load
-from sim.sortie import run_sortie
+import sortie.fleet.agent
+from sortie.fleet.agent import Agent
+from sortie.scenarios.load import load
+from sortie.sim.sortie import run_sortie
 
 SETS = ["perception.detector=none", "duration_s=3", "mission.phases=[{at_s: 0, phase: search}]"]
 
 
 def test_what_goes_to_four_peers_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    plain = fleet.agent.make_payload
+    plain = sortie.fleet.agent.make_payload
 
     def counted(*what: Any) -> Any:
         made.append(plain(*what))
         return made[-1]
 
-    monkeypatch.setattr(fleet.agent, "make_payload", counted)
+    monkeypatch.setattr(sortie.fleet.agent, "make_payload", counted)
     sent = run_sortie(load("track_target", SETS), "all-4").tables["transmissions"].num_rows
     assert sent > 200
     assert 3.8 * len(made) < sent <= 4 * len(made)

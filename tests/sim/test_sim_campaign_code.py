@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from sim.campaign import code
+from sortie.sim.campaign import code
 
 
 @pytest.fixture
 def rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("fleet/agent.py", "perception/weights/net.safetensors", "policies/learned.json", "sim/campaign/plan.py",
-                 "sim/__main__.py", "sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors",
+                 "sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors",
                  "scenarios/library/traces/links.json", "fleet/README.md"):  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("before")
@@ -35,7 +35,7 @@ def test_what_decides_a_run_changes_its_code_version(rooms: Path, name: str) -> 
 
 
 @pytest.mark.parametrize(
-    "name", ["sim/__main__.py", "sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors", "scenarios/library/traces/links.json", "fleet/README.md"]
+    "name", ["sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors", "scenarios/library/traces/links.json", "fleet/README.md"]
 )  # fmt: skip
 def test_what_only_looks_at_runs_does_not(rooms: Path, name: str) -> None:
     assert not changed(rooms, name, "after")
@@ -44,7 +44,12 @@ def test_what_only_looks_at_runs_does_not(rooms: Path, name: str) -> None:
 def test_every_shipped_file_that_a_run_may_read_is_looked_at() -> None:
     """A shipped suffix that nobody knows here would be a file that changes runs behind their keys."""
     asked = tomllib.loads((code.ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    shipped = {path.suffix for room, globs in asked.items() for g in globs for path in (code.ROOT / room).glob(g)}
+    shipped = {
+        path.suffix
+        for name, globs in asked.items()
+        for g in globs
+        for path in (code.ROOT / name.replace(".", "/")).glob(g)
+    }
     told_otherwise = {".md", ".typed", ".msg", ".xml", ".txt", ".toml", ".yaml", ".csv"}  # of the study, or in tasks
     assert shipped - {""} - told_otherwise == set(code.SUFFIXES) - {".py"}
 

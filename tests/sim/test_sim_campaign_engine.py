@@ -13,22 +13,22 @@ import pytest
 from campaign_examples import CAMPAIGN, CLUSTER, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
-from sim.campaign import engine as engines
-from sim.campaign.drive import Progress, run_campaign
-from sim.campaign.engine import Dask, InProcess, open_engine
-from sim.campaign.plan import Plan
-from sim.campaign.rows import find_row
-from sim.campaign.store import Store
-from sim.campaign.work import Task, fly_batch
-from sim.cli.app import app
-from sim.console import user_errors
-from sim.folders import RunError
+from sortie.sim.campaign import engine as engines
+from sortie.sim.campaign.drive import Progress, run_campaign
+from sortie.sim.campaign.engine import Dask, InProcess, open_engine
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.rows import find_row
+from sortie.sim.campaign.store import Store
+from sortie.sim.campaign.work import Task, fly_batch
+from sortie.sim.cli.app import app
+from sortie.sim.console import user_errors
+from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")
 
 FAULTY = """
 import os
-from policies.contract import Directive
+from sortie.policies.contract import Directive
 
 def decide(view, *, how="fail"):
     if view.me.battery_soc < 0.5:
@@ -260,7 +260,7 @@ def test_a_broken_part_is_one_line_on_the_command_line(tmp_path: Path) -> None:
     part.write_bytes(part.read_bytes()[:-100])
     for command in (["campaign", "report", str(folder)], ["fly", "--from-campaign", str(folder), "--run", "40"]):
         result = CliRunner().invoke(app, command)
-        assert isinstance(result.exception, RunError)  # sim.cli.app prints it in one line and exits with 2
+        assert isinstance(result.exception, RunError)  # sortie.sim.cli.app prints it in one line and exits with 2
         assert str(result.exception).startswith(f"{part}: is broken (")
 
 
@@ -315,7 +315,7 @@ def test_what_cannot_be_done_is_one_line(
     if "--out" not in arguments:
         arguments = [*arguments, "--out", str(tmp_path / "a")]
     result = CliRunner().invoke(app, ["campaign", str(path), *arguments])
-    assert isinstance(result.exception, RunError)  # sim.cli.app prints it in one line and exits with 2
+    assert isinstance(result.exception, RunError)  # sortie.sim.cli.app prints it in one line and exits with 2
     assert message in str(result.exception)
 
 

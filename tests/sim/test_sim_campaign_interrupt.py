@@ -15,15 +15,15 @@ from pathlib import Path
 import pytest
 from campaign_examples import CAMPAIGN, CLUSTER, write
 
-from sim.campaign import engine as engines
-from sim.campaign.engine import open_engine
-from sim.folders import RunError
+from sortie.sim.campaign import engine as engines
+from sortie.sim.campaign.engine import open_engine
+from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")
 
 DRIVER = """
 import sys
-from sim.cli.app import main
+from sortie.sim.cli.app import main
 if __name__ == "__main__":
     sys.argv[:2] = ["sortie", "campaign"]
     main()

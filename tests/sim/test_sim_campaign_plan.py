@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from campaign_examples import BASE, CAMPAIGN, plan, write
 
-from policies.contract import PolicyError
-from scenarios.load import ScenarioError
-from scenarios.load_campaign import load_campaign
-from sim.campaign.plan import Plan
-from sim.campaign.work import number, unpack
-from sim.folders import RunError
+from sortie.policies.contract import PolicyError
+from sortie.scenarios.load import ScenarioError
+from sortie.scenarios.load_campaign import load_campaign
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.work import number, unpack
+from sortie.sim.folders import RunError
 
 
 def test_every_combination_is_flown_once_and_policies_of_a_scene_share_their_seed(tmp_path: Path) -> None:

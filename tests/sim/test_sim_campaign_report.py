@@ -14,16 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.campaign import Sample
-from sim.campaign.contexts import contexts, rule, winner
-from sim.campaign.drive import run_campaign
-from sim.campaign.figures import on_front
-from sim.campaign.rows import Rows, figures, find_row, judged, read_rows, sign
-from sim.campaign.sensitivity import _morris, _saltelli, sensitivity
-from sim.campaign.spread import design
-from sim.campaign.statistics import Mean, estimate, paired, t_interval
-from sim.campaign.work import Result
-from sim.folders import RunError
+from sortie.scenarios.campaign import Sample
+from sortie.sim.campaign.contexts import contexts, rule, winner
+from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.figures import on_front
+from sortie.sim.campaign.rows import Rows, figures, find_row, judged, read_rows, sign
+from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
+from sortie.sim.campaign.spread import design
+from sortie.sim.campaign.statistics import Mean, estimate, paired, t_interval
+from sortie.sim.campaign.work import Result
+from sortie.sim.folders import RunError
 
 TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
     "replications: 2", "replications: 1"
@@ -153,7 +153,7 @@ class Failing(Pretended):
 
 def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
+    from sortie.sim.campaign.report import write_report
 
     p, folder = plan(tmp_path), tmp_path / "a"
     run_campaign(p, folder, Failing())  # type: ignore[arg-type]
@@ -183,8 +183,8 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
 
 def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: Path) -> None:
     """Warnings are errors here: no mean of nothing is taken, in words or in figures."""
-    from sim.campaign.figures import draw_pareto, draw_varied, with_values
-    from sim.campaign.report import _lines
+    from sortie.sim.campaign.figures import draw_pareto, draw_varied, with_values
+    from sortie.sim.campaign.report import _lines
 
     metrics = "metrics: [ap50.mission, ap50.full_scene, bytes.data_sent]"
     text = TWO.replace("metrics: [bytes.data_sent, energy_j.total]", metrics)
@@ -215,7 +215,7 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
 
 def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
+    from sortie.sim.campaign.report import write_report
 
     enough = "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
     folder = tmp_path / "a"
@@ -240,7 +240,7 @@ def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
 
 
 def test_levels_of_morris_have_no_intervals(tmp_path: Path) -> None:
-    from sim.campaign.report import _lines
+    from sortie.sim.campaign.report import _lines
 
     text = ONE_METRIC.replace("{count: 6}", "{count: 8, method: morris}")
     rows = rows_of(tmp_path, text, lambda fields, policy: fields["fleet.battery.initial_soc"] + policy)
@@ -252,7 +252,7 @@ def test_levels_of_morris_have_no_intervals(tmp_path: Path) -> None:
 
 
 def test_one_draw_gives_no_interval(tmp_path: Path) -> None:
-    from sim.campaign.report import _lines
+    from sortie.sim.campaign.report import _lines
 
     rows = rows_of(tmp_path, ONE_METRIC.replace("{count: 6}", "{count: 1}"), lambda fields, policy: policy)
     told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.campaign import (
+from sortie.scenarios.campaign import (
     Choice,
     Integers,
     LogNormal,
@@ -20,7 +20,7 @@ from scenarios.campaign import (
     Triangular,
     Uniform,
 )
-from sim.campaign.spread import design, quantile
+from sortie.sim.campaign.spread import design, quantile
 
 U = st.floats(0.001, 0.999)
 

@@ -20,13 +20,13 @@ import pyarrow.parquet as pq
 import pytest
 from campaign_examples import BASE, CAMPAIGN, Pretended, plan, pretend, table_bytes, write
 
-from sim.campaign.drive import run_campaign
-from sim.campaign.parts import BrokenPartError, read_part
-from sim.campaign.plan import Plan
-from sim.campaign.rows import find_row, read_rows
-from sim.campaign.store import Store
-from sim.campaign.work import Result, Task
-from sim.folders import RunError
+from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.parts import BrokenPartError, read_part
+from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.rows import find_row, read_rows
+from sortie.sim.campaign.store import Store
+from sortie.sim.campaign.work import Result, Task
+from sortie.sim.folders import RunError
 
 
 def flown(p: Plan, folder: Path, **how: object) -> dict[str, bytes]:
@@ -365,7 +365,7 @@ def test_polars_reads_it_with_one_line(tmp_path: Path) -> None:
 
 DRIVER = """
 import sys
-from sim.cli.app import main
+from sortie.sim.cli.app import main
 sys.argv = ["sortie", "campaign", sys.argv[1], "--workers", "0", "--out", sys.argv[2], "--no-report"]
 main()
 """

@@ -10,11 +10,11 @@ import pyarrow as pa
 import pytest
 from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
 
-from sim.campaign.contexts import winner
-from sim.campaign.drive import run_campaign
-from sim.campaign.rows import Rows, read_rows
-from sim.campaign.work import Result
-from sim.folders import RunError
+from sortie.sim.campaign.contexts import winner
+from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.rows import Rows, read_rows
+from sortie.sim.campaign.work import Result
+from sortie.sim.folders import RunError
 
 
 def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
     assert (rows.all.num_rows, rows.table.num_rows) == (90, 88)
     assert rows.by_unit("bytes.data_sent") == pytest.approx(np.full((2, 2), 11.5))
     pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
+    from sortie.sim.campaign.report import write_report
 
     told = write_report(folder).read_text()
     assert "2 of the runs are left out of all that follows: their draw is not finished at every grid point." in told
@@ -67,7 +67,7 @@ def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
 def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path) -> None:
     """It does worse by 1 everywhere, and fails in the two draws where all do worst."""
     pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
+    from sortie.sim.campaign.report import write_report
 
     p, folder = plan(tmp_path), tmp_path / "a"
     hard = (0, 1)
@@ -93,7 +93,7 @@ def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path
 
 def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sim.campaign.report import write_report
+    from sortie.sim.campaign.report import write_report
 
     p, folder = plan(tmp_path), tmp_path / "a"
 

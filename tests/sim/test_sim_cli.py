@@ -14,14 +14,14 @@ from cli_examples import command
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from perception.surrogate.model import SHIPPED as CALIBRATION
-from sim import rundir
-from sim.cli.app import app
-from sim.expect import check
-from sim.folders import RunError
-from sim.outcome import outcome
-from sim.record import TABLES
-from sim.sortie import run_sortie
+from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
+from sortie.sim import rundir
+from sortie.sim.cli.app import app
+from sortie.sim.expect import check
+from sortie.sim.folders import RunError
+from sortie.sim.outcome import outcome
+from sortie.sim.record import TABLES
+from sortie.sim.sortie import run_sortie
 
 FIELDS = {  # DESIGN.md: outcome.json holds at least these
     "scenario", "policy", "seed", "version", "fingerprint", "ap50", "bytes", "context_share", "deadline_miss_rate",
@@ -39,7 +39,7 @@ def scenario(tmp_path: Path) -> Path:
 def sortie(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """The real command in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-c", "from sim.cli.app import main; main()", *map(str, arguments)],
+        [sys.executable, "-c", "from sortie.sim.cli.app import main; main()", *map(str, arguments)],
         capture_output=True, text=True, cwd=cwd, check=False,
     )  # fmt: skip
 
@@ -151,7 +151,7 @@ def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
     def flown(*_: object, **__: object) -> None:
         raise AssertionError("flown")
 
-    monkeypatch.setattr("sim.cli.fly.run_sortie", flown)
+    monkeypatch.setattr("sortie.sim.cli.fly.run_sortie", flown)
     assert command("fly", scenario, "--no-recording", "--out", path) == 2
     assert "run: holds mynotes.txt, which no run wrote; choose another folder or move it" in capsys.readouterr().err
 
@@ -255,7 +255,7 @@ def test_the_real_command_gives_no_traceback(scenario: Path) -> None:
 
 def test_a_users_policy_flies_from_a_file(scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
-        "from policies.contract import Directive, Representation\n"
+        "from sortie.policies.contract import Directive, Representation\n"
         "def decide(view, *, rate=5.0):\n"
         "    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=rate, reason='mine') for p in view.peers]\n"
     )

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from perception.bench.dataset import Benchmark
-from perception.bench.difficulty import DENSITIES, Split
-from perception.geometry import FULL, SMALL
-from sim.cli.app import app
-from sim.cli.bench import DensityName, RangeName, SplitName
-from sim.folders import RunError
+from sortie.perception.bench.dataset import Benchmark
+from sortie.perception.bench.difficulty import DENSITIES, Split
+from sortie.perception.geometry import FULL, SMALL
+from sortie.sim.cli.app import app
+from sortie.sim.cli.bench import DensityName, RangeName, SplitName
+from sortie.sim.folders import RunError
 
 run = CliRunner()
 

@@ -13,10 +13,10 @@ import pyarrow as pa
 import pytest
 from sim_examples import example
 
-from policies.contract import Directive, Disc, FleetView, Policy, Representation
-from sim.outcome import describe, outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation
+from sortie.sim.outcome import describe, outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 PLAIN = Directive(0, 1, Representation.FEATURES, rho=0.05, rate_hz=10.0, reason="plain")
 NO_PHASES = "mission.phases=[{at_s: 0, phase: search}]"

@@ -12,10 +12,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from perception.detectors import DETECTORS
-from policies.conformance import conform
-from scenarios.load import load
-from sim.cli.app import app
+from sortie.perception.detectors import DETECTORS
+from sortie.policies.conformance import conform
+from sortie.scenarios.load import load
+from sortie.sim.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = sorted((ROOT / "docs" / "guide").glob("*.md"))

@@ -10,7 +10,7 @@ pettingzoo = pytest.importorskip("pettingzoo")
 
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
-from sim.env import CHOICES, SortieEnv  # noqa: E402
+from sortie.sim.env import CHOICES, SortieEnv  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 SHORT = ("duration_s=4", "fleet.drones=3", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.3")
@@ -164,7 +164,7 @@ def test_what_went_wrong_in_the_sortie_is_said_each_time(monkeypatch: pytest.Mon
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("planted")
 
-    monkeypatch.setattr("sim.env.run_sortie", broken)
+    monkeypatch.setattr("sortie.sim.env.run_sortie", broken)
     e = env()
     for fly in (e.reset, lambda: e.step({})):
         with pytest.raises(RuntimeError, match="planted"):

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from sim_examples import example
 
-from scenarios.schema import Expectation
-from sim.expect import check
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.scenarios.schema import Expectation
+from sortie.sim.expect import check
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from scenarios.load import load
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 GOLDEN = Path(__file__).parent / "golden"
 LEFT_OUT = {"fingerprint", "version", "wall_s", "realtime_factor", "policy_eval_us"}

@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from fleet.flightlog import read_log
-from fleet.logtrace import context_trace
-from fleet.traces import COLUMNS, read_traces
-from scenarios.load import load
-from sim.cli.app import app
-from sim.folders import RunError
-from sim.sortie import run_sortie
+from sortie.fleet.flightlog import read_log
+from sortie.fleet.logtrace import context_trace
+from sortie.fleet.traces import COLUMNS, read_traces
+from sortie.scenarios.load import load
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
+from sortie.sim.sortie import run_sortie
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")

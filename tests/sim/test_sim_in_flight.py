@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from sim_examples import BASE
 
-from perception.ap import average_precision
-from perception.scene import SceneModel
-from perception.surrogate.model import SHIPPED
-from scenarios.load import load, load_contexts
-from scenarios.schema import Scenario
-from sim.in_flight import Level, flights, means, torch_answers
-from sim.outcome import accuracy, both_matched
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.perception.ap import average_precision
+from sortie.perception.scene import SceneModel
+from sortie.perception.surrogate.model import SHIPPED
+from sortie.scenarios.load import load, load_contexts
+from sortie.scenarios.schema import Scenario
+from sortie.sim.in_flight import Level, flights, means, torch_answers
+from sortie.sim.outcome import accuracy, both_matched
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 
 def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[Level]:
@@ -79,7 +79,7 @@ def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytes
         flown.append((scenario.policy.name, scenario.policy.params.get("rho"), seed))
         return run_sortie(scenario.model_copy(update={"duration_s": 1.0}), policy, seed)
 
-    monkeypatch.setattr("sim.in_flight.run_sortie", fly)
+    monkeypatch.setattr("sortie.sim.in_flight.run_sortie", fly)
     told: list[tuple[str, int, int]] = []
     found = list(flights("contexts", SHIPPED, None, 2.0, ["silence", "all-4"], lambda *at: told.append(at)))
     contexts = load_contexts("contexts")
@@ -101,7 +101,7 @@ def test_a_context_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.
         records.append(run_sortie(scenario, policy, seed))
         return records[-1]
 
-    monkeypatch.setattr("sim.in_flight.run_sortie", fly)
+    monkeypatch.setattr("sortie.sim.in_flight.run_sortie", fly)
     told: list[tuple[str, int, int]] = []
     found = list(flights(str(path), SHIPPED, None, 0.5, ["silence", "all-4"], lambda *at: told.append(at), towns=3))
     scenario = load(path)

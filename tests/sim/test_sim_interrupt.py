@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from sim_examples import BASE
 
-from sim.cli import app, fly
+from sortie.sim.cli import app, fly
 
 COMMAND = """
 import signal, sys
@@ -30,7 +30,7 @@ from {module} import {function}
 
 def entry_point() -> dict[str, str]:
     """Module and function of the command, as it is installed."""
-    text = (Path(app.__file__).parents[2] / "pyproject.toml").read_text("utf-8")
+    text = (Path(app.__file__).resolve().parents[2] / "pyproject.toml").read_text("utf-8")
     module, _, function = tomllib.loads(text)["project"]["scripts"]["sortie"].partition(":")
     return {"module": module, "function": function}
 
@@ -41,7 +41,9 @@ def started(name: str, before: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("name", ["sim.cli.app", "typer", "numpy", "scipy.special", "pyarrow", "fleet.motion"])
+@pytest.mark.parametrize(
+    "name", ["sortie.sim.cli.app", "typer", "numpy", "scipy.special", "pyarrow", "sortie.fleet.motion"]
+)
 def test_while_the_command_is_still_imported(name: str) -> None:
     ended = started(name)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted; nothing was written\n")

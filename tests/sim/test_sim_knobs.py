@@ -16,10 +16,10 @@ from pydantic import BaseModel
 from recording_examples import record_flight
 from sim_examples import example
 
-from policies.contract import Descriptor, FleetView, TaskPhase
-from policies.views import to_json
-from scenarios.schema import Scenario
-from sim.sortie import run_sortie
+from sortie.policies.contract import Descriptor, FleetView, TaskPhase
+from sortie.policies.views import to_json
+from sortie.scenarios.schema import Scenario
+from sortie.sim.sortie import run_sortie
 
 NOT_KNOBS = ("name", "description", "expect", "expect_decisions")
 """Words for people, and what is asserted about the outcome."""
@@ -69,8 +69,8 @@ def descriptor(agent_id: int) -> Descriptor:
 
 
 CROSSING = """
-from policies.baselines import everyone
-from policies.contract import Reposition, looks_from
+from sortie.policies.baselines import everyone
+from sortie.policies.contract import Reposition, looks_from
 
 def nearer(view):
     me, middle = view.me, view.descriptors.get(0)
@@ -356,8 +356,8 @@ def other_weights(path):  # type: ignore[no-untyped-def]
     """The shipped weights with a more hesitant head."""
     import torch
 
-    from perception.checkpoint import load_weights, save_weights
-    from perception.detector import SHIPPED_WEIGHTS
+    from sortie.perception.checkpoint import load_weights, save_weights
+    from sortie.perception.detector import SHIPPED_WEIGHTS
 
     net = load_weights(SHIPPED_WEIGHTS)
     with torch.no_grad():

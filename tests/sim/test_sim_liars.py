@@ -9,11 +9,11 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
-from scenarios.load import load
-from sim.named import policy_overrides
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.sim.named import policy_overrides
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 SEARCH = "mission.phases=[{at_s: 0, phase: search}]"
 

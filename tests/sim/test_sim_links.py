@@ -8,11 +8,11 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
-from scenarios.load import load
-from sim.expect import check
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.sim.expect import check
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 LOSSY = ("policy.name=all-4", "policy.params={rho: 0.1}", "radio.retry_limit=0", "radio.bursts.loss_good=0.05")
 

@@ -16,22 +16,22 @@ import pytest
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from fleet.auth import Dropped, Opened
-from fleet.cdr import MalformedDatagram
-from fleet.staleness import LinkHealth
-from fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
-from policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sim.cli.app import app
-from sim.folders import RunError
-from sim.live import messages
-from sim.live.bus import LOOPBACK, Bus
-from sim.live.clock import WallClock
-from sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
-from sim.live.node import opened
-from sim.live.result import LiveResult, overhead_rows
-from sim.live.session import MAX_DRONES, fly_live
-from sim.live.words import changes_in_words
-from sim.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
+from sortie.fleet.auth import Dropped, Opened
+from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.staleness import LinkHealth
+from sortie.fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
+from sortie.sim.live import messages
+from sortie.sim.live.bus import LOOPBACK, Bus
+from sortie.sim.live.clock import WallClock
+from sortie.sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
+from sortie.sim.live.node import opened
+from sortie.sim.live.result import LiveResult, overhead_rows
+from sortie.sim.live.session import MAX_DRONES, fly_live
+from sortie.sim.live.words import changes_in_words
+from sortie.sim.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
 
 ROOT = Path(__file__).resolve().parents[2]
 DOMAIN = os.getpid() % 200 + 20
@@ -357,7 +357,7 @@ def test_a_kill_that_is_none_and_a_missing_extra_are_one_line(monkeypatch: pytes
     done = CliRunner().invoke(app, ["live", "--kill", "2"])
     assert isinstance(done.exception, RunError)
     assert str(done.exception) == "--kill '2', must be a drone and a time, as in 2@70"
-    for name in [m for m in sys.modules if m.startswith(("cyclonedds", "sim.live"))]:
+    for name in [m for m in sys.modules if m.startswith(("cyclonedds", "sortie.sim.live"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     done = CliRunner().invoke(app, ["live", "track_target"])

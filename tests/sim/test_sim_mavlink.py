@@ -21,13 +21,13 @@ from pymavlink.dialects.v20 import common as mavlink2
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from fleet.mavlink import KEY_BYTES, Listener, Transmitter, answers
-from sim import rundir
-from sim.cli.app import app
-from sim.folders import RunError
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
-from sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
+from sortie.fleet.mavlink import KEY_BYTES, Listener, Transmitter, answers
+from sortie.sim import rundir
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
+from sortie.sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
 
 BEGIN_US = 1_767_225_600_000_000
 

@@ -15,16 +15,16 @@ from rosbags.highlevel import AnyReader
 from sim_examples import example
 from typer.testing import CliRunner
 
-import fleet.agent
-from fleet.wire import decode_descriptor, decode_directive
-from policies.contract import Descriptor
-from sim import rundir
-from sim.bag import descriptors, write_bag
-from sim.cli.app import app
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
-from sim.words import decision_in_words
+import sortie.fleet.agent
+from sortie.fleet.wire import decode_descriptor, decode_directive
+from sortie.policies.contract import Descriptor
+from sortie.sim import rundir
+from sortie.sim.bag import descriptors, write_bag
+from sortie.sim.cli.app import app
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
+from sortie.sim.words import decision_in_words
 
 BEGIN_NS = 1_767_225_600_000_000_000
 Bag = dict[str, list[tuple[int, Any]]]
@@ -35,14 +35,14 @@ def flown() -> tuple[SortieRecord, list[tuple[float, bytes]]]:
     """A sortie of five seconds with an event, and the descriptors as they really went on the air."""
     sent: list[tuple[float, bytes]] = []
     with pytest.MonkeyPatch.context() as patch:
-        encode = fleet.agent.encode_descriptor
+        encode = sortie.fleet.agent.encode_descriptor
 
         def tapped(d: Descriptor) -> bytes:
             data = encode(d)
             sent.append((d.stamp_ns * 1e-9, data))
             return data
 
-        patch.setattr(fleet.agent, "encode_descriptor", tapped)
+        patch.setattr(sortie.fleet.agent, "encode_descriptor", tapped)
         event = "events=[{kind: link_drop, at_s: 3.5, drone: 2, loss_db: 60}]"
         return run_sortie(example("duration_s=5", event)), sent
 
@@ -158,7 +158,7 @@ def test_as_a_folder_it_is_a_bag_of_ros_2_with_the_paper_s_qos(path: Path, recor
 
 
 def test_the_messages_build_as_a_ros_2_package() -> None:
-    package = files("fleet") / "sortie_msgs"
+    package = files("sortie.fleet") / "sortie_msgs"
     listed = re.findall(r'"(msg/\w+\.msg)"', (package / "CMakeLists.txt").read_text("utf-8"))
     assert listed == ["msg/ContextDescriptor.msg", "msg/DataPlaneDirective.msg"]
     assert all((package / name).is_file() for name in listed)

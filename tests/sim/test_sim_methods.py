@@ -10,11 +10,11 @@ import pytest
 from sim_examples import example
 from typer.testing import CliRunner
 
-from policies.prior import METHODS
-from sim.cli.app import app
-from sim.compare import compare
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.policies.prior import METHODS
+from sortie.sim.cli.app import app
+from sortie.sim.compare import compare
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 
 def test_every_method_flies_in_a_comparison() -> None:

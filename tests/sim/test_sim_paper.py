@@ -13,18 +13,18 @@ from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 from rerun.chunk import RrdReader
 from sim_examples import example
 
-from perception.geometry import CELLS, FULL
-from perception.harness import report, rows
-from perception.harness.claims import OVERHEAD
-from perception.harness.measures import Elsewhere
-from perception.harness.picture import Picture
-from perception.harness.sensitivity import Varied
-from perception.types import Boxes
-from policies.registry import resolve
-from sim import paper, plane
-from sim.folders import RunError
-from sim.playback.frame import SHADES, save_frame
-from sim.sortie import run_sortie
+from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.harness import report, rows
+from sortie.perception.harness.claims import OVERHEAD
+from sortie.perception.harness.measures import Elsewhere
+from sortie.perception.harness.picture import Picture
+from sortie.perception.harness.sensitivity import Varied
+from sortie.perception.types import Boxes
+from sortie.policies.registry import resolve
+from sortie.sim import paper, plane
+from sortie.sim.folders import RunError
+from sortie.sim.playback.frame import SHADES, save_frame
+from sortie.sim.sortie import run_sortie
 
 ROOT = Path(__file__).resolve().parents[2]
 

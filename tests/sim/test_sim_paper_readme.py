@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from perception.harness import report, rows
-from perception.harness.sensitivity import Varied
-from perception.study import report as study
-from perception.study.figures import CAPTIONS
-from perception.study.measure import from_table
-from perception.study.plan import read_plan
-from sim import paper
+from sortie.perception.harness import report, rows
+from sortie.perception.harness.sensitivity import Varied
+from sortie.perception.study import report as study
+from sortie.perception.study.figures import CAPTIONS
+from sortie.perception.study.measure import from_table
+from sortie.perception.study.plan import read_plan
+from sortie.sim import paper
 
 ROOT = Path(__file__).resolve().parents[2]
 

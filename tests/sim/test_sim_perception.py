@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from scenarios.load import load
-from scenarios.schema import Scenario
-from sim.compare import compare
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.compare import compare
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 SHORT = ("duration_s=16", "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]", "policy.dwell_s=0.2")
 pytestmark = pytest.mark.slow

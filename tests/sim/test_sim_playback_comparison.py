@@ -9,10 +9,10 @@ import pytest
 from rerun.chunk import RrdReader
 from sim_examples import example
 
-from sim.playback.comparison import roots
-from sim.playback.recording import save_comparison, save_rrd
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.sim.playback.comparison import roots
+from sortie.sim.playback.recording import save_comparison, save_rrd
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 
 @pytest.fixture(scope="module")

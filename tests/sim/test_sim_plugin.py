@@ -15,15 +15,15 @@ from scipy import stats
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from scenarios.load import load
-from sim.checking import check_scenario
-from sim.cli.app import app
-from sim.expect import check, limit
-from sim.folders import RunError
-from sim.golden import golden_path, moved, write_golden
-from sim.outcome import outcome
-from sim.pytest_plugin import _is_scenario
-from sim.sortie import run_sortie
+from sortie.scenarios.load import load
+from sortie.sim.checking import check_scenario
+from sortie.sim.cli.app import app
+from sortie.sim.expect import check, limit
+from sortie.sim.folders import RunError
+from sortie.sim.golden import golden_path, moved, write_golden
+from sortie.sim.outcome import outcome
+from sortie.sim.pytest_plugin import _is_scenario
+from sortie.sim.sortie import run_sortie
 
 SHORT = BASE.replace("duration_s: 6", "duration_s: 1").replace("at_s: 3", "at_s: 0.5")
 EXPECT = """

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from policies.contract import Directive, FleetView, Representation
-from scenarios.load import loads
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.scenarios.load import loads
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 BASE = """
 name: random

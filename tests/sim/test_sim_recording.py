@@ -10,10 +10,10 @@ from recording_examples import record_flight, small
 from sim_examples import example
 from typer.testing import CliRunner
 
-from perception.outside.recorded import RecordingError
-from sim.cli.app import app
-from sim.compare import compare
-from sim.sortie import run_sortie
+from sortie.perception.outside.recorded import RecordingError
+from sortie.sim.cli.app import app
+from sortie.sim.compare import compare
+from sortie.sim.sortie import run_sortie
 
 RECORDED = "perception.detector=recorded"
 SHORT = ("duration_s=2", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.2")
@@ -50,7 +50,9 @@ def test_wrong_questions_are_told(tmp_path: Path) -> None:
 def test_a_threshold_that_cannot_be_is_told_before_anything_is_evaluated(
     tau: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("perception.outside.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated"))
+    monkeypatch.setattr(
+        "sortie.perception.outside.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated")
+    )
     done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--tau", tau])
     assert str(done.exception) == f"tau is {tau}, must be 0.01 to 1"
 

@@ -10,13 +10,13 @@ from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hin
 import pytest
 from sim_examples import example
 
-import radio
-from sim import reference
-from sim.golden import figures
-from sim.outcome import outcome
-from sim.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
-from sim.record import ABOUT, TABLES
-from sim.sortie import run_sortie
+from sortie import radio
+from sortie.sim import reference
+from sortie.sim.golden import figures
+from sortie.sim.outcome import outcome
+from sortie.sim.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
+from sortie.sim.record import ABOUT, TABLES
+from sortie.sim.sortie import run_sortie
 
 
 class Leaf(TypedDict):
@@ -114,7 +114,7 @@ def test_a_field_of_another_name_or_kind_is_found(change: dict[str, Any], fault:
 
 
 def test_the_page_is_current() -> None:
-    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sim.reference"
+    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sortie.sim.reference"
 
 
 def test_every_table_is_told() -> None:

@@ -16,15 +16,15 @@ from matplotlib.figure import Figure
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sim import report_figures, rundir
-from sim.cli.app import app
-from sim.folders import RunError
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.report_page import page, save_page
-from sim.sortie import run_sortie
-from sim.tables import size
-from sim.words import decision_in_words
+from sortie.sim import report_figures, rundir
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.report_page import page, save_page
+from sortie.sim.sortie import run_sortie
+from sortie.sim.tables import size
+from sortie.sim.words import decision_in_words
 
 VOID = {"meta", "br", "link", "img"}
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from sim_examples import example
 
-from policies.contract import PolicyError
-from scenarios.load import ScenarioError
-from sim.named import policy_overrides
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.policies.contract import PolicyError
+from sortie.scenarios.load import ScenarioError
+from sortie.sim.named import policy_overrides
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 SLOW = "rate_hz <= 5"
 
@@ -27,7 +27,9 @@ def base() -> SortieRecord:
 def twin(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The worked policy of the example under another name."""
     path = tmp_path_factory.mktemp("policies") / "twin.py"
-    path.write_text("from policies.worked import worked\n\ndef decide(view):\n    return worked(view, rho=0.25)\n")
+    path.write_text(
+        "from sortie.policies.worked import worked\n\ndef decide(view):\n    return worked(view, rho=0.25)\n"
+    )
     return f"{path}:decide"
 
 
@@ -202,7 +204,7 @@ BROKEN = {
 def test_a_users_policy_that_breaks_the_contract_is_told_how(name: str, tmp_path: Path) -> None:
     code, message = BROKEN[name]
     path = tmp_path / "mine.py"
-    path.write_text(f"from policies.contract import Directive\n\ndef {name}(view):\n    return {code}\n")
+    path.write_text(f"from sortie.policies.contract import Directive\n\ndef {name}(view):\n    return {code}\n")
     with pytest.raises(PolicyError, match=message.replace("directive 0", r"directive \d")):
         run_sortie(example("duration_s=1", "mission.phases=[{at_s: 0, phase: search}]"), f"{path}:{name}")
 
@@ -210,7 +212,7 @@ def test_a_users_policy_that_breaks_the_contract_is_told_how(name: str, tmp_path
 def test_what_the_audit_cannot_read_is_told_as_without_it(tmp_path: Path) -> None:
     path = tmp_path / "texts.py"
     path.write_text(
-        "from policies.contract import Directive, Representation\n\ndef decide(view):\n"
+        "from sortie.policies.contract import Directive, Representation\n\ndef decide(view):\n"
         "    return [Directive(view.ego, p, Representation.FEATURES, 0.1, rate_hz='10') for p in view.peers]\n"
     )
     for rules in ("policy.invariants=''", f"policy.invariants={SLOW}"):

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.table import Table
 from sim_examples import example
 
-from policies.contract import Directive, FleetView, Representation
-from sim.expect import Verdict
-from sim.outcome import outcome
-from sim.sortie import run_sortie
-from sim.tables import points, transitions_table, verdict_table
+from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.sim.expect import Verdict
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
+from sortie.sim.tables import points, transitions_table, verdict_table
 
 REASON = "as in [roi] and [/roi]"
 """Which the terminal's markup would swallow, or stumble over."""

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from sim_examples import example
 
-from fleet.cell import energy_fraction
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.fleet.cell import energy_fraction
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 STATES = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps", "soc")
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 from cli_examples import command
 
-from policies.conformance import RULES
-from policies.contract import TaskPhase
-from policies.registry import resolve
-from policies.views import draw_views, from_json, to_json
-from sim import console
-from sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
+from sortie.policies.conformance import RULES
+from sortie.policies.contract import TaskPhase
+from sortie.policies.registry import resolve
+from sortie.policies.views import draw_views, from_json, to_json
+from sortie.sim import console
+from sortie.sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 
 FAULTY = '''
-from policies.contract import Directive, Representation
+from sortie.policies.contract import Directive, Representation
 
 INVARIANTS = """
 when target_in_region and peers >= 1: any_link(representation >= detections)
@@ -121,7 +121,7 @@ def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
 
 
 BROKEN = """
-from policies.contract import Directive, Representation
+from sortie.policies.contract import Directive, Representation
 
 INVARIANTS = "rate_hz <= 20"
 

@@ -12,14 +12,22 @@ import numpy as np
 import pytest
 from sim_examples import example
 
-from fleet.coverage import unpack_grid
-from fleet.motion import MotionError
-from policies.baselines import everyone
-from policies.contract import COVERAGE_CELL_M, Coverage, Directive, FleetView, PolicyError, Reposition, looks_from
-from policies.vantage import vantage
-from sim.outcome import outcome
-from sim.record import SortieRecord
-from sim.sortie import run_sortie
+from sortie.fleet.coverage import unpack_grid
+from sortie.fleet.motion import MotionError
+from sortie.policies.baselines import everyone
+from sortie.policies.contract import (
+    COVERAGE_CELL_M,
+    Coverage,
+    Directive,
+    FleetView,
+    PolicyError,
+    Reposition,
+    looks_from,
+)
+from sortie.policies.vantage import vantage
+from sortie.sim.outcome import outcome
+from sortie.sim.record import SortieRecord
+from sortie.sim.sortie import run_sortie
 
 ASIDE = "mission.target.waypoints_m=[[-60, 60], [200, 60]]"
 LONG = (
@@ -180,6 +188,6 @@ def test_nearer_the_region_more_is_found_in_it() -> None:
 )
 def test_gains_that_cannot_be_measured_are_refused(arguments: list[str], message: str) -> None:
     """One sortie has no interval, and one that ends before it tracks has no accuracy: it was NaN."""
-    ran = subprocess.run([sys.executable, "-m", "sim.repositions", *arguments], capture_output=True, text=True)
+    ran = subprocess.run([sys.executable, "-m", "sortie.sim.repositions", *arguments], capture_output=True, text=True)
     assert ran.returncode == 2
     assert ran.stderr.endswith(f"error: {message}\n")

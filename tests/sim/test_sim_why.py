@@ -7,9 +7,9 @@ import dataclasses
 import pyarrow as pa
 from sim_examples import example
 
-from sim.outcome import outcome
-from sim.sortie import run_sortie
-from sim.why import why
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
+from sortie.sim.why import why
 
 
 def test_a_reason_keeps_its_figures() -> None:

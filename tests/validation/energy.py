@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from fleet.battery import CAUSES, FleetBatteries
-from fleet.dataflash import read_dataflash
-from fleet.flightlog import FlightLog, read_log
-from fleet.identify import (
+from sortie.fleet.battery import CAUSES, FleetBatteries
+from sortie.fleet.dataflash import read_dataflash
+from sortie.fleet.flightlog import FlightLog, read_log
+from sortie.fleet.identify import (
     electric_power_w,
     hovering,
     identify_pack,
@@ -30,8 +30,8 @@ from fleet.identify import (
     stated_pack,
     voltage_error,
 )
-from fleet.rotor import figure_of_merit, momentum_power_w, rotor_power_w
-from scenarios.schema import Airframe, Battery
+from sortie.fleet.rotor import figure_of_merit, momentum_power_w, rotor_power_w
+from sortie.scenarios.schema import Airframe, Battery
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = Path(os.environ.get("SORTIE_FLIGHT_LOG", ROOT.parent / "shared/flightlogs/log171.bin"))

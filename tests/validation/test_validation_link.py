@@ -6,11 +6,11 @@ import link
 import pytest
 import simpy
 
-from radio.airtime import BLOCK_ACK_S, Exchanges
-from radio.contention import DIFS_S, SIFS_S, SLOT_S
-from radio.jobs import GroupFrame, Job
-from radio.medium import Medium
-from scenarios.schema import Radio
+from sortie.radio.airtime import BLOCK_ACK_S, Exchanges
+from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S
+from sortie.radio.jobs import GroupFrame, Job
+from sortie.radio.medium import Medium
+from sortie.scenarios.schema import Radio
 
 
 def test_the_analytic_model_is_ns3s_within_one_percent() -> None:

@@ -20,12 +20,12 @@ import numpy as np
 import pyarrow.compute as pc
 import simpy
 
-from radio import Air, Status
-from radio.age import Chain, mean_age_s, share_older
-from scenarios.load import loads
-from scenarios.schema import Radio, Scenario
-from sim.outcome import outcome
-from sim.sortie import run_sortie
+from sortie.radio import Air, Status
+from sortie.radio.age import Chain, mean_age_s, share_older
+from sortie.scenarios.load import loads
+from sortie.scenarios.schema import Radio, Scenario
+from sortie.sim.outcome import outcome
+from sortie.sim.sortie import run_sortie
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs/validation"

@@ -11,7 +11,7 @@ def main() -> None:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # where it is ignored, it stays so
         signal.signal(signal.SIGINT, _leave)
-    from sim.cli.app import main as command  # here: it takes a second
+    from sortie.sim.cli.app import main as command  # here: it takes a second
 
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, before)
