@@ -15,14 +15,14 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import simpy
 
-from sortie.fleet.auth import Dropped, DropReason, Inbox, Opened, Sealer
-from sortie.fleet.compact import FULL, Form, encode_compact
 from sortie.fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from sortie.fleet.gate import Gate, Payload, make_payload
+from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened, Sealer
+from sortie.fleet.messages.compact import FULL, Form, encode_compact
+from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
-from sortie.fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from sortie.perception.types import Capture
 from sortie.policies.contract import (
     Descriptor,

@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from sortie.fleet import tiles
-from sortie.fleet.wire import DIRECTIVE_BYTES
+from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
 from sortie.policies.contract import Directive, Disc, Representation
 

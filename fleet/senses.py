@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from sortie.fleet.coverage import footprint_radius_m, survey
-from sortie.fleet.motion import Motion
+from sortie.fleet.flight.motion import Motion
 from sortie.perception.types import Capture
 
 COVERAGE_PERIOD_S = 1.0

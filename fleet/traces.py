@@ -19,7 +19,6 @@ after the last place a drone stands there, without velocity. A drone without a p
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -28,9 +27,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from sortie.fleet.cell import energy_fraction
-from sortie.fleet.frames import yaw_rad
-from sortie.fleet.motion import Motion, body_rates
+from sortie.fleet.energy.cell import energy_fraction
+from sortie.fleet.energy.recorded import BatteryTrace
+from sortie.fleet.flight.frames import yaw_rad
+from sortie.fleet.flight.motion import Motion, body_rates
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
@@ -57,36 +57,6 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "rssi_dbm": (-200.0, 50.0),
     "rssi_percent": (0.0, 100.0),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class BatteryTrace:
-    """One drone's charge over time; lists, because single values are asked for once a frame."""
-
-    time_s: list[float]
-    soc: list[float]
-    energy: list[float]
-    """Energy fraction of the charge."""
-    voltage_time_s: list[float]
-    voltage_v: list[float]
-    current_time_s: list[float]
-    current_a: list[float]
-
-    def soc_at(self, t_s: float) -> float:
-        """State of charge, 0 … 1."""
-        return _between(self.time_s, self.soc, t_s)
-
-    def energy_fraction_at(self, t_s: float) -> float:
-        """Share of a full pack's energy that is left."""
-        return _between(self.time_s, self.energy, t_s)
-
-    def voltage_at(self, t_s: float) -> float | None:
-        """Terminal voltage, or None where the trace has none."""
-        return _between(self.voltage_time_s, self.voltage_v, t_s) if self.voltage_v else None
-
-    def current_at(self, t_s: float) -> float | None:
-        """Current, or None where the trace has none."""
-        return _between(self.current_time_s, self.current_a, t_s) if self.current_a else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,17 +207,6 @@ def _battery(own: Mapping[str, Array], where: str) -> BatteryTrace | None:
 
 
 # --- arithmetic ----------------------------------------------------------------------------------
-
-
-def _between(time_s: Sequence[float], values: Sequence[float], t_s: float) -> float:
-    """Linear between samples, held beyond them."""
-    k = bisect_right(time_s, t_s)
-    if k == 0:
-        return values[0]
-    if k == len(time_s):
-        return values[-1]
-    share = (t_s - time_s[k - 1]) / (time_s[k] - time_s[k - 1])
-    return values[k - 1] + share * (values[k] - values[k - 1])
 
 
 def _sample(t_s: Array, time_s: Array, values: Array) -> Array:

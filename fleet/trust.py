@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sortie.fleet.compact import FULL, Form
 from sortie.fleet.coverage import RANGE_M, unpack_grid
+from sortie.fleet.messages.compact import FULL, Form
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
 JUDGED_EVERY_S = 1.0

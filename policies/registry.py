@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sortie.policies import adaptive, baselines
+from sortie.policies.catalogue import adaptive, baselines
+from sortie.policies.catalogue.deputies import deputies
+from sortie.policies.catalogue.prior import METHODS
+from sortie.policies.catalogue.vantage import vantage
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
-from sortie.policies.deputies import deputies
-from sortie.policies.prior import METHODS
-from sortie.policies.vantage import vantage
-from sortie.policies.worked import worked
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worked": worked,

@@ -21,17 +21,17 @@ import numpy as np
 import simpy
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.airtime import repair_wire_bytes, sample_wire
-from sortie.radio.broadcasts import Broadcast, Broadcasts, OnHeard
-from sortie.radio.channel import Channel, FloatArray, Jammer, SampleLuck
+from sortie.radio.channel.snr import Channel, FloatArray, Jammer, SampleLuck
+from sortie.radio.channel.traces import read_links
 from sortie.radio.counters import Counters
 from sortie.radio.goodput import Goodput
-from sortie.radio.jobs import End
-from sortie.radio.medium import Medium
+from sortie.radio.mac.airtime import repair_wire_bytes, sample_wire
+from sortie.radio.mac.broadcasts import Broadcast, Broadcasts, OnHeard
+from sortie.radio.mac.jobs import End
+from sortie.radio.mac.medium import Medium
 from sortie.radio.overrides import Overrides
 from sortie.radio.relay import Routes
 from sortie.radio.sample import IntArray, Sample, Service
-from sortie.radio.traces import read_links
 from sortie.radio.transmission import Status, Transmission
 from sortie.scenarios.schema import Radio
 from sortie.scenarios.streams import stream

@@ -3,7 +3,7 @@
 Every sender always has something to send. It waits for a DIFS of silence, counts its backoff down by a slot while the
 channel stays idle, keeps the rest while it is busy, and sends at zero; senders at zero together collide, double their
 windows and draw again; a success resets the window (IEEE 802.11-2020, §10.3.4). One event is one busy period. The
-analytic model (`sortie.radio.contention`) shares none of this code and none of its assumptions: here collisions have memory,
+analytic model (`sortie.radio.mac.contention`) shares none of this code and none of its assumptions: here collisions have memory,
 lengths differ, and a sender that has just sent may go on at once.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.radio.contention import CW_MAX, CW_MIN, DIFS_S, SIFS_S, SLOT_S
+from sortie.radio.mac.contention import CW_MAX, CW_MIN, DIFS_S, SIFS_S, SLOT_S
 
 FloatArray = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.bursts import PairNumbers, PairStates
+from sortie.radio.channel.bursts import PairNumbers, PairStates
+from sortie.radio.channel.traces import Given, LinkTrace
 from sortie.radio.rates import group_mcs, rate_table
-from sortie.radio.traces import Given, LinkTrace
 from sortie.scenarios.schema import Radio
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,7 @@ from math import isnan, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.radio.airtime import (
+from sortie.radio.mac.airtime import (
     ACK_S,
     Exchanges,
     ampdu_frames,
@@ -19,10 +19,10 @@ from sortie.radio.airtime import (
     sample_exchanges,
     tries,
 )
-from sortie.radio.contention import contention
-from sortie.radio.jobs import Job
+from sortie.radio.mac.contention import contention
+from sortie.radio.mac.jobs import Job
+from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
-from sortie.radio.rate_control import Minstrel
 from sortie.radio.rates import STANDARDS, rate_table, rescale
 from sortie.radio.transmission import Status, Transmission, losses
 from sortie.scenarios.schema import Radio

@@ -317,7 +317,7 @@ class Radio(Section):
     bursts: Bursts = Bursts()
     trace: str | None = Field(
         None,
-        description="CSV or Parquet (radio/traces.py): links named in it take SNR, loss or goodput from it, not from the models.",
+        description="CSV or Parquet (radio/channel/traces.py): links named in it take SNR, loss or goodput from it, not from the models.",
     )
     heartbeat_s: float = Field(0.02, gt=0, le=10, description="Heartbeat period of the reliable writer.")
     nack_delay_s: float = Field(0.005, ge=0, le=10, description="The reader's delay before it asks for a repair.")
@@ -495,7 +495,9 @@ class Policy(Section):
     )
     commands: tuple[PolicyCommand, ...] = Field((), max_length=1000, description="Commands from the ground.")
     invariants: str = Field(
-        "", max_length=10000, description="What directives must keep, one line each (policies/invariants.py); counted."
+        "",
+        max_length=10000,
+        description="What directives must keep, one line each (policies/verification/invariants.py); counted.",
     )
     shield: bool = Field(
         False, description="Directives that break an invariant are replaced by the nearest that keep it."

@@ -1,4 +1,4 @@
-"""What all traces share: tables of numbers over time that drive drones (fleet/traces.py) and links (radio/traces.py).
+"""What all traces share: tables of numbers over time that drive drones (fleet/traces.py) and links (radio/channel/traces.py).
 
 A trace is a CSV or Parquet file whose columns are numbers with their unit in the name. `t_s` counts from the
 sortie's begin and increases for each drone or link; between rows values run linearly, before the first and after the

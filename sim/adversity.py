@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import simpy
 
-from sortie.fleet.auth import TRAILER_BYTES, Sealer
 from sortie.fleet.lies import falsified
-from sortie.fleet.wire import decode_descriptor, encode_descriptor
+from sortie.fleet.messages.auth import TRAILER_BYTES, Sealer
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.scenarios.schema import (
     BatteryFault,
     CellFailure,

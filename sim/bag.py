@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.fleet.coverage import TARGET_FLAG, footprint_radius_m
-from sortie.fleet.wire import (
+from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
     DIRECTIVE_MSG,

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sortie.policies.conformance import raised_part
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
-from sortie.policies.proof import View
-from sortie.policies.views import to_json
+from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.proof import View
+from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
 from sortie.sim.sortie import run_sortie
 

@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 from sortie.fleet.agent import Agent, Received
-from sortie.fleet.auth import Dropped, Opened, open_datagram
 from sortie.fleet.gate import Payload
+from sortie.fleet.messages.auth import Dropped, Opened, open_datagram
 from sortie.fleet.tiles import cells_of
 from sortie.perception.types import Capture
 from sortie.policies.contract import Representation

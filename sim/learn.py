@@ -1,9 +1,9 @@
-"""Learning to spend a budget: simulated sorties under every arm of `sortie.policies.adaptive`, and what they teach.
+"""Learning to spend a budget: simulated sorties under every arm of `sortie.policies.catalogue.adaptive`, and what they teach.
 
 An offline contextual bandit. Training contexts are drawn from ranges that the held-out set
 (`scenarios/library/contexts.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that
 arms differ by nothing but themselves. Per arm, ridge regression predicts the AP gained over the first arm from what a
-policy sees (`sortie.policies.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
+policy sees (`sortie.policies.catalogue.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from sortie.perception.ap import average_precision
 from sortie.perception.detectors import make_detector
-from sortie.policies.adaptive import ARMS, features, spend
+from sortie.policies.catalogue.adaptive import ARMS, features, spend
 from sortie.policies.contract import Directive, FleetView
 from sortie.scenarios.load import load
 from sortie.scenarios.schema import Scenario

@@ -9,8 +9,8 @@ from collections.abc import Collection, Mapping
 from types import UnionType
 from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
 
-from sortie.fleet.auth import DropReason
-from sortie.fleet.battery import CAUSES, RECORDED
+from sortie.fleet.energy.battery import CAUSES, RECORDED
+from sortie.fleet.messages.auth import DropReason
 from sortie.radio.transmission import Status
 from sortie.scenarios.nodes import nearest
 
@@ -42,7 +42,7 @@ class Bytes(TypedDict):
     context_directives: Annotated[int, "Directives at 36 B, counted when they change."]
     data_sent: Annotated[int, "Payloads handed to the radio: delivered + lost + expired + in flight."]
     handshakes_sent: Annotated[
-        int, "What a method put on its links before payloads (`sortie.policies.prior`), part of `data_sent`."
+        int, "What a method put on its links before payloads (`sortie.policies.catalogue.prior`), part of `data_sent`."
     ]
     data_delivered: Annotated[int, "Arrived; of payloads that came in part, that part."]
     data_lost: Annotated[int, "Lost on the air."]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import simpy
 
 from sortie.fleet.agent import Agent
-from sortie.policies.conformance import raised_part
 from sortie.policies.contract import (
     Directive,
     FleetView,
@@ -25,10 +24,11 @@ from sortie.policies.contract import (
     check_directives,
     check_reposition,
 )
-from sortie.policies.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
 from sortie.policies.registry import handshake_bytes, resolve, told, viewpoint_of
-from sortie.policies.shield import MARK, checked, enforce
-from sortie.policies.views import ViewError, from_json
+from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
+from sortie.policies.verification.shield import MARK, checked, enforce
+from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.schema import Policy as PolicySection
 from sortie.scenarios.schema import PolicyChange
 from sortie.sim.record import DECISIONS_OF, Recorder

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from sortie.fleet.wire import descriptor_bytes, encode_directive
+from sortie.fleet.messages.wire import descriptor_bytes, encode_directive
 from sortie.perception.harness.verdict import Measured
 from sortie.policies.contract import Directive, FleetView, Policy
 from sortie.policies.registry import resolve

@@ -18,9 +18,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
-from sortie.fleet.wire import DIRECTIVE_BYTES
 from sortie.policies.contract import Descriptor, Directive, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
 

@@ -14,11 +14,11 @@ import pyarrow as pa
 import simpy
 
 from sortie.fleet.agent import Agent, PlaneRules
-from sortie.fleet.auth import Sealer
-from sortie.fleet.battery import FleetBatteries
-from sortie.fleet.compact import Form
-from sortie.fleet.frames import up_vector
-from sortie.fleet.motion import fly
+from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.frames import up_vector
+from sortie.fleet.flight.motion import fly
+from sortie.fleet.messages.auth import Sealer
+from sortie.fleet.messages.compact import Form
 from sortie.fleet.traces import follow, read_traces
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
 from sortie.perception.scene import SceneModel

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from sortie.fleet.mavlink import (
+from sortie.fleet.logs.mavlink import (
     KEY_BYTES,
     STATUS,
     Listener,

@@ -17,7 +17,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
-from sortie.fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME
+from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME
 
 BYTES_NAME = "std_msgs/msg/UInt8MultiArray"
 

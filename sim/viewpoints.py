@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sortie.fleet.displaced import displaced
-from sortie.fleet.viewpoints import Move, Plan, bounds_of, course_of, grant
+from sortie.fleet.flight.displaced import displaced
+from sortie.fleet.flight.viewpoints import Move, Plan, bounds_of, course_of, grant
 from sortie.policies.contract import Reposition
 from sortie.scenarios.schema import Scenario
 from sortie.sim.world import World

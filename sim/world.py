@@ -14,11 +14,11 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Agent, Platform, Task
-from sortie.fleet.battery import FleetBatteries
 from sortie.fleet.coverage import RANGE_M
-from sortie.fleet.frames import up_vector
-from sortie.fleet.motion import Motion
-from sortie.fleet.rotor import fleet_power_w
+from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.frames import up_vector
+from sortie.fleet.flight.motion import Motion
+from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.perception.scene import SceneModel
 from sortie.perception.types import Capture

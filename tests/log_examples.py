@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from sortie.fleet.mavlink import Origin, Telemetry, Transmitter, geodetic, messages
+from sortie.fleet.logs.mavlink import Origin, Telemetry, Transmitter, geodetic, messages
 
 ORIGIN = Origin(47.0, 8.0, 400.0)
 STEPS = 100

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sortie.fleet.motion import fly
+from sortie.fleet.flight.motion import fly
 from sortie.perception.outside.exchange import moved
 from sortie.perception.outside.writing import write_recording
 from sortie.perception.scene import SceneModel

@@ -10,8 +10,8 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from sortie.fleet.motion import MotionError
-from sortie.fleet.wire import DescriptorTooLarge
+from sortie.fleet.flight.motion import MotionError
+from sortie.fleet.messages.wire import DescriptorTooLarge
 from sortie.perception.errors import InputError
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.load import ScenarioError

@@ -14,7 +14,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from sortie.perception.detectors import make_detector
-from sortie.policies.adaptive import ARMS
+from sortie.policies.catalogue.adaptive import ARMS
 from sortie.policies.registry import resolve
 from sortie.scenarios.contexts import Contexts
 from sortie.sim.console import bars, out
@@ -117,7 +117,8 @@ def learn(
         typer.Option("--by-torch", help="The torch detector scores what the surrogate flies; half an hour a core."),
     ] = False,
     out_file: Annotated[
-        Path, typer.Option("--out", help="Where the fit is kept; policies/learned.json is the one that flies.")
+        Path,
+        typer.Option("--out", help="Where the fit is kept; policies/catalogue/learned.json is the one that flies."),
     ] = Path("runs/learned.json"),
 ) -> None:
     """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from sortie.fleet.cell import MEAN_CELL_V
+from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.scenarios.load import loads
 from sortie.sim.console import out, user_errors
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
@@ -49,8 +49,8 @@ def import_log(
 
     Gaps, restarts, damaged and missing messages are told and survived; gaps are empty cells of the trace.
     """
-    from sortie.fleet.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
-    from sortie.fleet.logtrace import context_trace, write_trace
+    from sortie.fleet.logs.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
+    from sortie.fleet.logs.logtrace import context_trace, write_trace
 
     folder = out_dir or Path(slug(log))
     ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO})

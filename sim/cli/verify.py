@@ -15,13 +15,13 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sortie.policies.conformance import VIEWS, Check, conform, failing
 from sortie.policies.contract import FleetView, Policy
-from sortie.policies.invariants import Invariant, InvariantError, parse
-from sortie.policies.proof import PLANE, Verdict, prove
-from sortie.policies.properties import PROMISES
 from sortie.policies.registry import resolve
-from sortie.policies.views import to_json
+from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
+from sortie.policies.verification.invariants import Invariant, InvariantError, parse
+from sortie.policies.verification.proof import PLANE, Verdict, prove
+from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.views import to_json
 from sortie.scenarios.load import dump, loads
 from sortie.scenarios.schema import Policy as PolicySection
 from sortie.scenarios.schema import Scenario

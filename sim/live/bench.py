@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter
 
-from sortie.fleet.auth import Opened
-from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.messages.auth import Opened
+from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
 from sortie.sim.live.messages import unpack_bytes
 from sortie.sim.live.node import opened

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
-from sortie.fleet.motion import fly
+from sortie.fleet.flight.motion import fly
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import follow, read_traces
 from sortie.perception.scene import SceneModel

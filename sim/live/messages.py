@@ -1,7 +1,7 @@
 """The plane's messages as DDS types, named and laid out as ROS 2 has them on the wire.
 
 A type is made from its `.msg` text (`fleet/sortie_msgs`; three standard ones stand below), so that there is no second
-definition. A sample is kept as its CDR bytes: `sortie.fleet.wire` writes and reads them, with all its checks, and this module
+definition. A sample is kept as its CDR bytes: `sortie.fleet.messages.wire` writes and reads them, with all its checks, and this module
 only tells DDS what they are called. `sortie_msgs/msg/ContextDescriptor` is `sortie_msgs::msg::dds_::ContextDescriptor_`.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import array, float32, int32, sequence, uint8, uint16, uint32
 
-from sortie.fleet.cdr import ENCAPSULATION, MalformedDatagram
-from sortie.fleet.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
+from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram
+from sortie.fleet.messages.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
 from sortie.sim.topics import BYTES_NAME
 
 DEFINITIONS = {

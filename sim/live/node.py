@@ -18,12 +18,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sortie.fleet.agent import Agent, PlaneRules
-from sortie.fleet.auth import Dropped, DropReason, Opened, open_datagram
-from sortie.fleet.cdr import MalformedDatagram
 from sortie.fleet.gate import HEADER_BYTES, Gate, Payload
+from sortie.fleet.messages.auth import Dropped, DropReason, Opened, open_datagram
+from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
 from sortie.fleet.staleness import LinkHealth, health
 from sortie.fleet.trust import Standing
-from sortie.fleet.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
 from sortie.scenarios.streams import stream

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from sortie.fleet.frames import yaw_rad
+from sortie.fleet.flight.frames import yaw_rad
 from sortie.perception.budget import CELL_M, roi_mask
 from sortie.perception.geometry import CELLS
 from sortie.sim.playback import canvas as c

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from sortie.fleet.auth import Inbox, Sealer, open_datagram
-from sortie.fleet.battery import FleetBatteries
-from sortie.fleet.motion import fly
-from sortie.fleet.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.motion import fly
+from sortie.fleet.messages.auth import Inbox, Sealer, open_datagram
+from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.scenarios.schema import Battery, Fleet, Route
 

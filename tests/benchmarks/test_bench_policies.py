@@ -9,8 +9,8 @@ from __future__ import annotations
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from sortie.policies.conformance import full_view
 from sortie.policies.registry import POLICIES
+from sortie.policies.verification.conformance import full_view
 
 
 @pytest.mark.parametrize("drones", [5, 25, 100])

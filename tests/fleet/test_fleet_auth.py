@@ -9,8 +9,8 @@ from fleet_examples import DESCRIPTOR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.auth import MAX_COUNTER, Dropped, DropReason, Inbox, Opened, Sealer, open_datagram, tag
-from sortie.fleet.wire import encode_descriptor
+from sortie.fleet.messages.auth import MAX_COUNTER, Dropped, DropReason, Inbox, Opened, Sealer, open_datagram, tag
+from sortie.fleet.messages.wire import encode_descriptor
 from sortie.policies.contract import Descriptor
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
@@ -89,7 +89,9 @@ def test_random_bytes_never_raise_and_never_pass(data: bytes, authentication: bo
 
 def test_the_parser_sees_no_unauthenticated_byte(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[bytes] = []
-    monkeypatch.setattr("sortie.fleet.auth.decode_descriptor", lambda payload: seen.append(payload) or DESCRIPTOR)
+    monkeypatch.setattr(
+        "sortie.fleet.messages.auth.decode_descriptor", lambda payload: seen.append(payload) or DESCRIPTOR
+    )
     for data in (sealed(key=OTHER), sealed(key_id=8), sealed()[:-1], sealed(bytes(1025)), PAYLOAD):
         open_datagram(data, KEYS)
     assert seen == []

@@ -12,10 +12,10 @@ from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
-from sortie.fleet import cell
-from sortie.fleet.battery import CAUSES, FleetBatteries
-from sortie.fleet.cell import current_a, energy_fraction, open_circuit_cell_v
-from sortie.fleet.rotor import climb_power_w, rotor_power_w
+from sortie.fleet.energy import cell
+from sortie.fleet.energy.battery import CAUSES, FleetBatteries
+from sortie.fleet.energy.cell import current_a, energy_fraction, open_circuit_cell_v
+from sortie.fleet.flight.rotor import climb_power_w, rotor_power_w
 from sortie.scenarios.schema import Battery, DroneOverride
 
 HOVER_W = 168.48

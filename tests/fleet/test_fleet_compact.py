@@ -9,9 +9,10 @@ from fleet_examples import DESCRIPTOR, descriptors
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sortie.fleet.auth import Dropped, DropReason, open_datagram
-from sortie.fleet.cdr import MalformedDatagram
-from sortie.fleet.compact import (
+from sortie.fleet.coverage import pack_grid, survey, unpack_grid
+from sortie.fleet.messages.auth import Dropped, DropReason, open_datagram
+from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.compact import (
     GRID_BITS,
     GRID_CELLS,
     MIN_COMPACT_BYTES,
@@ -20,8 +21,7 @@ from sortie.fleet.compact import (
     decode_compact,
     encode_compact,
 )
-from sortie.fleet.coverage import pack_grid, survey, unpack_grid
-from sortie.fleet.wire import decode_descriptor
+from sortie.fleet.messages.wire import decode_descriptor
 from sortie.policies.contract import Coverage
 
 forms = st.builds(Form, st.sampled_from(GRID_CELLS), st.sampled_from(GRID_BITS), st.sampled_from(NUMBER_BITS))

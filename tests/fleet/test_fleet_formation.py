@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from sortie.fleet.formation import slots
+from sortie.fleet.flight.formation import slots
 
 GROWING = ["cross", "line", "wedge", "grid"]
 SHAPES = [*GROWING, "circle"]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.frames import (
+from sortie.fleet.flight.frames import (
     compass_deg,
     swap_attitude,
     swap_enu_ned,

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.fleet.dataflash import RawLog, read_dataflash
-from sortie.fleet.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
-from sortie.fleet.identify import predicted_voltage
-from sortie.fleet.mavlink import geodetic, read_tlog
-from sortie.fleet.ulog import read_ulog
+from sortie.fleet.logs.dataflash import RawLog, read_dataflash
+from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
+from sortie.fleet.logs.identify import predicted_voltage
+from sortie.fleet.logs.mavlink import geodetic, read_tlog
+from sortie.fleet.logs.ulog import read_ulog
 from sortie.scenarios.schema import Battery
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from sortie.fleet import noise
-from sortie.fleet.noise import gauss_markov, smooth
+from sortie.fleet.flight import noise
+from sortie.fleet.flight.noise import gauss_markov, smooth
 
 steps = st.floats(0.001, 2.0)
 times = st.floats(0.05, 100.0)

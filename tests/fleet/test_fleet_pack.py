@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.fleet.battery import CAUSES, RECORDED, FleetBatteries
-from sortie.fleet.cell import (
+from sortie.fleet.energy.battery import CAUSES, RECORDED, FleetBatteries
+from sortie.fleet.energy.cell import (
     MEAN_CELL_V,
     ageing,
     energy_fraction,
@@ -19,7 +19,7 @@ from sortie.fleet.cell import (
     resistance_factor,
     terminal_voltage_v,
 )
-from sortie.fleet.traces import BatteryTrace
+from sortie.fleet.energy.recorded import BatteryTrace
 from sortie.scenarios.schema import Battery, DroneOverride
 
 HOVER_W = 168.48

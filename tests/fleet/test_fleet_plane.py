@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from sortie.fleet import gate
 from sortie.fleet.coverage import CELL_M, RANGE_M, footprint_radius_m, pack_grid, survey, unpack_grid
 from sortie.fleet.gate import Gate, make_payload
+from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
-from sortie.fleet.wire import DIRECTIVE_BYTES
 from sortie.policies.contract import Coverage, Directive, Disc, Representation
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")

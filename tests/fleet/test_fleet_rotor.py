@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.motion import fly
-from sortie.fleet.rotor import (
+from sortie.fleet.flight.motion import fly
+from sortie.fleet.flight.rotor import (
     climb_power_w,
     figure_of_merit,
     fleet_power_w,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from sortie.fleet.route import MAX_RING_SPEED_MPS, frame_path, spread
+from sortie.fleet.flight.route import MAX_RING_SPEED_MPS, frame_path, spread
 
 L_TURN = ((0.0, 0.0), (100.0, 0.0), (100.0, 100.0))
 

@@ -10,7 +10,7 @@ from sortie.fleet.gate import make_payload
 from sortie.fleet.tiles import TILE_HEADER_BYTES, cells_of, cut
 from sortie.perception import budget
 from sortie.policies.contract import Directive, Representation
-from sortie.radio.airtime import fragments
+from sortie.radio.mac.airtime import fragments
 from sortie.scenarios.schema import MIN_TILE_BYTES, Radio
 
 FULL = Directive(0, 1, Representation.FEATURES, 0.1, None, 10.0)

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.motion import fly
+from sortie.fleet.flight.motion import fly
 from sortie.fleet.traces import COLUMNS, TraceError, follow, read_traces
 from sortie.scenarios.schema import Fleet, Route
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.compact import Form, decode_compact, encode_compact
 from sortie.fleet.coverage import survey
 from sortie.fleet.lies import falsified
+from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
 from sortie.fleet.trust import (
     Arrival,
     Standing,

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.fleet.displaced import displaced
-from sortie.fleet.motion import Motion, MotionError, fly
-from sortie.fleet.rotor import fleet_power_w
-from sortie.fleet.viewpoints import (
+from sortie.fleet.flight.displaced import displaced
+from sortie.fleet.flight.motion import Motion, MotionError, fly
+from sortie.fleet.flight.rotor import fleet_power_w
+from sortie.fleet.flight.viewpoints import (
     LEAST_MOVE_M,
     Bounds,
     Course,

@@ -12,8 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sortie.fleet.cdr import ENCAPSULATION, MalformedDatagram, layout
-from sortie.fleet.wire import (
+from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, layout
+from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
     DIRECTIVE_BYTES,

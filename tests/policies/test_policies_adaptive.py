@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies import adaptive as a
-from sortie.policies.baselines import everyone
+from sortie.policies.catalogue import adaptive as a
+from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.contract import Coverage, Disc, FleetView, Representation, TaskPhase
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies.conformance import conform, failing
 from sortie.policies.contract import PolicyError, Representation, check_directives
 from sortie.policies.registry import BOUNDS, POLICIES, parameters, resolve
-from sortie.policies.views import draw_views, to_json
+from sortie.policies.verification.conformance import conform, failing
+from sortie.policies.verification.views import draw_views, to_json
 
 
 @pytest.mark.parametrize("name", POLICIES)

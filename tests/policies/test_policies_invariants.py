@@ -6,7 +6,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
-from sortie.policies.invariants import WORDS, InvariantError, complaint, just_heard, parse, violations
+from sortie.policies.verification.invariants import WORDS, InvariantError, complaint, just_heard, parse, violations
 
 VIEW = fleet_of(3, soc=0.2, goodput=4.0)
 SHARED = [

@@ -13,11 +13,11 @@ from dataclasses import replace
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies import conformance
-from sortie.policies.conformance import RULES, Check, conform, failing
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
-from sortie.policies.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
-from sortie.policies.worked import worked
+from sortie.policies.verification import conformance
+from sortie.policies.verification.conformance import RULES, Check, conform, failing
+from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
 
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
 calls = itertools.count()

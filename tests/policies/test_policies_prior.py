@@ -7,19 +7,19 @@ import math
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies.axes import FIELDS, Axis, decisions_of, method_table, observe
+from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around, seen_well
+from sortie.policies.catalogue.deputies import deputies
+from sortie.policies.catalogue.freshness import freshness
+from sortie.policies.catalogue.prior import METHODS
+from sortie.policies.catalogue.prior.hydracollab import hydracollab
+from sortie.policies.catalogue.prior.syncnet import MAP_MEGABITS, syncnet
+from sortie.policies.catalogue.prior.when2com import when2com
+from sortie.policies.catalogue.prior.where2comm import where2comm
+from sortie.policies.catalogue.prior.who2com import who2com
 from sortie.policies.contract import COVERAGE_CELL_M, Coverage, Descriptor, Directive, Disc, FleetView, Representation
-from sortie.policies.coverage import centre_cell, disc_around, seen_well
-from sortie.policies.deputies import deputies
-from sortie.policies.freshness import freshness
-from sortie.policies.prior import METHODS
-from sortie.policies.prior.hydracollab import hydracollab
-from sortie.policies.prior.syncnet import MAP_MEGABITS, syncnet
-from sortie.policies.prior.when2com import when2com
-from sortie.policies.prior.where2comm import where2comm
-from sortie.policies.prior.who2com import who2com
 from sortie.policies.registry import POLICIES, handshake_bytes, own_fusion
-from sortie.policies.views import draw_views
+from sortie.policies.verification.axes import FIELDS, Axis, decisions_of, method_table, observe
+from sortie.policies.verification.views import draw_views
 
 PAPER = """\
 | method | Mis. | Scene | Plat. | Geom. | decides |

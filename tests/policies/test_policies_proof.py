@@ -7,14 +7,14 @@ from functools import partial
 
 import pytest
 
-from sortie.policies.baselines import everyone, random_k
+from sortie.policies.catalogue.baselines import everyone, random_k
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
-from sortie.policies.invariants import parse
-from sortie.policies.proof import Verdict, complaint_on, property_of, prove
-from sortie.policies.properties import PROMISES
-from sortie.policies.views import from_json, to_json
-from sortie.policies.worked import worked
+from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.proof import Verdict, complaint_on, property_of, prove
+from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.views import from_json, to_json
 
 Decide = Callable[[FleetView], Sequence[Directive]]
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"

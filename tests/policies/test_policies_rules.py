@@ -19,12 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies_examples import fleet_of
 
-from sortie.fleet.auth import Dropped, Inbox, Sealer, open_datagram
 from sortie.fleet.gate import Gate
+from sortie.fleet.messages.auth import Dropped, Inbox, Sealer, open_datagram
+from sortie.fleet.messages.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.fleet.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
-from sortie.policies.confine import Reached, confined
-from sortie.policies.conformance import RULES, full_view, raised_part
 from sortie.policies.contract import (
     Descriptor,
     Directive,
@@ -37,7 +35,9 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import LinkState, damp
 from sortie.policies.registry import POLICIES
-from sortie.policies.views import draw_view, draw_views
+from sortie.policies.verification.confine import Reached, confined
+from sortie.policies.verification.conformance import RULES, full_view, raised_part
+from sortie.policies.verification.views import draw_view, draw_views
 from sortie.scenarios.load import ScenarioError, loads
 
 FLEET = fleet_of(5)

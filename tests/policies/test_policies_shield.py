@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies.baselines import everyone, silence
-from sortie.policies.conformance import conform, failing
+from sortie.policies.catalogue.baselines import everyone, silence
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, Representation, TaskPhase
-from sortie.policies.invariants import InvariantError, just_heard, parse, violations
-from sortie.policies.proof import prove
-from sortie.policies.shield import MARK, interventions, shield
-from sortie.policies.views import draw_views
-from sortie.policies.worked import worked
+from sortie.policies.verification.conformance import conform, failing
+from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.proof import prove
+from sortie.policies.verification.shield import MARK, interventions, shield
+from sortie.policies.verification.views import draw_views
 
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
 SPARING = """

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies.baselines import everyone, silence
-from sortie.policies.conformance import conform, failing
+from sortie.policies.catalogue.baselines import everyone, silence
+from sortie.policies.catalogue.vantage import MOST_M, over_region
 from sortie.policies.contract import (
     Directive,
     Disc,
@@ -23,7 +23,7 @@ from sortie.policies.contract import (
     looks_from,
 )
 from sortie.policies.registry import POLICIES, resolve, viewpoint_of
-from sortie.policies.vantage import MOST_M, over_region
+from sortie.policies.verification.conformance import conform, failing
 
 
 def tracking(view: FleetView, region: Disc) -> FleetView:

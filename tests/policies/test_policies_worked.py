@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from policies_examples import fleet_of
 
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import (
     Directive,
     Disc,
@@ -16,7 +17,6 @@ from sortie.policies.contract import (
 )
 from sortie.policies.geometry import circle_overlap, peers_by_overlap
 from sortie.policies.registry import parameters, resolve
-from sortie.policies.worked import worked
 
 
 def to_peer_1(view: FleetView) -> Directive:

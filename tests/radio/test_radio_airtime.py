@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sortie.radio import airtime
-from sortie.radio.airtime import frames_exchanges, legacy_ppdu_s
-from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
+from sortie.radio.mac import airtime
+from sortie.radio.mac.airtime import frames_exchanges, legacy_ppdu_s
+from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
 from sortie.radio.rates import STANDARDS, Standard
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from radio_flights import Hover
 
 from sortie.radio import Status
-from sortie.radio.bursts import PairStates, bad_share, mean_loss, walk
+from sortie.radio.channel.bursts import PairStates, bad_share, mean_loss, walk
 from sortie.scenarios.schema import Bursts, Radio
 
 FLOWN = Bursts(good_to_bad=0.05, bad_to_good=0.28, step_s=0.1)

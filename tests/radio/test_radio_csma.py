@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sortie.radio import csma
-from sortie.radio.airtime import ACK_S, BLOCK_ACK_S, frames_exchanges
-from sortie.radio.contention import CW_MIN, DIFS_S, SIFS_S, SLOT_S, contention
+from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frames_exchanges
+from sortie.radio.mac.contention import CW_MIN, DIFS_S, SIFS_S, SLOT_S, contention
 
 CASES = [(1, 86.0, ACK_S), (64, 360.3, BLOCK_ACK_S)]
 

@@ -7,8 +7,8 @@ import pytest
 from radio_examples import CROSS_M, still
 from scipy import integrate, stats
 
-from sortie.radio.channel import Channel, noise_dbm
-from sortie.radio.pathloss import free_space_loss_db, log_distance_loss_db
+from sortie.radio.channel.pathloss import free_space_loss_db, log_distance_loss_db
+from sortie.radio.channel.snr import Channel, noise_dbm
 from sortie.radio.rates import (
     LEGACY_RATES_MBPS,
     NO_LINK_PER,

@@ -9,10 +9,10 @@ import simpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.radio.airtime import Exchanges
-from sortie.radio.contention import DIFS_S, SLOT_S, contention
-from sortie.radio.jobs import End, GroupFrame, Job
-from sortie.radio.medium import AIFS_CONTEXT_S, Medium
+from sortie.radio.mac.airtime import Exchanges
+from sortie.radio.mac.contention import DIFS_S, SLOT_S, contention
+from sortie.radio.mac.jobs import End, GroupFrame, Job
+from sortie.radio.mac.medium import AIFS_CONTEXT_S, Medium
 
 ONE_MS = Exchanges(4, 0.9e-3, 1e-3)
 

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from radio_examples import CROSS_M, still
 from scipy import stats
 
-from sortie.radio.antenna import FLOOR_DB, antenna_loss_db
-from sortie.radio.channel import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
-from sortie.radio.crowd import EPOCH
-from sortie.radio.draws import fade_table_db, normal_table
-from sortie.radio.links import both_ways, near_pairs
-from sortie.radio.pathloss import LIGHT_MPS, free_space_loss_db, path_loss_db, range_m, two_ray_loss_db
-from sortie.radio.shadowing import ShadowField, gauss_markov
+from sortie.radio.channel.antenna import FLOOR_DB, antenna_loss_db
+from sortie.radio.channel.draws import fade_table_db, normal_table
+from sortie.radio.channel.earshot import both_ways, near_pairs
+from sortie.radio.channel.large_fleet import EPOCH
+from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, path_loss_db, range_m, two_ray_loss_db
+from sortie.radio.channel.shadowing import ShadowField, gauss_markov
+from sortie.radio.channel.snr import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
 from sortie.scenarios.schema import Radio
 
 # --- two rays ------------------------------------------------------------------------------------------

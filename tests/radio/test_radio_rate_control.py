@@ -8,7 +8,7 @@ import simpy
 from radio_examples import CROSS_M, still
 
 from sortie.radio import Air, Transmission
-from sortie.radio.rate_control import INTERVAL_S, KEEP, Minstrel
+from sortie.radio.mac.rate_control import INTERVAL_S, KEEP, Minstrel
 from sortie.radio.rates import STANDARDS, rate_table
 from sortie.scenarios.schema import Radio
 

@@ -11,7 +11,7 @@ import pytest
 from radio_flights import Hover, trace
 
 from sortie.radio import Status
-from sortie.radio.traces import read_links
+from sortie.radio.channel.traces import read_links
 from sortie.scenarios.schema import Bursts, Radio
 from sortie.scenarios.traces import TraceError
 

@@ -13,7 +13,7 @@ from radio_flights import Hover, trace
 from scipy import stats
 
 from sortie.radio import Status
-from sortie.radio.airtime import frame_bytes, sample_wire
+from sortie.radio.mac.airtime import frame_bytes, sample_wire
 from sortie.scenarios.schema import Bursts, Radio
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from sortie.perception.scene import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Capture
-from sortie.policies.adaptive import ARMS, FEATURES, read_model
+from sortie.policies.catalogue.adaptive import ARMS, FEATURES, read_model
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.contexts import Contexts
 from sortie.scenarios.load import ScenarioError, context_sets, library, load_contexts

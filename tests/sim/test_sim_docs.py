@@ -13,7 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from sortie.perception.detectors import DETECTORS
-from sortie.policies.conformance import conform
+from sortie.policies.verification.conformance import conform
 from sortie.scenarios.load import load
 from sortie.sim.cli.app import app
 

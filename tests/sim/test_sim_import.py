@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from sortie.fleet.flightlog import read_log
-from sortie.fleet.logtrace import context_trace
+from sortie.fleet.logs.flightlog import read_log
+from sortie.fleet.logs.logtrace import context_trace
 from sortie.fleet.traces import COLUMNS, read_traces
 from sortie.scenarios.load import load
 from sortie.sim.cli.app import app

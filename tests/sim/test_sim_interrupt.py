@@ -42,7 +42,7 @@ def started(name: str, before: str = "") -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    "name", ["sortie.sim.cli.app", "typer", "numpy", "scipy.special", "pyarrow", "sortie.fleet.motion"]
+    "name", ["sortie.sim.cli.app", "typer", "numpy", "scipy.special", "pyarrow", "sortie.fleet.flight.motion"]
 )
 def test_while_the_command_is_still_imported(name: str) -> None:
     ended = started(name)

@@ -17,7 +17,7 @@ from recording_examples import record_flight
 from sim_examples import example
 
 from sortie.policies.contract import Descriptor, FleetView, TaskPhase
-from sortie.policies.views import to_json
+from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
 from sortie.sim.sortie import run_sortie
 
@@ -69,7 +69,7 @@ def descriptor(agent_id: int) -> Descriptor:
 
 
 CROSSING = """
-from sortie.policies.baselines import everyone
+from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.contract import Reposition, looks_from
 
 def nearer(view):

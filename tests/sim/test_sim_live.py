@@ -16,10 +16,10 @@ import pytest
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from sortie.fleet.auth import Dropped, Opened
-from sortie.fleet.cdr import MalformedDatagram
+from sortie.fleet.messages.auth import Dropped, Opened
+from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
 from sortie.fleet.staleness import LinkHealth
-from sortie.fleet.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError

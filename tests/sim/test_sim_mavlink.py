@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import common as mavlink2
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from sortie.fleet.mavlink import KEY_BYTES, Listener, Transmitter, answers
+from sortie.fleet.logs.mavlink import KEY_BYTES, Listener, Transmitter, answers
 from sortie.sim import rundir
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError

@@ -16,7 +16,7 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 import sortie.fleet.agent
-from sortie.fleet.wire import decode_descriptor, decode_directive
+from sortie.fleet.messages.wire import decode_descriptor, decode_directive
 from sortie.policies.contract import Descriptor
 from sortie.sim import rundir
 from sortie.sim.bag import descriptors, write_bag

@@ -10,7 +10,7 @@ import pytest
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.policies.prior import METHODS
+from sortie.policies.catalogue.prior import METHODS
 from sortie.sim.cli.app import app
 from sortie.sim.compare import compare
 from sortie.sim.outcome import outcome

@@ -28,7 +28,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The worked policy of the example under another name."""
     path = tmp_path_factory.mktemp("policies") / "twin.py"
     path.write_text(
-        "from sortie.policies.worked import worked\n\ndef decide(view):\n    return worked(view, rho=0.25)\n"
+        "from sortie.policies.catalogue.worked import worked\n\ndef decide(view):\n    return worked(view, rho=0.25)\n"
     )
     return f"{path}:decide"
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from sim_examples import example
 
-from sortie.fleet.cell import energy_fraction
+from sortie.fleet.energy.cell import energy_fraction
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord
 from sortie.sim.sortie import run_sortie

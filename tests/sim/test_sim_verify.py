@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from cli_examples import command
 
-from sortie.policies.conformance import RULES
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
-from sortie.policies.views import draw_views, from_json, to_json
+from sortie.policies.verification.conformance import RULES
+from sortie.policies.verification.views import draw_views, from_json, to_json
 from sortie.sim import console
 from sortie.sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 

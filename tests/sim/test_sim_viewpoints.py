@@ -13,8 +13,9 @@ import pytest
 from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
-from sortie.fleet.motion import MotionError
-from sortie.policies.baselines import everyone
+from sortie.fleet.flight.motion import MotionError
+from sortie.policies.catalogue.baselines import everyone
+from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.contract import (
     COVERAGE_CELL_M,
     Coverage,
@@ -24,7 +25,6 @@ from sortie.policies.contract import (
     Reposition,
     looks_from,
 )
-from sortie.policies.vantage import vantage
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord
 from sortie.sim.sortie import run_sortie

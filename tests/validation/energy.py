@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from sortie.fleet.battery import CAUSES, FleetBatteries
-from sortie.fleet.dataflash import read_dataflash
-from sortie.fleet.flightlog import FlightLog, read_log
-from sortie.fleet.identify import (
+from sortie.fleet.energy.battery import CAUSES, FleetBatteries
+from sortie.fleet.flight.rotor import figure_of_merit, momentum_power_w, rotor_power_w
+from sortie.fleet.logs.dataflash import read_dataflash
+from sortie.fleet.logs.flightlog import FlightLog, read_log
+from sortie.fleet.logs.identify import (
     electric_power_w,
     hovering,
     identify_pack,
@@ -30,7 +31,6 @@ from sortie.fleet.identify import (
     stated_pack,
     voltage_error,
 )
-from sortie.fleet.rotor import figure_of_merit, momentum_power_w, rotor_power_w
 from sortie.scenarios.schema import Airframe, Battery
 
 ROOT = Path(__file__).resolve().parents[2]

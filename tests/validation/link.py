@@ -20,15 +20,15 @@ import simpy
 from scipy import stats
 
 from sortie.radio import Air, csma
-from sortie.radio.airtime import ACK_S, BLOCK_ACK_S, Exchanges, frames_exchanges, legacy_ppdu_s
-from sortie.radio.antenna import antenna_loss_db
-from sortie.radio.channel import Channel, earshot_m
-from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
-from sortie.radio.pathloss import LIGHT_MPS, free_space_loss_db, two_ray_loss_db
-from sortie.radio.rate_control import INTERVAL_S, Minstrel
+from sortie.radio.channel.antenna import antenna_loss_db
+from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, two_ray_loss_db
+from sortie.radio.channel.shadowing import ShadowField
+from sortie.radio.channel.snr import Channel, earshot_m
+from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, Exchanges, frames_exchanges, legacy_ppdu_s
+from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
+from sortie.radio.mac.rate_control import INTERVAL_S, Minstrel
 from sortie.radio.rates import STANDARDS, per, rate_table
 from sortie.radio.sample import Service
-from sortie.radio.shadowing import ShadowField
 from sortie.scenarios.schema import Radio
 
 ROOT = Path(__file__).resolve().parents[2]

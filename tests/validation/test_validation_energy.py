@@ -12,8 +12,8 @@ import energy
 import numpy as np
 import pytest
 
-from sortie.fleet.flightlog import FlightLog, read_log
-from sortie.fleet.identify import hovering, identify_pack, stated_pack, voltage_error
+from sortie.fleet.logs.flightlog import FlightLog, read_log
+from sortie.fleet.logs.identify import hovering, identify_pack, stated_pack, voltage_error
 
 needs_log = pytest.mark.skipif(not energy.LOG.is_file(), reason=f"{energy.LOG} is not here")
 

@@ -6,10 +6,10 @@ import link
 import pytest
 import simpy
 
-from sortie.radio.airtime import BLOCK_ACK_S, Exchanges
-from sortie.radio.contention import DIFS_S, SIFS_S, SLOT_S
-from sortie.radio.jobs import GroupFrame, Job
-from sortie.radio.medium import Medium
+from sortie.radio.mac.airtime import BLOCK_ACK_S, Exchanges
+from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S
+from sortie.radio.mac.jobs import GroupFrame, Job
+from sortie.radio.mac.medium import Medium
 from sortie.scenarios.schema import Radio
 
 

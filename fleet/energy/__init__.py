@@ -1,0 +1,1 @@
+"""What the packs of a fleet still give: the cell's chemistry and the battery's books."""

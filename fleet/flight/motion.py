@@ -1,0 +1,195 @@
+"""Where every drone is, how it is tilted and what it believes, for a whole sortie at once.
+
+The formation is a rigid virtual structure that moves along the route and turns with it. A drone holds its slot
+up to a smooth random offset, in a mean wind with gusts of its own. Its attitude follows from its acceleration by
+differential flatness; no controller is simulated. Nothing here needs the clock, so the whole flight is computed
+as arrays [T frames, N drones, ...] before it begins. Frames as in `sortie.fleet.flight.frames`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from sortie.fleet.flight.formation import slots
+from sortie.fleet.flight.frames import yaw_rad
+from sortie.fleet.flight.noise import LAGS, gauss_markov, smooth
+from sortie.fleet.flight.route import frame_path
+from sortie.scenarios import schema
+from sortie.scenarios.streams import stream
+
+Array = npt.NDArray[np.float64]
+
+GRAVITY_MPS2 = 9.81
+DRAG_PER_S = 0.2
+"""Rotor and body drag over mass, linear in air speed (the form of Faessler, Franchi & Scaramuzza 2018). The value is
+chosen, not measured: 10 m/s of air tilts the airframe by 11.5°. The rotor-power formula has its own drag."""
+ESTIMATE_TIME_S = 10.0
+"""Correlation time of the errors of the position and heading estimates."""
+
+
+class MotionError(ValueError):
+    """The motion asked for cannot be flown; the message names the drone, the time and the settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A flown formation. Every array is read-only."""
+
+    time_s: Array  # [T]
+    position_m: Array  # [T, N, 3] ENU
+    orientation_xyzw: Array  # [T, N, 4] FLU in ENU, unit, without sign jumps in time
+    velocity_mps: Array  # [T, N, 3] ENU
+    acceleration_mps2: Array  # [T, N, 3] ENU, gravity not included
+    body_rates_radps: Array  # [T, N, 3] FLU; constant from one frame to the next, the last frame repeats
+    wind_mps: Array  # [T, N, 3] ENU, velocity of the air, gusts included
+    yaw_rad: Array  # [T, N] true yaw of the body
+    est_position_m: Array  # [T, N, 3] what the drone believes; height is taken to be known
+    est_yaw_rad: Array  # [T, N]
+    frame_position_m: Array  # [T, 3] the formation's reference point
+    frame_yaw_rad: Array  # [T] the formation's heading
+
+    @property
+    def air_speed_mps(self) -> Array:
+        """Horizontal speed through the air [T, N]."""
+        air = self.velocity_mps[..., :2] - self.wind_mps[..., :2]
+        return np.hypot(air[..., 0], air[..., 1])
+
+
+def attitude(thrust_mps2: Array, heading_rad: Array) -> Array:
+    """Attitude by differential flatness (Mellinger & Kumar 2011, §III).
+
+    z_B points along the thrust, x_C = (cos ψ, sin ψ, 0), y_B = z_B × x_C normalised, x_B = y_B × z_B.
+
+    Args:
+        thrust_mps2: [..., 3] thrust over mass, ENU: acceleration + gravity·(0, 0, 1) + drag.
+        heading_rad: [...] ψ, ENU.
+
+    Returns:
+        [..., 4] unit quaternions x, y, z, w of FLU in ENU.
+
+    Raises:
+        MotionError: no thrust (free fall), or thrust along x_C: the attitude is not determined.
+    """
+    norm = np.linalg.norm(thrust_mps2, axis=-1, keepdims=True)
+    if not np.all(norm > 1e-6):
+        raise MotionError("attitude is not determined: the thrust is zero (free fall)")
+    z_b = thrust_mps2 / norm
+    x_c = np.stack([np.cos(heading_rad), np.sin(heading_rad), np.zeros_like(heading_rad)], axis=-1)
+    y_b = np.cross(z_b, x_c)
+    norm = np.linalg.norm(y_b, axis=-1, keepdims=True)
+    if not np.all(norm > 1e-6):
+        raise MotionError("attitude is not determined: the thrust points along the heading")
+    y_b /= norm
+    matrix = np.stack([np.cross(y_b, z_b), y_b, z_b], axis=-1)
+    quaternion: Array = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat().reshape(*thrust_mps2.shape[:-1], 4)
+    return quaternion
+
+
+def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0) -> Motion:
+    """Fly the formation along its route.
+
+    Every random number comes from a stream of its drone, so that the first n drones fly the same whatever n is
+    (circle apart, whose slots depend on n), and a longer sortie begins as a shorter one.
+
+    Args:
+        fleet: drones, formation, route and motion sections are read.
+        duration_s: the frames that begin before it are flown (end exclusive).
+        frame_s: time between frames, > 0.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
+
+    Raises:
+        MotionError: the asked motion needs thrust that points downwards.
+    """
+    n, config = fleet.drones, fleet.motion
+    frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
+    time_s: Array = np.arange(frames, dtype=np.float64) * frame_s
+    path = frame_path(
+        fleet.route.waypoints_m, fleet.route.speed_mps, fleet.route.turn_time_s, fleet.formation.spacing_m, time_s
+    )
+
+    def draws(purpose: str, *shape: int) -> Array:  # [T, *shape, N]
+        per_drone = [stream(seed, replication, i, purpose).standard_normal((frames, *shape)) for i in range(n)]
+        return np.stack(per_drone, axis=-1)
+
+    # the virtual structure: p + R(ψ)·s and its two time derivatives, [T, N, 3]
+    slot = slots(fleet.formation.shape, n, fleet.formation.spacing_m)
+    cos, sin = np.cos(path.yaw_rad)[:, None], np.sin(path.yaw_rad)[:, None]
+    arm = np.stack([cos * slot[:, 0] - sin * slot[:, 1], sin * slot[:, 0] + cos * slot[:, 1]], axis=-1)
+    across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+    rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
+    position = _raise(path.position_m[:, None] + arm, fleet.formation.altitude_m)
+    velocity = _raise(path.velocity_mps[:, None] + rate * across)
+    acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
+
+    offsets = smooth(draws("pose_jitter", LAGS, 3), config.pose_jitter_m, config.pose_jitter_time_s, frame_s)
+    position, velocity, acceleration = (
+        held + np.moveaxis(offset, -1, 1)
+        for held, offset in zip((position, velocity, acceleration), offsets, strict=True)
+    )
+    gusts = gauss_markov(draws("gust", 3), config.gust_sigma_mps, config.gust_time_s, frame_s)
+    wind = np.array([*config.wind_mps, 0.0]) + np.moveaxis(gusts, -1, 1)
+
+    thrust = acceleration + DRAG_PER_S * (velocity - wind)
+    thrust[..., 2] += GRAVITY_MPS2
+    if thrust[..., 2].min() <= 0:
+        frame, drone = np.unravel_index(np.argmin(thrust[..., 2]), thrust.shape[:2])
+        raise MotionError(
+            f"drone {drone} at {time_s[frame]:.1f} s would have to thrust downwards: fleet.motion.pose_jitter_m "
+            f"{config.pose_jitter_m:g} within pose_jitter_time_s {config.pose_jitter_time_s:g} or gust_sigma_mps "
+            f"{config.gust_sigma_mps:g} cannot be flown"
+        )
+    quaternion = _continuous(attitude(thrust, np.broadcast_to(path.yaw_rad[:, None], (frames, n))))
+    yaw = yaw_rad(quaternion)
+
+    est_position = position.copy()
+    error = gauss_markov(draws("pose_error", 2), config.pose_error_m, ESTIMATE_TIME_S, frame_s)
+    est_position[..., :2] += np.moveaxis(error, -1, 1)
+    est_yaw = yaw + gauss_markov(
+        draws("heading_error"), math.radians(config.heading_error_deg), ESTIMATE_TIME_S, frame_s
+    )
+    motion = Motion(
+        time_s=time_s,
+        position_m=position,
+        orientation_xyzw=quaternion,
+        velocity_mps=velocity,
+        acceleration_mps2=acceleration,
+        body_rates_radps=body_rates(quaternion, frame_s),
+        wind_mps=wind,
+        yaw_rad=yaw,
+        est_position_m=est_position,
+        est_yaw_rad=np.mod(est_yaw + np.pi, 2 * np.pi) - np.pi,
+        frame_position_m=_raise(path.position_m, fleet.formation.altitude_m),
+        frame_yaw_rad=path.yaw_rad,
+    )
+    for each in fields(motion):
+        getattr(motion, each.name).setflags(write=False)
+    return motion
+
+
+def body_rates(quaternion_xyzw: Array, step_s: float) -> Array:
+    """Rates ω [T, N, 3] in FLU with q[t+1] = q[t]·exp(ω[t]·step_s), by the logarithm on SO(3); the last repeats."""
+    frames, n = quaternion_xyzw.shape[:2]
+    if frames < 2:
+        return np.zeros((frames, n, 3))
+    now = Rotation.from_quat(quaternion_xyzw[:-1].reshape(-1, 4))
+    then = Rotation.from_quat(quaternion_xyzw[1:].reshape(-1, 4))
+    rates = ((now.inv() * then).as_rotvec() / step_s).reshape(frames - 1, n, 3)
+    return np.concatenate([rates, rates[-1:]])
+
+
+def _continuous(quaternion: Array) -> Array:
+    """Of the two quaternions of each attitude take the one nearer to the frame before."""
+    flips = np.sign(np.einsum("tni,tni->tn", quaternion[1:], quaternion[:-1]))
+    flips[flips == 0] = 1.0
+    quaternion[1:] *= np.cumprod(flips, axis=0)[..., None]
+    return quaternion
+
+
+def _raise(ground: Array, height: float = 0.0) -> Array:
+    """[..., 2] to [..., 3]."""
+    return np.concatenate([ground, np.full((*ground.shape[:-1], 1), height)], axis=-1)

@@ -1,0 +1,289 @@
+"""Viewpoints: how a drone leaves its slot because its policy asks, and what keeps that safe.
+
+A drone's place is its slot plus a shift, both in the formation's frame (x forward, y left), so that places which keep
+their distance go on keeping it however the formation flies and turns. A shift changes by moves: straight lines from
+standing to standing, spread in time like the route's corners, so that speed and acceleration are bounded and have no
+jumps. A move is granted only if the whole rest of the flight is safe with it, everybody ending the move that he is on
+and then standing where it ends. What flies at any time was found safe to the end, so nothing has to be taken back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sortie.fleet.flight.formation import slots
+from sortie.fleet.flight.motion import MotionError
+from sortie.fleet.flight.route import FramePath, bend, frame_path, spread
+from sortie.scenarios import schema
+
+Array = npt.NDArray[np.float64]
+Place = tuple[float, float]
+
+LEAST_MOVE_M = 2.0
+"""A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
+SHARES = (1.0, 0.75, 0.5, 0.25)
+"""What is tried of a wish before it is refused, the most first."""
+INSTANTS_S = 0.1
+"""At which two moves are held against each other."""
+JITTERS = 5.0
+"""Places keep so many standard deviations of the pose jitter off the bounds, so that the drones keep them."""
+_PEAK_SPEED, _PEAK_ACCELERATION = 2.25, 9.0
+"""Of a unit step spread over a unit of time (quadratic B-spline)."""
+
+
+class Move(NamedTuple):
+    """A drone's shift goes from one place to another, in the formation's frame."""
+
+    begin_s: float
+    width_s: float
+    start_m: Place
+    end_m: Place
+
+    @property
+    def end_s(self) -> float:
+        """When it stands again."""
+        return self.begin_s + self.width_s
+
+    @property
+    def length_m(self) -> float:
+        """How far it goes."""
+        return math.dist(self.start_m, self.end_m)
+
+    @property
+    def speed_mps(self) -> float:
+        """The fastest that it gets."""
+        return _PEAK_SPEED * self.length_m / self.width_s
+
+    @property
+    def acceleration_mps2(self) -> float:
+        """The most that it accelerates."""
+        return _PEAK_ACCELERATION * self.length_m / self.width_s**2
+
+
+Plan = tuple[Move, ...]
+"""One drone's moves so far, in order of time, none begun before the one before has ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What places and moves are held to."""
+
+    reach_m: float
+    speed_mps: float
+    acceleration_mps2: float
+    separation_m: float
+    """Between places: the drones' own and room for both their jitters."""
+    fence_m: tuple[float, float, float, float] | None
+    """For places, likewise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What the formation will do: its frame at every frame of the flight, and its slots."""
+
+    time_s: Array  # [T]
+    path: FramePath
+    slot_m: Array  # [N, 2]
+
+    def world_m(self, places_m: Array, frames: slice = slice(None)) -> Array:
+        """Places [..., 2] of the formation's frame, one for every frame, on the ground, ENU."""
+        yaw = self.path.yaw_rad[frames]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x, y = places_m[..., 0], places_m[..., 1]
+        turned: Array = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        return turned + self.path.position_m[frames]
+
+    def wanted_shift_m(self, drone: int, frame: int, x_m: float, y_m: float) -> Place:
+        """The shift that would have a drone over (x, y) now."""
+        yaw, (at_x, at_y) = self.path.yaw_rad[frame], self.path.position_m[frame]
+        cos, sin, dx, dy = math.cos(yaw), math.sin(yaw), x_m - at_x, y_m - at_y
+        slot_x, slot_y = self.slot_m[drone]
+        return float(cos * dx + sin * dy - slot_x), float(cos * dy - sin * dx - slot_y)
+
+
+def bounds_of(fleet: schema.Fleet) -> Bounds:
+    """The scenario's bounds, less room for the pose jitter."""
+    v, room_m = fleet.viewpoints, JITTERS * fleet.motion.pose_jitter_m
+    fence = v.fence_m
+    if fence is not None:
+        fence = (fence[0] + room_m, fence[1] + room_m, fence[2] - room_m, fence[3] - room_m)
+    return Bounds(v.reach_m, v.speed_mps, v.acceleration_mps2, v.separation_m + math.sqrt(2) * room_m, fence)
+
+
+def course_of(fleet: schema.Fleet, time_s: Array) -> Course:
+    """What the formation will do, as `sortie.fleet.flight.motion.fly` has it.
+
+    Raises:
+        MotionError: a slot's own way leaves the fence.
+    """
+    formation, route = fleet.formation, fleet.route
+    path = frame_path(route.waypoints_m, route.speed_mps, route.turn_time_s, formation.spacing_m, time_s)
+    course = Course(time_s, path, slots(formation.shape, fleet.drones, formation.spacing_m))
+    bounds = bounds_of(fleet)
+    for drone, slot in enumerate(course.slot_m):
+        if not fenced(course, bounds, drone, (), 0):
+            x, y = course.world_m(slot[None])[first_outside(course.world_m(slot[None]), bounds)]
+            raise MotionError(
+                f"fleet.viewpoints.fence_m {fleet.viewpoints.fence_m} must hold every slot's way with {JITTERS:g} times "
+                f"pose_jitter_m to spare: drone {drone}'s slot comes to ({x:.1f}, {y:.1f})"
+            )
+    return course
+
+
+# --- shifts over time ------------------------------------------------------------------------------
+
+
+def standing_m(plan: Plan) -> Place:
+    """The shift at which a drone stands once its last move is over."""
+    return plan[-1].end_m if plan else (0.0, 0.0)
+
+
+def shift_m(plan: Plan, time_s: Array) -> Array:
+    """A drone's shift at any times [T]: [T, 2], m, the formation's frame."""
+    return shifts(plan, time_s)[0]
+
+
+def shifts(plan: Plan, time_s: Array) -> tuple[Array, Array, Array]:
+    """Shift, its rate and its acceleration, [T, 2] each."""
+    total = np.zeros((3, len(time_s), 2))
+    for move in plan:
+        since_s = time_s - (move.begin_s + 0.5 * move.width_s)
+        _, step, slope = spread(since_s, move.width_s)
+        along = np.subtract(move.end_m, move.start_m)
+        total += np.stack([step, slope, bend(since_s, move.width_s)])[..., None] * along
+    return total[0], total[1], total[2]
+
+
+# --- the safety layer ------------------------------------------------------------------------------
+
+
+def grant(
+    drone: int,
+    wanted_m: Place,
+    plans: Sequence[Plan],
+    course: Course,
+    bounds: Bounds,
+    frame: int,
+    gone: Container[int] = (),
+) -> Move | str | None:
+    """What is granted of a drone's wish: the safety layer.
+
+    Args:
+        drone: who asks.
+        wanted_m: the shift that it asks for, the formation's frame.
+        plans: every drone's moves so far.
+        frame: the move would begin with it.
+        gone: drones that have left the air for good, to whom nobody comes near.
+
+    Returns:
+        A move as far towards the wish as is safe; None where the drone stands there already, or is on its way and has to
+        arrive first; or why nothing is granted.
+    """
+    plan, now_s = plans[drone], float(course.time_s[frame])
+    if plan and plan[-1].end_s > now_s:
+        return None
+    start, wish = standing_m(plan), _within(wanted_m, bounds.reach_m)
+    if math.dist(start, wish) < LEAST_MOVE_M:
+        return None
+    refused = ""
+    for share in SHARES:
+        end = (start[0] + share * (wish[0] - start[0]), start[1] + share * (wish[1] - start[1]))
+        if math.dist(start, end) < LEAST_MOVE_M:
+            break
+        move = Move(now_s, _width_s(math.dist(start, end), bounds), start, end)
+        near = _too_near(drone, move, plans, course, bounds, gone)
+        if near is not None:
+            refused = f"would come too near drone {near}"
+        elif not fenced(course, bounds, drone, (*plan, move), frame):
+            refused = "would leave the fence"
+        else:
+            return move
+    return refused or None
+
+
+def fenced(course: Course, bounds: Bounds, drone: int, plan: Plan, frame: int) -> bool:
+    """Whether a drone's place stays within the fence from a frame to the end."""
+    if bounds.fence_m is None:
+        return True
+    rest = slice(frame, None)
+    places = course.slot_m[drone] + shift_m(plan, course.time_s[rest])
+    return first_outside(course.world_m(places, rest), bounds) is None
+
+
+def first_outside(world_m: Array, bounds: Bounds) -> int | None:
+    """The first of [T, 2] places that lies outside the fence."""
+    assert bounds.fence_m is not None  # noqa: S101
+    low, high = np.array(bounds.fence_m[:2]), np.array(bounds.fence_m[2:])
+    outside = ((world_m < low) | (world_m > high)).any(axis=-1)
+    return int(outside.argmax()) if outside.any() else None
+
+
+def least_m(course: Course, bounds: Bounds, i: int, j: int) -> float:
+    """How near two places may come: the separation, or as near as the formation itself has them."""
+    return min(bounds.separation_m, float(np.hypot(*(course.slot_m[i] - course.slot_m[j]))))
+
+
+def _too_near(
+    drone: int, move: Move, plans: Sequence[Plan], course: Course, bounds: Bounds, gone: Container[int]
+) -> int | None:
+    """The first drone to which a move would come closer than allowed, at any time."""
+    for other, plan in enumerate(plans):
+        if other == drone or other in gone:
+            continue
+        least = least_m(course, bounds, drone, other) - 1e-9
+        apart = course.slot_m[drone] - course.slot_m[other]
+        if not plan or plan[-1].end_s <= move.begin_s:  # it stands: a point and a segment
+            apart = apart - standing_m(plan)
+            if _distance_m(apart + move.start_m, apart + move.end_m) < least:
+                return other
+            continue
+        last = plan[-1]
+        if math.dist(*_middles(course, drone, move, other, last)) - (move.length_m + last.length_m) / 2 >= least:
+            continue
+        if move.begin_s == last.begin_s and math.isclose(move.width_s, last.width_s, rel_tol=1e-12):
+            begin, end = (apart + np.subtract(a, b) for a, b in zip(move[2:], last[2:], strict=True))
+            if _distance_m(begin, end) < least:  # in step: one moves straight past the other
+                return other
+            continue
+        # both move: instants, and no nearer in between than speed and acceleration allow
+        end_s = max(move.end_s, plan[-1].end_s)
+        time_s = np.linspace(move.begin_s, end_s, max(2, math.ceil((end_s - move.begin_s) / INSTANTS_S) + 1))
+        ours, theirs = shifts((move,), time_s), shifts(plan, time_s)
+        way, rate = apart + move.start_m + ours[0] - theirs[0], np.linalg.norm(ours[1] - theirs[1], axis=-1)
+        half_s = 0.5 * (time_s[1] - time_s[0])
+        between_m = rate * half_s + (move.acceleration_mps2 + last.acceleration_mps2) * half_s**2 / 2
+        if float((np.linalg.norm(way, axis=-1) - between_m).min()) < least:
+            return other
+    return None
+
+
+def _middles(course: Course, drone: int, move: Move, other: int, theirs: Move) -> tuple[Array, Array]:
+    """The middles of two drones' moves, in the formation's frame."""
+    ours_m = course.slot_m[drone] + 0.5 * np.add(move.start_m, move.end_m)
+    return ours_m, course.slot_m[other] + 0.5 * np.add(theirs.start_m, theirs.end_m)
+
+
+def _distance_m(a: Array, b: Array) -> float:
+    """From the origin to a segment."""
+    along = b - a
+    length2 = float((along * along).sum())
+    t = min(1.0, max(0.0, -float((a * along).sum()) / length2)) if length2 > 0.0 else 0.0
+    return float(np.hypot(*(a + t * along)))
+
+
+def _width_s(length_m: float, bounds: Bounds) -> float:
+    """The shortest time for a move within speed and acceleration."""
+    by_speed = _PEAK_SPEED * length_m / bounds.speed_mps
+    return max(by_speed, math.sqrt(_PEAK_ACCELERATION * length_m / bounds.acceleration_mps2))
+
+
+def _within(wanted_m: Place, reach_m: float) -> Place:
+    far_m = math.hypot(*wanted_m)
+    share = reach_m / far_m if far_m > reach_m else 1.0
+    return wanted_m[0] * share, wanted_m[1] * share

@@ -1,0 +1,1 @@
+"""Flight logs of real drones: readers, context traces made of them, and MAVLink."""

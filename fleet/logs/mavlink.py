@@ -1,0 +1,351 @@
+"""Drone states as MAVLink 2 messages, and as a telemetry log that ground stations open.
+
+MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.flight.frames` does the turning. Positions on the
+globe lie on a plane through a stated origin, with the WGS-84 ellipsoid's two radii of curvature there: within 5 km
+of the origin the error stays below 2 m · tan(latitude) horizontally, and height is height above the plane.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import struct
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink2
+
+from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
+from sortie.fleet.logs.dataflash import Column, RawLog
+
+_SENSORS = (
+    mavlink2.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink2.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink2.MAV_SYS_STATUS_SENSOR_GPS
+    | mavlink2.MAV_SYS_STATUS_SENSOR_BATTERY
+)
+_UNKNOWN_U16 = 0xFFFF
+_MAX_I16 = 0x7FFF
+_FARTHEST_UP_M = 100_000.0
+"""Of an origin; altitudes go in 32-bit millimetres."""
+_LOG_STAMP = struct.Struct(">Q")
+SIGNING_EPOCH_US = 1_420_070_400_000_000
+"""2015-01-01, from which the clocks of signed frames count."""
+_STAMP_BYTES = 8
+_MARKS = {0xFE: 8, 0xFD: 12}
+"""First byte of a MAVLink 1 and 2 frame, and what stands around its payload; a signature adds 13."""
+_SIGNED, _SIGNATURE_BYTES = 0x01, 13
+_YEARS_US = (0, 4_000_000_000_000_000)  # 1970 … 2096
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where ENU (0, 0, 0) lies: WGS-84 degrees, metres above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (abs(self.latitude_deg) <= 85 and abs(self.longitude_deg) <= 180):
+            raise ValueError(
+                f"origin is ({self.latitude_deg}, {self.longitude_deg}), must lie within ±85° and ±180°: a local "
+                "east and north mean nothing at a pole"
+            )
+        if not abs(self.altitude_m) <= _FARTHEST_UP_M:
+            raise ValueError(f"its altitude is {self.altitude_m} m, must be within ±{_FARTHEST_UP_M:g} m")
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """One drone at one time; ENU, FLU, x y z w."""
+
+    time_s: float
+    """Since the sortie's begin."""
+    position_m: tuple[float, float, float]
+    orientation_xyzw: tuple[float, float, float, float]
+    velocity_mps: tuple[float, float, float]
+    body_rates_radps: tuple[float, float, float]
+    soc: float
+    voltage_v: float
+    current_a: float
+    energy_used_j: float
+    cpu_load: float
+    """0 … 1."""
+    landed: bool
+
+
+def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
+    """ENU metres to latitude and longitude in degrees and altitude in metres."""
+    a, e2 = 6378137.0, 6.69437999014e-3  # WGS-84
+    phi = math.radians(origin.latitude_deg)
+    w = math.sqrt(1 - e2 * math.sin(phi) ** 2)
+    meridian_m = a * (1 - e2) / w**3 + origin.altitude_m
+    normal_m = a / w + origin.altitude_m
+    east, north, up = position_m
+    latitude = origin.latitude_deg + math.degrees(north / meridian_m)
+    longitude = origin.longitude_deg + math.degrees(east / (normal_m * math.cos(phi)))
+    return latitude, (longitude + 180) % 360 - 180, origin.altitude_m + up
+
+
+def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:
+    """HEARTBEAT, ATTITUDE_QUATERNION and ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYS_STATUS,
+    EXTENDED_SYS_STATE, BATTERY_STATUS."""
+    time_ms = round(state.time_s * 1000)
+    q = to_wxyz(swap_attitude(state.orientation_xyzw)).tolist()
+    rates = swap_flu_frd(state.body_rates_radps).tolist()
+    position, velocity = swap_enu_ned(state.position_m).tolist(), swap_enu_ned(state.velocity_mps).tolist()
+    latitude, longitude, altitude = geodetic(state.position_m, origin)
+    heading = round(float(compass_deg(yaw_rad(state.orientation_xyzw))) * 100) % 36000
+    charge, current_ca = round(state.soc * 100), _fitting(state.current_a * 100)
+    return [
+        mavlink2.MAVLink_heartbeat_message(
+            mavlink2.MAV_TYPE_QUADROTOR,
+            mavlink2.MAV_AUTOPILOT_GENERIC,
+            0 if state.landed else mavlink2.MAV_MODE_FLAG_SAFETY_ARMED | mavlink2.MAV_MODE_FLAG_AUTO_ENABLED,
+            0,
+            mavlink2.MAV_STATE_STANDBY if state.landed else mavlink2.MAV_STATE_ACTIVE,
+            3,
+        ),
+        mavlink2.MAVLink_attitude_quaternion_message(time_ms, *q, *rates),
+        mavlink2.MAVLink_attitude_message(time_ms, *_roll_pitch_yaw(*q), *rates),
+        mavlink2.MAVLink_local_position_ned_message(time_ms, *position, *velocity),
+        mavlink2.MAVLink_global_position_int_message(
+            time_ms,
+            round(latitude * 1e7),
+            round(longitude * 1e7),
+            round(altitude * 1000),
+            round(state.position_m[2] * 1000),
+            *(_fitting(v * 100) for v in velocity),
+            heading,
+        ),
+        mavlink2.MAVLink_sys_status_message(
+            _SENSORS,
+            _SENSORS,
+            _SENSORS,
+            round(state.cpu_load * 1000),
+            min(round(state.voltage_v * 1000), _UNKNOWN_U16),
+            current_ca,
+            charge,
+            *(0,) * 6,
+        ),
+        mavlink2.MAVLink_extended_sys_state_message(
+            mavlink2.MAV_VTOL_STATE_UNDEFINED,
+            mavlink2.MAV_LANDED_STATE_ON_GROUND if state.landed else mavlink2.MAV_LANDED_STATE_IN_AIR,
+        ),
+        mavlink2.MAVLink_battery_status_message(
+            0,
+            mavlink2.MAV_BATTERY_FUNCTION_ALL,
+            mavlink2.MAV_BATTERY_TYPE_LIPO,
+            _MAX_I16,  # temperature unknown
+            _pack_voltage_mv(state.voltage_v),
+            current_ca,
+            -1,  # charge used is not kept; energy is
+            round(state.energy_used_j / 100),
+            charge,
+        ),
+    ]
+
+
+def _roll_pitch_yaw(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The aircraft's angles of an attitude FRD in NED, rad."""
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _fitting(value: float) -> int:
+    """A number in 16 bits; what traces tell may lie beyond them."""
+    return max(-_MAX_I16, min(round(value), _MAX_I16))
+
+
+def _pack_voltage_mv(voltage_v: float) -> list[int]:
+    """BATTERY_STATUS.voltages: cells are not modelled singly, so the pack's voltage stands in slot 0 and what does
+    not fit there in the slots after it, as the message's definition asks."""
+    full, rest = divmod(round(voltage_v * 1000), _UNKNOWN_U16 - 1)
+    slots = [_UNKNOWN_U16 - 1] * full + [rest] * (rest > 0 or not full)
+    return slots + [_UNKNOWN_U16] * (10 - len(slots))
+
+
+STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS"})
+"""Messages of `messages` that an autopilot sends once a second; the others go at the telemetry's own rate."""
+KEY_BYTES = 32
+
+
+class Transmitter:
+    """One vehicle's MAVLink 2 stream: system id = drone id + 1 (0 means everybody), frames numbered in a row.
+
+    With a key of 32 B every frame is signed (13 B more); `signed_at_us`, in µs since 1970, is where its clock begins.
+    """
+
+    def __init__(self, drone: int, key: bytes | None = None, signed_at_us: int = SIGNING_EPOCH_US) -> None:
+        self._mav = mavlink2.MAVLink(None, srcSystem=drone + 1, srcComponent=mavlink2.MAV_COMP_ID_AUTOPILOT1)
+        if key is not None:
+            if len(key) != KEY_BYTES:
+                raise ValueError(f"the signing key has {len(key)} B, must have {KEY_BYTES}")
+            signing = self._mav.signing
+            signing.secret_key, signing.link_id, signing.sign_outgoing = key, 0, True
+            signing.timestamp = (signed_at_us - SIGNING_EPOCH_US) // 10
+
+    def pack(self, message: mavlink2.MAVLink_message) -> bytes:
+        """The next frame."""
+        frame: bytes = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return frame
+
+
+class Listener:
+    """Takes what ground stations say; bytes that are no frame are passed over."""
+
+    def __init__(self) -> None:
+        self._mav = mavlink2.MAVLink(None)
+        self._mav.robust_parsing = True
+
+    def heard(self, data: bytes) -> list[mavlink2.MAVLink_message]:
+        """The messages that these bytes complete."""
+        with contextlib.suppress(mavlink2.MAVError):
+            known = self._mav.parse_buffer(data) or []
+            return [m for m in known if m.get_type() != "BAD_DATA" and not m.get_type().startswith("UNKNOWN")]
+        return []
+
+
+def answers(request: mavlink2.MAVLink_message, drone: int) -> list[mavlink2.MAVLink_message]:
+    """What a drone says to a ground station that asks: who it is; that it has no parameters to set, no mission, no commands.
+
+    Nothing that a ground station sends changes a sortie.
+    """
+    asked, target = request.get_type(), getattr(request, "target_system", 0)
+    if target not in (0, drone + 1):
+        return []
+    if asked == "PARAM_REQUEST_LIST":
+        kind = mavlink2.MAV_PARAM_TYPE_REAL32
+        return [mavlink2.MAVLink_param_value_message(b"SYSID_THISMAV", float(drone + 1), kind, 1, 0)]
+    if asked == "MISSION_REQUEST_LIST":
+        peer, component = request.get_srcSystem(), request.get_srcComponent()
+        return [mavlink2.MAVLink_mission_count_message(peer, component, 0, request.mission_type)]
+    if asked == "COMMAND_LONG":
+        # compared as the float that it is: it may be no number
+        version = request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and request.param1 == _VERSION_ID
+        result = mavlink2.MAV_RESULT_ACCEPTED if version else mavlink2.MAV_RESULT_UNSUPPORTED
+        said: list[mavlink2.MAVLink_message] = [mavlink2.MAVLink_command_ack_message(request.command, result)]
+        return [*said, _version(drone)] if version else said
+    return []
+
+
+_VERSION_ID = mavlink2.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+
+
+def _version(drone: int) -> mavlink2.MAVLink_message:
+    none = bytes(8)
+    return mavlink2.MAVLink_autopilot_version_message(
+        mavlink2.MAV_PROTOCOL_CAPABILITY_MAVLINK2, 0, 0, 0, 0, none, none, none, 0, 0, drone + 1
+    )
+
+
+def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:
+    """Write a telemetry log: for every frame its time as big-endian u64 µs since 1970, then the frame.
+
+    Written to a temporary name beside `path` and renamed, so that a log is there whole or not at all.
+
+    Args:
+        path: conventionally *.tlog.
+        frames: (µs since 1970, MAVLink frame), in order of time.
+    """
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            for time_us, frame in frames:
+                file.write(_LOG_STAMP.pack(time_us) + frame)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
+        raise
+
+
+def is_tlog(data: bytes) -> bool:
+    """Whether a file begins as a telemetry log: a time and a MAVLink frame."""
+    return _frame_bytes(data, 0) > 0
+
+
+def read_tlog(data: bytes) -> RawLog:
+    """A telemetry log's messages as columns; `timestamp` is the ground's clock, µs since the first.
+
+    The vehicle is the first system whose heartbeat names an autopilot; of other systems only RADIO_STATUS is kept,
+    which the vehicle's radio sends in its own name. Parameters become the table PARM. A frame whose checksum is wrong,
+    or a stretch that is no frame, is skipped, counted and told.
+    """
+    from pymavlink.dialects.v20 import ardupilotmega as dialect  # the widest set of messages
+
+    parser = dialect.MAVLink(None)
+    heard: dict[str, list[tuple[int, int, dict[str, object]]]] = {}
+    parameters: dict[str, float] = {}
+    at, end, skipped, stretches, bad, vehicle, restarts, boot_ms = 0, len(data), 0, 0, 0, -1, 0, 0
+    cut = False
+    while at < end:
+        size = _frame_bytes(data, at)
+        if not size:
+            cut = cut or _may_begin(data, at)
+            following = next((p for p in range(at + 1, end) if _frame_bytes(data, p)), end)
+            skipped, stretches, at = skipped + following - at, stretches + 1, following
+            continue
+        stamp_us = _LOG_STAMP.unpack_from(data, at)[0]
+        try:
+            message = parser.decode(bytearray(data[at + _STAMP_BYTES : at + size]))
+        except dialect.MAVError:
+            bad, at = bad + 1, at + size
+            continue
+        at += size
+        name, values, system = message.get_type(), message.to_dict(), message.get_srcSystem()
+        if name == "HEARTBEAT" and vehicle < 0 and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
+            vehicle = system
+        if name == "PARAM_VALUE":
+            parameters[message.param_id] = float(message.param_value)
+        if system == vehicle and "time_boot_ms" in values:
+            restarts += values["time_boot_ms"] < boot_ms - 1000
+            boot_ms = values["time_boot_ms"]
+        heard.setdefault(name, []).append((system, stamp_us, values))
+    tables: dict[str, dict[str, Column]] = {}
+    begin_us = min((each[0][1] for each in heard.values()), default=0)
+    for name, each in heard.items():
+        own = [row for row in each if row[0] == vehicle or name in ("RADIO_STATUS", "RADIO")]
+        if own and name != "PARAM_VALUE":
+            numbers = [key for key, value in own[0][2].items() if isinstance(value, int | float)]
+            tables[name] = {key: np.array([row[2][key] for row in own]) for key in numbers}
+            tables[name]["timestamp"] = np.array([row[1] - begin_us for row in own])
+    tables["PARM"] = {
+        "Name": np.array([n.encode() for n in parameters], "S16"),
+        "Value": np.array(list(parameters.values()), float),
+    }
+    told = (
+        (stretches, f"{skipped} bytes at {stretches} places are no message"),
+        (bad, f"{bad} messages are damaged or of no known kind"),
+        (restarts, f"the vehicle restarted {restarts} times"),
+        (cut, "the last message is cut off"),
+    )
+    return RawLog(tables, tuple(text for happened, text in told if happened))
+
+
+def _may_begin(data: bytes, at: int) -> bool:
+    """Whether a time that could be one and a frame's first byte stand here, or the file ends before."""
+    if len(data) - at <= _STAMP_BYTES:
+        return True
+    return data[at + _STAMP_BYTES] in _MARKS and _YEARS_US[0] < _LOG_STAMP.unpack_from(data, at)[0] < _YEARS_US[1]
+
+
+def _frame_bytes(data: bytes, at: int) -> int:
+    """Bytes of the stamp and frame that begin here, 0 where none does: the next has to begin where it ends."""
+    mark = at + _STAMP_BYTES
+    if mark + 3 > len(data) or not _may_begin(data, at):
+        return 0
+    version2 = data[mark] == 0xFD
+    size = _STAMP_BYTES + data[mark + 1] + _MARKS[data[mark]]
+    size += _SIGNATURE_BYTES if version2 and data[mark + 2] & _SIGNED else 0
+    after = at + size
+    return size if after == len(data) or (after < len(data) and _may_begin(data, after)) else 0

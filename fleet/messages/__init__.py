@@ -1,0 +1,1 @@
+"""Descriptors and directives as bytes: CDR, the compact form and authentication."""

@@ -1,0 +1,177 @@
+"""Adaptive policies: one byte budget, spent by what mission, link, battery and geometry ask for.
+
+Each decision picks an arm, a way to spend the budget: to how many peers, features or boxes, all that is seen or the
+mission's region alone. `adaptive` picks by rules that read mission, coverage, budget and links jointly; `learned` asks a
+linear model that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
+
+`rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies: at equal
+`rho` no arm sends more bytes than they do.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from math import floor, fsum, isfinite, log2, log10
+from pathlib import Path
+from typing import NamedTuple
+
+from sortie.policies.catalogue.coverage_cells import sees
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.geometry import footprint_overlap, peers_by_overlap
+
+RATE_HZ = 10.0
+MAP_MB = 8 * 4096 * 160e-6
+"""All feature cells of one map, megabits."""
+CARRIED = 0.5
+"""A drone asks of the air no more than this part of its mean goodput: the others send as well."""
+STEPS_A_HALVING = 2
+"""What the air carries is rounded down in steps of √2, so that a goodput that wavers moves no directive."""
+EVERYONE = 255
+LEARNED = Path(__file__).with_name("learned.json")
+
+
+class Arm(NamedTuple):
+    """A way to spend the budget."""
+
+    peers: int
+    """How many of the most overlapping peers get features and share the budget; more than there are is all."""
+    boxes: bool
+    """Whether the others get boxes; otherwise nothing."""
+    region: bool
+    """Features of the mission's region alone, where there is one."""
+
+    @property
+    def words(self) -> str:
+        """As it stands in a reason."""
+        who = "all" if self.peers >= EVERYONE else f"{self.peers}"
+        rest = ", boxes to the rest" if self.boxes and self.peers < EVERYONE else ""
+        return f"features to {who}{rest}" if self.peers else "boxes to all"
+
+
+ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, True), Arm(2, True, True), Arm(0, True, False))
+"""What the adaptive policies choose from; searching there is no region, and maps are of everything."""
+MAPS, BOXES = ARMS[0], ARMS[-1]
+FEW = 8 / 4096
+"""Of a map: with fewer cells than that to a link boxes are sent."""
+
+
+def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
+    """The directives of an arm: the budget shared evenly by the chosen peers, or what the air carries of it.
+
+    Args:
+        view: the fleet's latest descriptors.
+        arm: how to spend.
+        rho: the budget, 0 … 1 of full sharing over all links.
+        why: the reason, before the arm's own words.
+    """
+    me = view.me
+    if me is None:
+        return []
+    ego, peers = view.ego, view.peers
+    chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
+    per_link = min(1.0, rho * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
+    roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
+    reason = f"{why}: {arm.words}"
+    directives = []
+    for peer in peers:
+        if peer in chosen:
+            directives.append(Directive(ego, peer, Representation.FEATURES, per_link, roi, RATE_HZ, reason=reason))
+        elif arm.boxes:
+            directives.append(Directive(ego, peer, Representation.DETECTIONS, 0.0, None, RATE_HZ, reason=reason))
+        else:
+            directives.append(nothing(ego, peer, reason))
+    return directives
+
+
+def carried(me: Descriptor, peers: Sequence[int]) -> float:
+    """Share of a map that each of so many links carries in time, by the goodput that the drone measured to them.
+
+    More than that is sent in vain: samples wait for one another and miss their deadlines. 1 while nothing is measured.
+    """
+    measured = [mbps for mbps in map(me.goodput_to, peers) if mbps > 0.0]
+    if not measured:
+        return 1.0
+    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * MAP_MB * RATE_HZ)
+    return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
+
+
+def arm(view: FleetView, *, index: int = 0, rho: float = 0.25) -> list[Directive]:
+    """One arm, always: what the adaptive policies choose from, for `sortie learn` and comparisons."""
+    return spend(view, ARMS[index % len(ARMS)], rho, "fixed arm")
+
+
+FEATURES = ("log10 of the budget", "tracking a region", "mean overlap of peers", "log10 of 1 + mean goodput", "charge")
+
+
+def features(view: FleetView, rho: float) -> tuple[float, ...]:
+    """What the learned policy reads, in the order of `FEATURES`: budget, mission, coverage, links, battery."""
+    me = view.me
+    if me is None:
+        return (0.0,) * len(FEATURES)
+    peers = view.peers
+    overlap = sum(footprint_overlap(me, view.descriptors[p]) for p in peers) / len(peers) if peers else 0.0
+    goodput_mbps = sum(me.goodput_to(p) for p in peers) / len(peers) if peers else 0.0
+    tracking = me.task_phase == TaskPhase.TRACK and me.region is not None
+    return log10(max(rho, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
+
+
+def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """Boxes to every peer, whatever the context and the budget: the cheapest sharing that there is."""
+    return spend(view, BOXES, rho, "fixed")
+
+
+def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """Rules over mission, coverage, budget and links: of a region that is tracked and seen its feature cells, otherwise boxes.
+
+    A region is small, so that even a starved budget sends the cells that count, and maps of them find more than boxes; of
+    the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`). Who sees
+    nothing of the region has no cells of it to send.
+    """
+    me = view.me
+    if me is None:
+        return []
+    if me.task_phase != TaskPhase.TRACK or me.region is None:
+        return spend(view, BOXES, rho, "no region")
+    if not sees(me, me.region):
+        return spend(view, BOXES, rho, "a region out of sight")
+    through = min(rho, carried(me, view.peers))
+    if through < FEW:
+        return spend(view, BOXES, rho, f"a region, budget and links {through:.2g} < {FEW:.2g}")
+    return spend(view, MAPS, rho, "a region")
+
+
+def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+    """The arm that promises most by what simulated sorties taught (`sortie learn`); ties go to the earlier arm."""
+    seen = features(view, rho)
+    z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
+    gains = [w[0] + sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
+    best = max(range(len(ARMS)), key=lambda k: gains[k])
+    return spend(view, ARMS[best], rho, "learned")
+
+
+class Model(NamedTuple):
+    """What `sortie learn` stores: per arm, the AP gained over the first arm as a linear function of `FEATURES`."""
+
+    mean: tuple[float, ...]
+    scale: tuple[float, ...]
+    weights: tuple[tuple[float, ...], ...]
+    """[arms][1 + features], intercept first."""
+
+
+def read_model(path: Path) -> Model:
+    """A stored model.
+
+    Raises:
+        ValueError: its shapes do not fit `FEATURES` and `ARMS`, or a number is not finite.
+    """
+    data = json.loads(path.read_text("utf-8"))
+    model = Model(tuple(data["mean"]), tuple(data["scale"]), tuple(tuple(w) for w in data["weights"]))
+    numbers = [*model.mean, *model.scale, *(x for w in model.weights for x in w)]
+    shapes = {len(model.mean), len(model.scale), *(len(w) - 1 for w in model.weights)}
+    if shapes != {len(FEATURES)} or len(model.weights) != len(ARMS) or not all(map(isfinite, numbers)):
+        raise ValueError(f"{path}: must hold {len(ARMS)} arms of 1 + {len(FEATURES)} finite weights")
+    return model
+
+
+_MODEL = read_model(LEARNED)  # once, when the policy is loaded: a decision reads no file

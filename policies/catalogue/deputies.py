@@ -1,0 +1,78 @@
+"""A policy that reads all four context axes and makes all six decisions: who serves whom, by what is not yet seen.
+
+For each receiver the fleet appoints the k drones that add most to what it sees, as far as link and battery carry
+them. Every drone works out the same appointment from the same descriptors, so nothing is negotiated; a drone whose
+claims are false can take a place from a better one, which is what trust (`sortie.fleet.trust`) is for.
+"""
+
+from __future__ import annotations
+
+from sortie.policies.catalogue.coverage_cells import seen_well
+from sortie.policies.catalogue.freshness import freshness
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.geometry import footprint_overlap
+
+HIGH_BATTERY, LOW_BATTERY = 0.60, 0.30
+FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
+MIN_GOODPUT_MBPS, GOOD_GOODPUT_MBPS = 5.0, 20.0
+RESTING_DUTY_PERCENT = 50
+SLOW_DEADLINE_S = 0.5
+_IDS = 256
+
+
+def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directive]:
+    """Each receiver is served by the k drones that add most: unseen cells × link × battery, nearer ones first on ties."""
+    me = view.me
+    if me is None:
+        return []
+    resting = RESTING_DUTY_PERCENT if me.battery_soc < LOW_BATTERY else 100
+    directives = []
+    for peer in view.peers:
+        place = _appointed(view, peer).index(view.ego)
+        if place >= k:
+            directives.append(
+                nothing(view.ego, peer, f"not among the {k} that add most")._replace(duty_percent=resting)
+            )
+        else:
+            serve = _serve(view, me, peer, rho, f"deputy {place + 1} of {k}")
+            directives.append(serve._replace(duty_percent=resting))
+    return directives
+
+
+def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> Directive:
+    """How the ego serves a peer."""
+    roi = me.region if me.task_phase == TaskPhase.TRACK else None
+    weight = freshness(view.age_s[peer], view.period_s)
+    goodput_mbps = me.goodput_to(peer)
+    if me.battery_soc < LOW_BATTERY or goodput_mbps < MIN_GOODPUT_MBPS:
+        cause = "battery < 30 %" if me.battery_soc < LOW_BATTERY else f"goodput {goodput_mbps:.1f} Mb/s"
+        return Directive(
+            view.ego, peer, Representation.DETECTIONS, 0.0, roi, SLOW_RATE_HZ, SLOW_DEADLINE_S, weight,
+            reason=f"{why}, {cause}",
+        )  # fmt: skip
+    rate_hz = FULL_RATE_HZ if me.battery_soc >= HIGH_BATTERY else HALF_RATE_HZ
+    return Directive(
+        view.ego, peer, Representation.FEATURES, rho, roi, rate_hz, fusion_weight=weight, reason=why
+    )  # fmt: skip
+
+
+def _appointed(view: FleetView, receiver: int) -> list[int]:
+    """All other drones, those that add most to the receiver first."""
+    served = view.descriptors[receiver]
+    known = seen_well(served)
+
+    def merit(i: int) -> tuple[float, float, int]:
+        d = view.descriptors[i]
+        adds = len(seen_well(d) - known) * _link(d.goodput_to(receiver)) * _battery(d.battery_soc)
+        return -round(adds), -round(footprint_overlap(d, served), 1), (i - receiver) % _IDS
+
+    return sorted((i for i in view.descriptors if i != receiver), key=merit)
+
+
+def _link(goodput_mbps: float) -> float:
+    """1 for a good link, ¼ for a bad or unmeasured one."""
+    return min(1.0, max(0.25, goodput_mbps / GOOD_GOODPUT_MBPS))
+
+
+def _battery(soc: float) -> float:
+    return 1.0 if soc >= HIGH_BATTERY else 0.5 if soc >= LOW_BATTERY else 0.1

@@ -1,0 +1,11 @@
+"""DiscoNet (Li et al., NeurIPS 2021): everything to everyone; its edge network weighs agents cell by cell."""
+
+from __future__ import annotations
+
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView
+
+
+def disconet(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    """DiscoNet: full maps to every peer, no context read; weights come from its edge network (fusion disconet)."""
+    return [full_sharing(view.ego, p, rho, "DiscoNet: everyone, weights in the network") for p in view.peers]

@@ -1,0 +1,37 @@
+"""HydraCollab-style: scene confidence switches a link between intermediate and late fusion.
+
+Only its abstract is public: where both ends are confident, features; where one is, detections. Here confidence is
+what the coverage grids say is seen well, its agreement over a link is held against a threshold, and the region is
+what the chosen rung is about: what both see, or what only the sender does.
+"""
+
+from __future__ import annotations
+
+from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around, seen_well
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView, Representation
+
+AGREEMENT = 0.3
+"""Shared over joint cells; two footprints of 42 m agree this far at about 40 m."""
+
+
+def hydracollab(view: FleetView, *, rho: float = 1.0, threshold: float = AGREEMENT) -> list[Directive]:
+    """HydraCollab-style: features of what both ends see well where they agree, otherwise detections of what one sees."""
+    me = view.me
+    if me is None:
+        return []
+    mine = seen_well(me)
+    directives = []
+    for peer in view.peers:
+        theirs = seen_well(view.descriptors[peer])
+        both, joint = mine & theirs, mine | theirs
+        agreement = len(both) / len(joint) if joint else 0.0
+        if both and agreement >= threshold:
+            why = f"HydraCollab: both confident, {agreement:.2f}"
+            directives.append(full_sharing(view.ego, peer, rho, why)._replace(roi=disc_around(both)))
+        else:
+            why = f"HydraCollab: one confident, {agreement:.2f}"
+            region = disc_around((mine - theirs) or centre_cell(me))
+            late = full_sharing(view.ego, peer, 0.0, why)
+            directives.append(late._replace(representation=Representation.DETECTIONS, roi=region))
+    return directives

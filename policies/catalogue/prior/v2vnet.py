@@ -1,0 +1,11 @@
+"""V2VNet (Wang et al., ECCV 2020): everything to everyone; what it decides, it decides in its fusion network."""
+
+from __future__ import annotations
+
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.contract import Directive, FleetView
+
+
+def v2vnet(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    """V2VNet: full maps to every peer, no context read; weights come from message passing (fusion v2vnet)."""
+    return [full_sharing(view.ego, p, rho, "V2VNet: everyone, weights in the network") for p in view.peers]

@@ -1,0 +1,28 @@
+"""Who2com (Liu et al., ICRA 2020): every drone is served by exactly one other, the one that answers it best.
+
+The handshake is When2com's (a request, a score from each, a choice); the softmax leaves the drone itself out, so that
+somebody always sends.
+"""
+
+from __future__ import annotations
+
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.catalogue.prior.matching import scores_for
+from sortie.policies.contract import Directive, FleetView, nothing
+
+_IDS = 256
+
+
+def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
+    """Who2com: full maps to the peers for whom the ego is the best of all drones; ties go round by id."""
+    if view.me is None:
+        return []
+    directives = []
+    for peer in view.peers:
+        scores = scores_for(view, peer)
+        best = max(scores, key=lambda i: (scores[i], -((i - peer) % _IDS)))
+        if best == view.ego:
+            directives.append(full_sharing(view.ego, peer, rho, f"Who2com: best for {peer}, {scores[best]:.2f}"))
+        else:
+            directives.append(nothing(view.ego, peer, f"Who2com: {best} is better for {peer}"))
+    return directives

@@ -1,0 +1,124 @@
+"""What a policy reads and what it decides, watched while it decides: the paper's table of methods, generated.
+
+A policy is run on views whose descriptors note every field that is read. A decision is one that ever differs from
+full sharing (full maps to every peer, every frame, fused at weight 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
+from typing import Any, NamedTuple, cast
+
+from sortie.policies.catalogue.prior import METHODS
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation
+
+
+class Axis(Enum):
+    """The descriptor's groups of fields, as the paper's table heads its columns."""
+
+    MISSION = "Mis."
+    SCENE = "Scene"
+    PLATFORM = "Plat."
+    GEOMETRY = "Geom."
+
+
+FIELDS: dict[str, Axis | None] = {
+    "stamp_ns": None,
+    "agent_id": None,
+    "position_m": Axis.GEOMETRY,
+    "orientation_xyzw": Axis.GEOMETRY,
+    "velocity_mps": Axis.GEOMETRY,
+    "footprint_radius_m": Axis.GEOMETRY,
+    "battery_soc": Axis.PLATFORM,
+    "cpu_headroom": Axis.PLATFORM,
+    "gpu_headroom": Axis.PLATFORM,
+    "peer_goodput_mbps": Axis.PLATFORM,
+    "goodput_to": Axis.PLATFORM,
+    "coverage_grid": Axis.SCENE,
+    "coverage_corner": Axis.SCENE,  # where the grid lies, to the cell: without it the grid says nothing
+    "novelty_flags": Axis.SCENE,
+    "task_phase": Axis.MISSION,
+    "region": Axis.MISSION,
+    "priority_target_ids": Axis.MISSION,
+}
+"""Which axis each field of a descriptor belongs to."""
+
+DECISIONS = ("duty", "topology", "fidelity", "ROI", "rate", "fusion wts")
+"""The six decisions; fidelity is representation and budget, rate is rate and deadline."""
+
+
+class Observed(NamedTuple):
+    """What was seen of a policy."""
+
+    axes: frozenset[Axis]
+    decisions: frozenset[str]
+
+
+class _Watched:
+    """A descriptor that notes which fields are read; it is no tuple, so that nothing is read by place."""
+
+    def __init__(self, descriptor: Descriptor, read: set[str]) -> None:
+        self._descriptor, self._read = descriptor, read
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._descriptor, name)
+        if name not in FIELDS:
+            raise AttributeError(f"a watched descriptor has fields alone, {name!r} is none")
+        self._read.add(name)
+        return value
+
+
+def observe(policy: Callable[..., Sequence[Directive]], views: Iterable[FleetView]) -> Observed:
+    """Run a policy on watched views."""
+    read: set[str] = set()
+    decided: set[str] = set()
+    for view in views:
+        watched = {i: cast(Descriptor, _Watched(d, read)) for i, d in view.descriptors.items()}
+        for directive in policy(view._replace(descriptors=watched)):
+            decided |= decisions_of(directive)
+    return Observed(frozenset(a for f in read if (a := FIELDS[f]) is not None), frozenset(decided))
+
+
+def decisions_of(d: Directive) -> set[str]:
+    """In which decisions a directive differs from full sharing."""
+    full = full_sharing(d.source, d.destination, 1.0, "")
+    differs = {
+        "duty": d.duty_percent != full.duty_percent,
+        "topology": d.representation == Representation.NONE,
+    }
+    if d.representation != Representation.NONE:  # of a link that carries nothing the rest says nothing
+        differs |= {
+            "fidelity": (d.representation, d.rho) != (full.representation, full.rho),
+            "ROI": d.roi is not None,
+            "rate": (d.rate_hz, d.deadline_s) != (full.rate_hz, full.deadline_s),
+            "fusion wts": d.fusion_weight != full.fusion_weight,
+        }
+    return {name for name, is_so in differs.items() if is_so}
+
+
+def method_table(views: Sequence[FleetView], everything: Iterable[Callable[..., Sequence[Directive]]]) -> str:
+    """The paper's table: a row a prior method, and one for the plane, which is what `everything` reads and decides.
+
+    A method that brings a fusion network of its own decides fusion weights there.
+    """
+    rows = ["| method | Mis. | Scene | Plat. | Geom. | decides |", "|---|---|---|---|---|---|"]
+    for method in METHODS.values():
+        axes, decided = observe(method.policy, views)
+        if not decided and method.fusion is not None:
+            decided = frozenset({"fusion wts"})
+        rows.append(_row(method.title, Observed(axes, decided)))
+    seen = [observe(policy, views) for policy in everything]
+    plane = Observed(frozenset().union(*(o.axes for o in seen)), frozenset().union(*(o.decisions for o in seen)))
+    return "\n".join([*rows, _row("Context plane", plane)]) + "\n"
+
+
+def _row(title: str, observed: Observed) -> str:
+    read = " | ".join("●" if axis in observed.axes else "–" for axis in Axis)
+    decides = (
+        "all six"
+        if len(observed.decisions) == len(DECISIONS)
+        else " + ".join(d for d in DECISIONS if d in observed.decisions)
+    )
+    return f"| {title} | {read} | {decides} |"

@@ -1,0 +1,359 @@
+"""The conformance kit: what every policy must keep, tried on drawn views; no policy is exempt.
+
+    checks = conform(my_policy)
+    assert all(c.holds for c in checks)
+
+A rule is a function of a policy and a view that returns a complaint, or None where the policy keeps it. A rule
+that fails comes with the smallest view found on which it fails.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+from sortie.policies.contract import (
+    Descriptor,
+    Directive,
+    FleetView,
+    Policy,
+    PolicyError,
+    check_directives,
+    check_reposition,
+    kind_fault,
+)
+from sortie.policies.registry import viewpoint_of
+from sortie.policies.verification.confine import Reached, confined
+from sortie.policies.verification.views import draw_view, draw_views, smaller
+
+VIEWS = 300
+BUDGETS = (0.02, 0.25, 1.0)
+DECISION_LIMIT_S = 0.010
+"""A tenth of a frame at 10 Hz, at 20 drones: generous, since machines differ; the figure itself is reported."""
+_STALE_PERIODS = 20.0  # beyond the plane's ten, at which a peer is detached
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One rule's verdict on one policy."""
+
+    name: str
+    holds: bool
+    what: str
+    """The complaint where it fails, otherwise what was tried."""
+    counterexample: FleetView | None = None
+    """The smallest failing view found; None where the rule holds or needs no view."""
+
+
+Rule = Callable[[Policy, FleetView], str | None]
+
+
+class _Raised(Exception):
+    """The policy itself raised, or gave no directives; `answers` and `bounds kept` report it, no other rule does."""
+
+
+def conform(
+    policy: Policy, views: Iterable[FleetView] | None = None, *, seed: int = 0, count: int = VIEWS
+) -> list[Check]:
+    """Hold a policy to every rule of the kit.
+
+    Args:
+        policy: any callable of the contract's shape; a keyword parameter `rho` is taken for its budget.
+        views: what to try it on; left out, the first `count` views of `seed`.
+        seed: of the drawn views.
+        count: how many.
+
+    Returns:
+        One check a rule, always in the same order; a rule that no view could judge does not hold.
+    """
+    tried = list(draw_views(seed, count) if views is None else views)
+    checks = [_judge(name, rule, policy, tried) for name, rule in RULES.items()]
+    return [*checks, _decides_in_time(policy)]
+
+
+def failing(checks: Sequence[Check]) -> list[Check]:
+    """The checks that do not hold."""
+    return [c for c in checks if not c.holds]
+
+
+def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
+    def complaint(view: FleetView) -> str | None:
+        try:
+            return rule(policy, _copied(view))
+        except _Raised:
+            return None
+
+    judged = 0
+    for view in views:
+        try:
+            found = rule(policy, _copied(view))
+        except _Raised:
+            continue
+        judged += 1
+        if found is not None:
+            small = smaller(view, lambda v: complaint(v) is not None)
+            return Check(name, False, complaint(small) or found, small)
+    return Check(
+        name, judged > 0, f"{judged} views" if judged else "could be judged on no view: see answers, bounds kept"
+    )
+
+
+# --- the rules -----------------------------------------------------------------------------------
+
+
+def _ask(policy: Policy, view: FleetView) -> list[Directive]:
+    """What the policy decides on a copy of the view: one that changes its input spoils no other rule."""
+    directives = _answer(policy, view)
+    if any(kind_fault(d) is not None for d in directives):
+        raise _Raised
+    return directives
+
+
+def _answer(policy: Policy, view: FleetView) -> list[Directive]:
+    """The same, whatever its directives are made of."""
+    try:
+        return list(policy(_copied(view)))
+    except Exception as error:
+        raise _Raised from error
+
+
+def _answers(policy: Policy, view: FleetView) -> str | None:
+    try:
+        answer = policy(view)
+    except Exception as error:
+        return f"raises {type(error).__name__}: {error}"
+    if not isinstance(answer, Sequence):
+        return f"returns {type(answer).__name__}, must be a sequence of directives"
+    return None
+
+
+def _keeps_bounds(policy: Policy, view: FleetView) -> str | None:
+    try:
+        check_directives(_answer(policy, view), view)
+    except PolicyError as error:
+        return str(error)
+    return None
+
+
+def _one_a_link(policy: Policy, view: FleetView) -> str | None:
+    decided = sorted(d.destination for d in _ask(policy, view))
+    return None if decided == list(view.peers) else f"directives for {decided}, must be for each of {list(view.peers)}"
+
+
+def _says_why(policy: Policy, view: FleetView) -> str | None:
+    silent = [f"{d.source}→{d.destination}" for d in _ask(policy, view) if not d.reason]
+    return f"no reason given for {', '.join(silent)}" if silent else None
+
+
+def _leaves_its_input(policy: Policy, view: FleetView) -> str | None:
+    before = _copied(view)
+    with contextlib.suppress(Exception):  # one that raises half-way may have changed it all the same
+        policy(view)
+    if view == before and list(view.descriptors) == list(before.descriptors) and list(view.age_s) == list(before.age_s):
+        return None
+    changed = [n for n in ("descriptors", "age_s") if getattr(view, n) != getattr(before, n)]
+    return f"the policy changed its input: {', '.join(changed) or 'the order of drones'}"
+
+
+def _same_in_same_out(policy: Policy, view: FleetView) -> str | None:
+    first = _spelt(_ask(policy, view))
+    if _spelt(_ask(policy, view)) != first:
+        return "two calls with the same view differ"
+    _ask(policy, draw_view(1, 0))
+    return None if _spelt(_ask(policy, view)) == first else "differs after another view: it remembers"
+
+
+def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
+    usual = _spelt(_ask(policy, view))
+    try:
+        alone = _spelt(_ask(confined(policy), view))
+    except Reached as error:
+        return str(error)
+    return None if alone == usual else "decides otherwise where only its view is in reach"
+
+
+def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
+    usual = _by_peer(_ask(policy, view))
+    ids = list(view.descriptors)
+    for order in (ids[::-1], sorted(ids), ids[1:] + ids[:1]):
+        other = view._replace(
+            descriptors={i: view.descriptors[i] for i in order}, age_s={i: view.age_s[i] for i in order}
+        )
+        if _by_peer(_ask(policy, other)) != usual:
+            return f"drones in the order {order} get other directives than in the order {ids}"
+    return None
+
+
+def _alone_and_empty(policy: Policy, view: FleetView) -> str | None:
+    alone = {i: d for i, d in view.descriptors.items() if i == view.ego}
+    for few in (
+        view._replace(descriptors=alone, age_s={i: view.age_s[i] for i in alone}),
+        view._replace(descriptors={}, age_s={}),
+    ):
+        try:
+            directives = list(policy(few))
+        except Exception as error:
+            return f"{len(few.descriptors)} drones in the view: raises {type(error).__name__}: {error}"
+        if directives:
+            return f"{len(few.descriptors)} drones in the view: {len(directives)} directives, must be none"
+    return None
+
+
+def _stands_stale(policy: Policy, view: FleetView) -> str | None:
+    stale = view._replace(age_s=dict.fromkeys(view.age_s, _STALE_PERIODS * view.period_s))
+    try:
+        check_directives(list(policy(stale)), stale)
+    except Exception as error:
+        return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {error}"
+    return None
+
+
+def age_monotone(policy: Policy, view: FleetView) -> str | None:
+    """The plane's second rule: raising any descriptor's age raises no directive's fidelity or rate.
+
+    Each descriptor's age is raised by itself, and all together, to beyond each of the plane's two thresholds.
+    """
+    before = _ask(policy, view)
+    for periods in (1.0, 3.5, 10.5, 1000.0):
+        add_s = periods * view.period_s
+        for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
+            older = view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
+            raised = raised_part(before, _ask(policy, older))
+            if raised is not None:
+                return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
+    return None
+
+
+def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str | None:
+    """The first directive of `after` that is above its link's in `before` in rung, budget (at one rung) or rate."""
+    usual = _by_peer(before)
+    for d in after:
+        old = usual.get(d.destination)
+        link = f"directive {d.source}→{d.destination}"
+        if old is None:
+            if d.representation > 0:
+                return f"{link}: there was none before"
+        elif d.representation > old.representation:
+            return f"{link}: representation rises from {int(old.representation)} to {int(d.representation)}"
+        elif d.representation == old.representation and d.rho > old.rho:
+            return f"{link}: rho rises from {old.rho} to {d.rho}"
+        elif d.rate_hz > old.rate_hz:
+            return f"{link}: rate_hz rises from {old.rate_hz} to {d.rate_hz}"
+    return None
+
+
+def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
+    parameter = inspect.signature(policy).parameters.get("rho")
+    if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
+        _ask(policy, view)
+        return None
+    takes_rho: Callable[..., Any] = policy
+    for rho in BUDGETS:
+        bound = partial(takes_rho, rho=rho)
+        spent, allowed = sum(d.rho for d in _ask(bound, view)), rho * len(view.peers)
+        if not spent <= allowed * (1 + _ROUNDING):
+            return f"rho={rho:g}: its links sum to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
+    return None
+
+
+def _looks(policy: Policy, view: FleetView) -> str | None:
+    """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
+    look = viewpoint_of(policy)
+    if look is None:
+        _ask(policy, view)
+        return None
+    shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
+    try:
+        asked = look(shown)
+        check_reposition(asked, view)
+        if shown != view:
+            return "its viewpoint changed its input"
+        others = {
+            "two calls with the same view differ": look(_copied(view)),
+            "drones in another order get another place": look(view._replace(descriptors=_turned(view.descriptors))),
+            "decides otherwise where only its view is in reach": confined(look)(view),
+        }
+        for few in (alone, {}):
+            fewer = view._replace(descriptors=few, age_s={i: view.age_s[i] for i in few})
+            check_reposition(look(fewer), fewer)
+    except PolicyError as error:
+        return str(error)
+    except Reached as error:
+        return f"its viewpoint {error}"
+    except Exception as error:
+        return f"its viewpoint raises {type(error).__name__}: {error}"
+    return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
+
+
+def _turned(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
+    """The same in the opposite order."""
+    return dict(reversed(list(descriptors.items())))
+
+
+RULES: dict[str, Rule] = {
+    "answers": _answers,
+    "bounds kept": _keeps_bounds,
+    "one directive a link": _one_a_link,
+    "says why": _says_why,
+    "input unchanged": _leaves_its_input,
+    "same in, same out": _same_in_same_out,
+    "reads only its view": _reads_only_its_view,
+    "order of drones irrelevant": _order_is_irrelevant,
+    "one drone and empty views": _alone_and_empty,
+    "stale views": _stands_stale,
+    "age-monotone": age_monotone,
+    "budget kept": _keeps_budget,
+    "viewpoint kept": _looks,
+}
+"""The kit's rules by name; a policy without a parameter `rho` has no budget to break."""
+
+
+def _decides_in_time(policy: Policy) -> Check:
+    """CPU time of a decision, the median of many, at 5 and at 20 drones."""
+    name, took_s = "time per decision", {}
+    for drones in (5, 20):
+        view = full_view(drones)
+        try:
+            for _ in range(3):
+                policy(view)
+            marks_ns = [time.thread_time_ns()]
+            for _ in range(50):
+                policy(view)
+                marks_ns.append(time.thread_time_ns())
+        except Exception as error:
+            return Check(name, False, f"raises {type(error).__name__}: {error}", view)
+        took_s[drones] = statistics.median(b - a for a, b in pairwise(marks_ns)) * 1e-9
+    what = ", ".join(f"{s * 1e6:.0f} µs at {n} drones" for n, s in took_s.items())
+    slow = took_s[20] > DECISION_LIMIT_S
+    return Check(name, not slow, what + (f", must be at most {DECISION_LIMIT_S * 1e3:g} ms" if slow else ""))
+
+
+def full_view(drones: int) -> FleetView:
+    """A view of so many drones, all heard, in drawn states: what decisions are timed on."""
+    drawn = next(v for v in draw_views(2, 10_000) if len(v.descriptors) >= 3)
+    some = list(drawn.descriptors.values())
+    descriptors = {
+        i: some[i % len(some)]._replace(agent_id=i, peer_goodput_mbps=(100.0,) * (drones - 1)) for i in range(drones)
+    }
+    return FleetView(0, 0.1, descriptors, dict.fromkeys(descriptors, 0.1))
+
+
+def _copied(view: FleetView) -> FleetView:
+    """The view with mappings of its own; all below them is immutable."""
+    return view._replace(descriptors=dict(view.descriptors), age_s=dict(view.age_s))
+
+
+def _spelt(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
+    return [tuple(d) for d in directives]  # with the reasons, which equality leaves out
+
+
+def _by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:
+    return {d.destination: d for d in directives}

@@ -1,0 +1,254 @@
+"""Proofs: whether a policy keeps its properties on every view of a fleet, or a view on which it does not.
+
+The policy runs on views whose fields are ranges (`sortie.policies.verification.symbols`). What it compares cuts the ranges into cells,
+and the search visits all of them: every roster up to `max_drones`, every ego, every subset of peers heard, and
+
+| field | searched over |
+|---|---|
+| charge and headrooms | every float of 0 … 1 |
+| goodput | every float of 0 … 10⁵ Mb/s |
+| ages | every float of 0 … 3600 s |
+| phase, region | all five; none, or any disc |
+| novelty flags, target ids | every byte; how many, 0 … 16 |
+| positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |
+
+A policy that asks for anything else (the coverage grid's cells, a clock, two goodputs compared with each other) is
+not proved: it is tried on drawn views, and where none breaks it the verdict says "not proved". A counterexample is
+a view of plain numbers on which the policy itself was run again and failed.
+
+Outside the proof: fleets larger than `max_drones`, another period than the one given, NaN, and a policy that
+compares text in which a number stands among other text (`f"charge {soc:.2f}" == "charge 0.12"`: Python makes plain
+text of it), or that looks behind its input with `is`, `id`, or code that is not Python's. Text of a number alone,
+`isinstance` and `type` are answered as in flight or not proved.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
+from sortie.policies.verification.confine import looks_up
+from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.invariants import Invariant, spelt, violations
+from sortie.policies.verification.ranges import FleetOfRanges
+from sortie.policies.verification.symbols import Path, Refused, explore
+from sortie.policies.verification.views import draw_views, smaller
+
+MAX_DRONES = 4
+MAX_CELLS = 200_000
+TRIED_VIEWS = 1000
+
+Outcome = Literal["proved", "refuted", "not proved"]
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """Something to prove: a complaint about a policy on a view, None where it is kept."""
+
+    name: str
+    complaint: Callable[[Policy, View], str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of one property."""
+
+    name: str
+    outcome: Outcome
+    what: str
+    counterexample: FleetView | None = None
+    raised_age_s: Mapping[int, float] | None = None
+    """The ages to which the counterexample's were raised, where that is what the property is about."""
+
+
+class View:
+    """A view that can be had as often as it is asked for, over the same inputs: plain, at age 0, or older."""
+
+    def __init__(
+        self,
+        plain: FleetView | None = None,
+        system: FleetOfRanges | None = None,
+        raised: Mapping[int, float] | None = None,
+    ) -> None:
+        self._plain, self._system, self._raised = plain, system, raised
+
+    def now(self) -> FleetView:
+        """The view itself, each time with mappings of its own."""
+        if self._system is not None:
+            return self._system.view()
+        assert self._plain is not None  # noqa: S101
+        return self._plain._replace(descriptors=dict(self._plain.descriptors), age_s=dict(self._plain.age_s))
+
+    def just_heard(self) -> FleetView:
+        """The same with every age 0."""
+        view = self.now()
+        return view._replace(age_s=dict.fromkeys(view.age_s, 0.0))
+
+    def older(self) -> Iterator[FleetView]:
+        """The same with ages raised: any raise at all in a search, a few in a trial."""
+        if self._system is not None:
+            yield self._system.older_view()
+            return
+        if self._raised is not None:
+            yield self.now()._replace(age_s=dict(self._raised))
+        view = self.now()
+        for periods in (1.0, 3.5, 10.5, 1000.0):
+            for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
+                yield view._replace(age_s={i: a + periods * view.period_s * (i in who) for i, a in view.age_s.items()})
+
+
+# --- properties ----------------------------------------------------------------------------------
+
+
+def keeps_contract(policy: Policy, view: View) -> str | None:
+    """Bounds, and one directive a link."""
+    directives = list(policy(view.now()))
+    try:
+        check_directives(directives, view.now())
+    except PolicyError as error:
+        return str(error)
+    decided, peers = sorted(d.destination for d in directives), list(view.now().peers)
+    return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
+
+
+def only_falls_with_age(policy: Policy, view: View) -> str | None:
+    """Raising any ages raises no directive's rung, budget or rate."""
+    before = list(policy(view.now()))
+    for older in view.older():
+        raised = raised_part(before, policy(older))
+        if raised is not None:
+            ages = ", ".join(f"{i}: {a!r}" for i, a in older.age_s.items())
+            return f"with ages raised to {ages} s, {raised}"
+    return None
+
+
+def property_of(invariant: Invariant) -> Property:
+    """An invariant as something to prove."""
+
+    def complaint(policy: Policy, view: View) -> str | None:
+        directives = list(policy(view.now()))
+        fresh = list(policy(view.just_heard())) if invariant.needs_fresh else []
+        for broken in violations(invariant, view.now(), directives, fresh):
+            return f"decided {spelt(directives if broken is None else [broken])}"
+        return None
+
+    return Property(invariant.text, complaint)
+
+
+PLANE: tuple[Property, ...] = (
+    Property("contract: bounds, one directive a link", keeps_contract),
+    Property("age-monotone: older descriptors raise no rung, budget or rate", only_falls_with_age),
+)
+"""What every policy owes the plane, whatever its invariants."""
+
+
+# --- proving -------------------------------------------------------------------------------------
+
+
+def prove(
+    policy: Policy,
+    invariants: Sequence[Invariant] = (),
+    *,
+    max_drones: int = MAX_DRONES,
+    period_s: float = 0.1,
+    max_cells: int = MAX_CELLS,
+    seed: int = 0,
+) -> list[Verdict]:
+    """Prove or refute the plane's properties and a policy's invariants.
+
+    Args:
+        policy: the policy.
+        invariants: what it must keep besides.
+        max_drones: rosters of 1 to so many are searched; cells grow about tenfold with each.
+        period_s: the plane's period.
+        max_cells: a search that would visit more is given up: not proved.
+        seed: of the drawn views on which what is not proved is tried.
+
+    Returns:
+        One verdict a property, the plane's first.
+    """
+    properties = [*PLANE, *(property_of(i) for i in invariants)]
+    return [_verdict(policy, p, max_drones, period_s, max_cells, seed) for p in properties]
+
+
+def _verdict(policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int, seed: int) -> Verdict:
+    def fails(view: FleetView) -> bool:
+        return complaint_on(prop, policy, view) is not None
+
+    try:
+        cells, system = _search(policy, prop, max_drones, period_s, max_cells)
+    except Refused as refused:
+        reason = str(refused)
+    else:
+        if system is not None:
+            found = system.example()
+            raised = system.raised_example()
+            confirmed = complaint_on(prop, policy, found, raised)
+            if confirmed is not None:
+                return Verdict(prop.name, "refuted", confirmed, found, raised)
+            reason = "the search meets a fault that no plain view shows"
+        elif looks_up(policy, type):
+            reason = "asks for a type(…), which is another one in the search"
+        else:
+            return Verdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
+    for view in draw_views(seed, TRIED_VIEWS):
+        if fails(view):
+            small = smaller(view, fails)
+            return Verdict(prop.name, "refuted", complaint_on(prop, policy, small) or "", small)
+    return Verdict(prop.name, "not proved", f"{reason}; {TRIED_VIEWS} drawn views keep it")
+
+
+def complaint_on(
+    prop: Property, policy: Policy, view: FleetView, raised: Mapping[int, float] | None = None
+) -> str | None:
+    """What is wrong with a policy on one plain view; raising is."""
+    try:
+        return prop.complaint(policy, View(plain=view, raised=raised))
+    except Exception as error:
+        return _unsound(policy, view) or f"raises {type(error).__name__}: {error}"
+
+
+def _unsound(policy: Policy, view: FleetView) -> str | None:
+    """What in the policy's answer is no directive, over which a property stumbles; None where that is not the cause."""
+    try:
+        return next((wrong for d in policy(view) if (wrong := kind_fault(d)) is not None), None)
+    except Exception:
+        return None
+
+
+def _search(
+    policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int
+) -> tuple[int, FleetOfRanges | None]:
+    """How many cells were visited, and the first on which the property fails."""
+    cells = 0
+    for drones, ego, heard in _rosters(max_drones):
+
+        def run(
+            path: Path, drones: int = drones, ego: int = ego, heard: tuple[int, ...] = heard
+        ) -> tuple[str | None, FleetOfRanges]:
+            system = FleetOfRanges(path, drones, ego, heard, period_s)
+            try:
+                return prop.complaint(policy, View(system=system)), system
+            except Exception as error:  # its own fault or the ranges': the plain view will tell
+                return f"raises {type(error).__name__}", system
+
+        for _, (complaint, system) in explore(run):
+            cells += 1
+            if complaint is not None:
+                return cells, system
+            if cells >= max_cells:
+                raise Refused(f"more than {max_cells} cells")
+    return cells, None
+
+
+def _rosters(max_drones: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
+    """Every fleet size, ego, and subset of drones heard (always with the ego), small ones first."""
+    for drones in range(1, max_drones + 1):
+        for ego in range(drones):
+            others = [i for i in range(drones) if i != ego]
+            for k in range(drones):
+                for peers in itertools.combinations(others, k):
+                    yield drones, ego, tuple(sorted((ego, *peers)))

@@ -1,0 +1,289 @@
+"""A fleet's view whose fields are ranges, for the search of `sortie.policies.verification.proof`, and a plain view of any of its cells."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NoReturn
+
+from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.geometry import circle_overlap, peers_by_overlap
+from sortie.policies.verification.symbols import Path, Ranged
+from sortie.policies.verification.views import GRID_BYTES
+
+_FOOTPRINT_M = 42.0
+_FLAGS = 8
+"""Bits of a descriptor's novelty flags; the plane itself uses two."""
+_HIGHEST: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
+
+
+class FleetOfRanges:
+    """A fleet's view over the ranges of one path."""
+
+    def __init__(self, path: Path, drones: int, ego: int, heard: tuple[int, ...], period_s: float) -> None:
+        self.path, self.drones, self.ego, self.heard, self.period_s = path, drones, ego, heard, period_s
+        self.peers = tuple(i for i in heard if i != ego)
+        self._older = False
+
+    def view(self) -> FleetView:
+        descriptors: dict[int, Any] = {i: DescriptorOfRanges(self, i) for i in self.heard}
+        ages: Mapping[int, Any] = {i: self._age(i) for i in self.heard}
+        return FleetView(self.ego, self.period_s, descriptors, ages)
+
+    def _age(self, i: int) -> Ranged:
+        return self.path.number(f"age_s of drone {i}", 0.0, _HIGHEST["age"])
+
+    def older_view(self) -> FleetView:
+        """The view at ages not below this cell's: each at least the lowest age of the cell reached so far.
+
+        Exact, not an approximation: within the cell the policy decides the same, so that its lowest age stands
+        for it, and every age from there on is a raise of that one.
+        """
+        self._older = True
+        ages: dict[int, Any] = {}
+        for i in self.heard:
+            self._age(i)
+            low, _ = self.path.ranges[f"age_s of drone {i}"]
+            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _HIGHEST["age"])
+        return self.view()._replace(age_s=ages)
+
+    def example(self) -> FleetView:
+        """A plain view of the cell: usual values where they lie in it, otherwise round ones."""
+        path = self.path
+
+        def number(axis: str, usual: float) -> float:
+            low, high = path.ranges.get(axis, (usual, usual))
+            return usual if low <= usual <= high else _round_within(low, high)
+
+        order = path.picks.get("order by overlap", self.peers)
+        places = _places(self.ego, order)
+        descriptors = {}
+        for i in self.heard:
+            region = path.picks.get(f"region of drone {i}", False)
+            names = [f"region {part} of drone {i}" for part in ("x_m", "y_m", "radius_m")]
+            targets = number(f"targets of drone {i}", 0)
+            descriptors[i] = Descriptor(
+                stamp_ns=0,
+                agent_id=i,
+                position_m=places[i],
+                orientation_xyzw=(0.0, 0.0, 0.0, 1.0),
+                velocity_mps=(0.0, 0.0, 0.0),
+                footprint_radius_m=_FOOTPRINT_M,
+                battery_soc=number(f"battery_soc of drone {i}", 1.0),
+                cpu_headroom=number(f"cpu_headroom of drone {i}", 1.0),
+                gpu_headroom=number(f"gpu_headroom of drone {i}", 1.0),
+                peer_goodput_mbps=tuple(
+                    number(f"goodput of drone {i} to slot {slot}", 100.0) for slot in range(self.drones - 1)
+                ),
+                coverage_grid=bytes(GRID_BYTES),
+                novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
+                task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
+                region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
+                priority_target_ids=tuple(range(int(targets))),
+            )
+        return FleetView(self.ego, self.period_s, descriptors, self._example_ages())
+
+    def _example_ages(self) -> dict[int, float]:
+        ages = {}
+        for i in self.heard:
+            low, high = self.path.ranges.get(f"age_s of drone {i}", (0.0, 0.0))
+            # Where ages were raised it is the lowest age of the cell that they were raised from.
+            ages[i] = low if self._older or low == 0.0 else _round_within(low, high)
+        return ages
+
+    def raised_example(self) -> dict[int, float] | None:
+        """The raised ages of the example, where the property raised any."""
+        if not self._older:
+            return None
+        from_s = self._example_ages()
+        raised = {}
+        for i in self.heard:
+            low, high = self.path.ranges[f"raised age_s of drone {i}"]
+            raised[i] = from_s[i] if low <= from_s[i] <= high else _round_within(low, high)
+        return raised
+
+
+class DescriptorOfRanges:
+    """A descriptor whose fields are ranges, forked where they have no order, refused where they cannot be searched."""
+
+    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
+        self._system = system
+        self.agent_id = agent_id
+
+    def _number(self, name: str, low: float, high: float) -> Any:
+        return self._system.path.number(f"{name} of drone {self.agent_id}", low, high)
+
+    @property
+    def battery_soc(self) -> Any:
+        return self._number("battery_soc", 0.0, 1.0)
+
+    @property
+    def cpu_headroom(self) -> Any:
+        return self._number("cpu_headroom", 0.0, 1.0)
+
+    @property
+    def gpu_headroom(self) -> Any:
+        return self._number("gpu_headroom", 0.0, 1.0)
+
+    @property
+    def peer_goodput_mbps(self) -> tuple[Any, ...]:
+        path, me, high = self._system.path, self.agent_id, _HIGHEST["goodput"]
+        slots = range(self._system.drones - 1)
+        return tuple(path.number(f"goodput of drone {me} to slot {slot}", 0.0, high) for slot in slots)
+
+    def goodput_to(self, peer: int) -> Any:
+        found = Descriptor.goodput_to(self, peer)  # type: ignore[arg-type]
+        return found
+
+    @property
+    def task_phase(self) -> TaskPhase:
+        return self._system.path.pick(f"task_phase of drone {self.agent_id}", tuple(TaskPhase))
+
+    @property
+    def novelty_flags(self) -> Any:
+        return _Flags(self._system.path, self.agent_id)
+
+    @property
+    def region(self) -> Disc | None:
+        if not self._system.path.pick(f"region of drone {self.agent_id}", (False, True)):
+            return None
+        return Disc(
+            self._number("region x_m", -1e5, 1e5),
+            self._number("region y_m", -1e5, 1e5),
+            self._number("region radius_m", 0.001, 1e5),
+        )
+
+    @property
+    def priority_target_ids(self) -> Any:
+        return _Counted(self._number("targets", 0, 16), self._system.path)
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        self._only_for_order("position_m")
+        order = self._system.path.pick("order by overlap", _orders(self._system.peers))
+        return _places(self._system.ego, order)[self.agent_id]
+
+    @property
+    def footprint_radius_m(self) -> float:
+        self._only_for_order("footprint_radius_m")
+        return _FOOTPRINT_M
+
+    def _only_for_order(self, field: str) -> None:
+        """Geometry is read through `peers_by_overlap` of the ego alone: then its order is all that a policy sees."""
+        frame = sys._getframe(2)
+        while frame is not None:
+            if frame.f_code is peers_by_overlap.__code__:
+                if getattr(frame.f_locals.get("view"), "ego", None) == self._system.ego:
+                    return
+                break
+            frame = frame.f_back  # type: ignore[assignment]
+        self._system.path.refuse(f"reads {field} otherwise than through peers_by_overlap")
+
+    def __getattr__(self, name: str) -> NoReturn:
+        self._system.path.refuse(f"reads {name}, which has no boundaries to search")
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or self.__getattr__("whole descriptors")
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return Descriptor  # as `isinstance` finds it in flight
+
+
+class _Flags:
+    """A byte of flags, forked bit by bit as they are asked for, and into all its values by whatever asks for more."""
+
+    def __init__(self, path: Path, agent_id: int) -> None:
+        self._path, self._id = path, agent_id
+
+    def _bits(self, mask: int) -> int:
+        asked = [bit for bit in range(_FLAGS) if mask >> bit & 1]
+        return sum(self._path.pick(_flag(bit, self._id), (0, 1 << bit)) for bit in asked)
+
+    def __and__(self, mask: object) -> Any:
+        return self._bits(mask) if isinstance(mask, int) else NotImplemented
+
+    __rand__ = __and__
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bits(-1), name)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return int
+
+
+def _of_all_bits(name: str) -> Callable[..., Any]:
+    def operator(*operands: Any) -> Any:
+        return getattr(int, name)(*(x._bits(-1) if type(x) is _Flags else x for x in operands))
+
+    return operator
+
+
+_UNASKED = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
+for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _UNASKED:
+    setattr(_Flags, _asked, _of_all_bits(_asked))  # where Python looks for operators
+
+
+def _flag(bit: int, agent_id: int) -> str:
+    return f"novelty flag {bit} of drone {agent_id}"
+
+
+class _Counted:
+    """Target ids of which only the number is known."""
+
+    def __init__(self, count: Any, path: Path) -> None:
+        self._count, self._path = count, path
+
+    def __bool__(self) -> bool:
+        return bool(self._count > 0)
+
+    def __len__(self) -> int:
+        for n in range(16):
+            if self._count <= n:
+                return n
+        return 16
+
+    def _cannot(self, *_: object) -> NoReturn:
+        self._path.refuse("reads what the targets' ids are")
+
+    __iter__ = __contains__ = __getitem__ = __eq__ = __hash__ = __getattr__ = _cannot
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return tuple
+
+
+def _orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    return tuple(itertools.permutations(peers))
+
+
+@lru_cache(maxsize=4096)
+def _places(ego: int, order: tuple[int, ...]) -> dict[int, tuple[float, float, float]]:
+    """Positions whose footprints overlap the ego's in that order, each a clear step less than the one before."""
+    places = {ego: (0.0, 0.0, 60.0)}
+    for rank, peer in enumerate(order):
+        wanted = 0.95 - 0.9 * (rank + 1) / (len(order) + 1)
+        near_m, far_m = 0.0, 2 * _FOOTPRINT_M
+        for _ in range(40):
+            middle_m = (near_m + far_m) / 2
+            if circle_overlap(middle_m, _FOOTPRINT_M, _FOOTPRINT_M) > wanted:
+                near_m = middle_m
+            else:
+                far_m = middle_m
+        places[peer] = (round(near_m, 2), 0.0, 60.0)
+    return places
+
+
+def _round_within(low: float, high: float) -> float:
+    """A number of [low, high] with few digits."""
+    middle = low / 2 + high / 2
+    for digits in range(17):
+        candidate = round(middle, digits)
+        if low <= candidate <= high:
+            return candidate
+    return low

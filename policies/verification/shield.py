@@ -1,0 +1,234 @@
+"""A shield: a policy that keeps its invariants at run time, and says where it had to step in.
+
+    decide = shield(worked, parse("when battery < 0.3: rate_hz <= 1"))
+
+A directive that breaks an invariant is replaced by the nearest one that keeps them all, and its reason begins with
+"shield:", so that the record shows each intervention at the gate and `interventions` counts them. Nearest means:
+fewest fields changed, then the least change, a rung counting as a quarter of the ladder and every number as its
+share of its bounds. The shield stands where the policy stands: staleness and damping come after it and may lower
+what it raised, and damping holds a raise back for the dwell time.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from sortie.policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.verification.invariants import (
+    Binary,
+    Invariant,
+    InvariantError,
+    Links,
+    Name,
+    Node,
+    Scope,
+    evaluate,
+    just_heard,
+    walk,
+)
+
+MARK = "shield: "
+_HIGHEST: dict[str, float] = {
+    "representation": 4, "rho": 1.0, "rate_hz": MAX_RATE_HZ, "deadline_s": MAX_DEADLINE_S, "fusion_weight": 1.0,
+    "duty": 1.0, "roi": 1.0,
+}  # fmt: skip
+_SUMS = ("sum_links", "count_links", "every_link")
+
+
+def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
+    """The policy, kept to its invariants; a pure function as the policy is, and shielding it again changes nothing.
+
+    Where no change of one link keeps an invariant (it contradicts another, or asks something of the view alone)
+    the directives stay as decided and each one's reason says so.
+
+    Raises:
+        InvariantError: an invariant sums or counts links: which of them should yield is not the shield's to say; nor
+            `every_link(…)`, which says the same as its requirement alone.
+    """
+    rules = checked(invariants)
+    asks_fresh = any(rule.needs_fresh for rule in rules)
+
+    def shielded(view: FleetView, /) -> list[Directive]:
+        decided = list(policy(view))
+        fresh = list(policy(just_heard(view))) if asks_fresh else []
+        return enforce(rules, view, decided, fresh)
+
+    shielded.__doc__ = f"{getattr(policy, '__name__', 'a policy')}, shielded."
+    return shielded
+
+
+def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
+    """The invariants, all of them such that a shield can keep them.
+
+    Raises:
+        InvariantError: as `shield` does.
+    """
+    rules = tuple(invariants)
+    for rule in rules:
+        for top in (rule.when, rule.then):
+            for node in () if top is None else walk(top):
+                if isinstance(node, Links) and node.function in _SUMS:
+                    raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
+    return rules
+
+
+def interventions(directives: Iterable[Directive]) -> int:
+    """How many of a policy's directives a shield replaced."""
+    return sum(d.reason.startswith(MARK) for d in directives)
+
+
+def enforce(
+    rules: Sequence[Invariant], view: FleetView, decided: Sequence[Directive], fresh: Sequence[Directive] = ()
+) -> list[Directive]:
+    """The directives, with those that break a rule replaced by the nearest that keep all.
+
+    Args:
+        rules: what must hold.
+        view: what the policy saw.
+        decided: what it decided.
+        fresh: what it decides at age 0, for rules that ask.
+    """
+    me, directives = view.me, list(decided)
+    if me is None:
+        return directives
+    of_link = [rule for rule in rules if rule.of_link]
+    scope = Scope(view, me, directives, {d.destination: d for d in fresh})
+    for k, directive in enumerate(directives):
+        broken = [r for r in of_link if not _keeps(r, scope, directive)]
+        if broken:
+            directives[k] = _mended(scope, k, of_link, broken)
+    for rule in rules:
+        if not rule.of_link and not _keeps(rule, scope, None):
+            _mend_together(scope, directives, rule, of_link)
+    return directives
+
+
+def _keeps(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
+    here = scope._replace(link=link)
+    return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
+
+
+def _mended(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
+    """The nearest directive on this link that keeps every rule of links."""
+    before = scope.directives[k]
+    for _, after in _nearest(before, rules, scope):
+        if all(_keeps(r, scope, after) for r in rules):
+            return _told(before, after, broken)
+    return _unkept(before, broken)
+
+
+def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
+    """Change one link, the least change of all links', so that a rule over all of them holds.
+
+    Args:
+        scope: of these very directives.
+    """
+    best: tuple[tuple[int, float], int, Directive] | None = None
+    for k, before in enumerate(list(directives)):
+        for far, after in _nearest(before, [*of_link, rule], scope):
+            if best is not None and far >= best[0]:
+                break
+            directives[k] = after
+            if _keeps(rule, scope, None) and all(_keeps(r, scope, after) for r in of_link):
+                best = (far, k, after)
+                break
+        directives[k] = before
+    if best is None:
+        directives[:] = [_unkept(d, [rule]) for d in directives]
+    else:
+        _, k, after = best
+        directives[k] = _told(directives[k], after, [rule])
+
+
+def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
+    because = "; ".join(rule.text for rule in broken)
+    was = f"{Representation(before.representation).name.lower()} at {before.rate_hz:g} Hz"
+    return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
+
+
+def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
+    note = f"{MARK}cannot keep {'; '.join(rule.text for rule in broken)} "
+    return before if before.reason.startswith(note) else before._replace(reason=f"{note}({before.reason})")
+
+
+# --- candidates ----------------------------------------------------------------------------------
+
+
+def _nearest(
+    before: Directive, rules: Sequence[Invariant], scope: Scope
+) -> Iterator[tuple[tuple[int, float], Directive]]:
+    """How far, and which: directives that differ in the decisions that the rules speak of, nearest first."""
+    here = scope._replace(link=before)
+    values: dict[str, set[float]] = {}
+    for rule in rules:
+        for top in (rule.when, rule.then):
+            if top is not None:
+                _collect(top, here, values)
+    now = {word: _value(before, word) for word in values}
+    steps = {w: sorted(({0.0, _HIGHEST[w]} | values[w]) - {now[w]}) for w in sorted(values)}
+    waiting: list[tuple[tuple[int, float], Directive]] = []
+    # A change of so many words changes so many fields or, where a rung takes its budget along, one more.
+    for changes in range(1, len(steps) + 2):
+        for words in itertools.combinations(steps, changes):
+            for pick in itertools.product(*(steps[w] for w in words)):
+                found = _with(before, dict(zip(words, pick, strict=True)), scope.me.region)
+                if found is not None:
+                    waiting.append((_distance(before, found), found))
+        near = [w for w in waiting if w[0][0] <= changes]
+        waiting = [w for w in waiting if w[0][0] > changes]
+        yield from sorted(near, key=lambda w: w[0])
+
+
+def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
+    """Into `values`: for each decision spoken of, where the comparisons about it change their answer."""
+    for node in walk(top):
+        if isinstance(node, Name) and node.word in _HIGHEST:
+            values.setdefault(node.word, set())
+        if not isinstance(node, Binary) or node.sign not in ("<", "<=", ">", ">=", "==", "!="):
+            continue
+        for side, other in ((node.left, node.right), (node.right, node.left)):
+            if isinstance(side, Name) and side.word in _HIGHEST and not isinstance(other, Links):
+                edge = evaluate(other, scope)
+                near = (edge - 1, edge, edge + 1) if side.word == "representation" else _around(edge)
+                values.setdefault(side.word, set()).update(v for v in near if 0 <= v <= _HIGHEST[side.word])
+
+
+def _around(edge: float) -> tuple[float, ...]:
+    """The edge, and a clear step to each side: what a strict comparison needs must survive the wire's rounding."""
+    step = max(abs(edge), 0.01) * 0.01
+    return (edge - step, edge, edge + step) if math.isfinite(edge) else ()
+
+
+def _value(d: Directive, word: str) -> float:
+    if word == "duty":
+        return d.duty_percent / 100
+    return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
+
+
+def _with(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
+    """The directive with decisions changed; None where there is no such directive."""
+    changed: dict[str, Any] = {}
+    for word, value in wanted.items():
+        if word == "representation":
+            if value != int(value):
+                return None
+            changed[word] = Representation(int(value))
+        elif word == "duty":
+            changed["duty_percent"] = round(value * 100)
+        elif word == "roi":
+            if value and region is None:
+                return None
+            changed["roi"] = region if value else None
+        else:
+            changed[word] = value
+    if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
+        changed["rho"] = 0.0  # the budget is one of feature cells
+    return before._replace(**changed)
+
+
+def _distance(a: Directive, b: Directive) -> tuple[int, float]:
+    parts = [abs(_value(a, word) - _value(b, word)) / high for word, high in _HIGHEST.items()]
+    return sum(p > 0 for p in parts), sum(parts)

@@ -1,0 +1,133 @@
+"""The random numbers of links, by stream for small fleets and by counter for large ones.
+
+**By stream**: one stream a drone and purpose; the stream of drone h draws for its links to the drones of *lower* id,
+so that each link has numbers of its own and one more drone changes none of the others', with N streams and not N².
+
+**By counter**: a number for a link and a frame, without those of any other link or frame before it.
+A stream of numbers has to be drawn in order, also for links that nobody needs; where a fleet is large, most links
+are out of earshot. So there each link has a 64 bit key, made of keys from its drones' streams, and the number of
+a frame is SplitMix64's finaliser of key and frame (Steele, Lea & Flood, OOPSLA 2014).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chndtr, ndtri
+
+from sortie.radio.channel.shadowing import gauss_markov, keep
+from sortie.scenarios.schema import Radio
+from sortie.scenarios.streams import stream
+
+Keys = NDArray[np.uint64]
+
+FloatArray = NDArray[np.float64]
+
+_LEVELS = 1 << 16
+
+
+def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
+    """Power gain of mean 1 from two standard normals: a fixed path of K/(K + 1) and a scattered one of 1/(K + 1)."""
+    k = 10.0 ** (k_db / 10.0)
+    scatter = sqrt(0.5 / (k + 1.0))
+    return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
+
+
+class StreamDraws:
+    """Shadowing, fades and luck of every link of n drones, block after block."""
+
+    def __init__(self, config: Radio, seed: int, replication: int, n: int, frame_s: float) -> None:
+        self._config, self._n = config, n
+        self._keep = keep(frame_s, config.shadowing_time_s)
+        self._shadow = [stream(seed, replication, h, "shadowing") for h in range(n)]
+        self._fade = [stream(seed, replication, h, "fading") for h in range(n)]
+        self._luck = [stream(seed, replication, h, "group loss") for h in range(n)]
+        self._last_db: FloatArray | None = None
+
+    def block(self, frames: int, flown: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the next frames: shadowing in dB, fades in dB, and luck (uniform; NaN on the diagonal).
+
+        Args:
+            frames: how many to draw, the same in every block.
+            flown: how many of them are wanted.
+
+        Returns:
+            [flown, n, n] each, sender by receiver.
+        """
+        b, n = frames, self._n
+        shadow_z, x, y, luck = (np.zeros((b, n, n)) for _ in range(4))
+        for h in range(1, n):
+            z = self._shadow[h].standard_normal((b, h))
+            shadow_z[:, h, :h] = z
+            shadow_z[:, :h, h] = z
+            self._scatter(x, h, f := self._fade[h].standard_normal((b, 2, 2, h)), 0)
+            self._scatter(y, h, f, 1)
+            self._scatter(luck, h, self._luck[h].random((b, 1, 2, h)), 0)
+        luck[:, range(n), range(n)] = np.nan
+        shadow_db = gauss_markov(shadow_z, self._config.shadowing_sigma_db, self._keep, self._last_db)
+        self._last_db = shadow_db[-1]
+        gain = rician_gain(x[:flown], y[:flown], self._config.rician_k_db)
+        return shadow_db[:flown], 10.0 * np.log10(np.maximum(gain, 1e-12)), luck[:flown]
+
+    @staticmethod
+    def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:
+        into[:, h, :h] = drawn[:, part, 0]  # h sends
+        into[:, :h, h] = drawn[:, part, 1]  # h receives
+
+
+def mix(z: Keys) -> Keys:
+    """SplitMix64's finaliser, of a counter times the golden ratio."""
+    z = z * np.uint64(0x9E3779B97F4A7C15)
+    shifted = z >> np.uint64(30)
+    z ^= shifted
+    z *= np.uint64(0xBF58476D1CE4E5B9)
+    z ^= np.right_shift(z, np.uint64(27), out=shifted)
+    z *= np.uint64(0x94D049BB133111EB)
+    z ^= np.right_shift(z, np.uint64(31), out=shifted)
+    return z
+
+
+def drone_keys(seed: int, replication: int, n: int) -> Keys:
+    """[N]: one key a drone, of its own stream."""
+    return np.array([stream(seed, replication, i, "link key").bit_generator.random_raw() for i in range(n)], np.uint64)
+
+
+def link_keys(drones: Keys, sender: NDArray[np.int64], receiver: NDArray[np.int64]) -> Keys:
+    """[L]: one key a directed link."""
+    return mix(drones)[sender] ^ mix(drones ^ np.uint64(0x5851F42D4C957F2D))[receiver]
+
+
+def numbers(keys: Keys, first_frame: int, frames: int) -> Keys:
+    """[frames, L]: 64 random bits a link and frame."""
+    counters = mix(np.arange(first_frame, first_frame + frames, dtype=np.uint64))
+    return mix(keys[None, :] + counters[:, None])
+
+
+def uniforms(bits: Keys) -> NDArray[np.float32]:
+    """Numbers in [0, 1), in steps of 2⁻²⁴, from 24 of the lower 32 bits."""
+    return np.asarray((bits.astype(np.uint32) >> np.uint32(8)) * np.float32(2.0**-24))
+
+
+def levels(bits: Keys, which: int) -> NDArray[np.uint64]:
+    """0 … 65,535, indices into the tables below: from bits 32 to 47 (0) or 48 to 63 (1)."""
+    return np.asarray((bits >> np.uint64(32 + 16 * which)) & np.uint64(_LEVELS - 1))
+
+
+@lru_cache(maxsize=1)
+def normal_table() -> NDArray[np.float32]:
+    """[65,536]: the standard normal distribution in steps of equal probability, ± 4.3 at most."""
+    return np.asarray(ndtri((np.arange(_LEVELS) + 0.5) / _LEVELS), np.float32)
+
+
+@lru_cache(maxsize=32)
+def fade_table_db(k_db: float) -> NDArray[np.float32]:
+    """[65,536]: the Rician power gain of mean 1, dB, in steps of equal probability."""
+    k = 10.0 ** (k_db / 10.0)
+    grid_db = np.arange(-60.0, 16.0, 0.01)
+    cdf = chndtr(10.0 ** (grid_db / 10.0) * 2.0 * (k + 1.0), 2, 2.0 * k)  # non-central χ², two degrees of freedom
+    rising = np.concatenate([[True], np.diff(cdf) > 0.0])
+    middles = (np.arange(_LEVELS) + 0.5) / _LEVELS
+    return np.asarray(np.interp(middles, cdf[rising], grid_db[rising]), np.float32)

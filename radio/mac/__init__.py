@@ -1,0 +1,1 @@
+"""Who may send when, and for how long: contention, airtime, rate control and group-addressed frames."""
