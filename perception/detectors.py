@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception
 
@@ -83,14 +83,14 @@ def make_detector(scene: SceneModel, config: Perception, seed: int, replication:
 
 
 def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from sortie.perception.detector import TorchDetector
+    from sortie.perception.network.detector import TorchDetector
 
     weights = None if config.weights is None else Path(config.weights)
     return TorchDetector(scene, config, seed, weights, replication)
 
 
 def _recorded(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from sortie.perception.outside.detector import RecordedDetector
+    from sortie.perception.recordings.detector import RecordedDetector
 
     return RecordedDetector(config)
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
-from sortie.perception.ap import best_first, rivals, standing
 from sortie.perception.geometry import in_square
+from sortie.perception.metrics.ap import best_first, rivals, standing
 from sortie.perception.types import Boxes, Share
 
 NMS_IOU = 0.15

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from sortie.scenarios.explain import sections_of
+from sortie.scenarios.reading.explain import sections_of
 from sortie.scenarios.schema import Scenario, json_schema
 
 HERE = Path(__file__).parent

@@ -31,7 +31,7 @@ from sortie.fleet.messages.wire import (
     encode_descriptor,
     encode_directive,
 )
-from sortie.perception.traffic import TARGET_ID
+from sortie.perception.scene.traffic import TARGET_ID
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.sim.folders import replacing
 from sortie.sim.outcome import transitions

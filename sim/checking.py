@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sortie.scenarios.files import named_files
-from sortie.scenarios.load import library, load
+from sortie.scenarios.reading.files import named_files
+from sortie.scenarios.reading.load import library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.expect import Verdict, check
 from sortie.sim.folders import RunError

@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sortie.perception.ap import Matched
-from sortie.perception.harness.statistics import compare as bootstrap
+from sortie.perception.metrics.ap import Matched
+from sortie.perception.metrics.bootstrap import compare as bootstrap
 from sortie.policies.registry import resolve
 from sortie.scenarios.schema import Scenario
 from sortie.sim.outcome import matched, outcome

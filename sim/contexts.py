@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sortie.perception.ap import average_precision
 from sortie.perception.detectors import make_detector
+from sortie.perception.metrics.ap import average_precision
 from sortie.policies.registry import POLICIES, parameters, resolve
-from sortie.scenarios.contexts import Context, Contexts
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.conditions import Context, Contexts
 from sortie.sim.folders import RunError
 from sortie.sim.outcome import matched, outcome
 from sortie.sim.sortie import DetectorOf, run_sortie

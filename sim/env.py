@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sortie.perception.ap import average_precision
+from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
 from sortie.sim.outcome import matched

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sortie.perception.harness.report import put_into
+from sortie.perception.evaluation.report import put_into
 
 
 class RunError(ValueError):

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sortie.perception.ap import Matched, average_precision
 from sortie.perception.detectors import Constructor, Detector
-from sortie.perception.scene import SceneModel
-from sortie.scenarios.contexts import Context, Contexts
-from sortie.scenarios.load import load, load_contexts
+from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.reading.load import load, load_contexts
 from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.schema.conditions import Context, Contexts
 from sortie.sim.contexts import paired_interval, scenario_of
 from sortie.sim.outcome import both_matched
 from sortie.sim.sortie import run_sortie
@@ -110,7 +110,7 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
     Sorties that are made one after the other in one scene, under several policies, share the torch detector, its scenery
     and what it has encoded.
     """
-    from sortie.perception.detector import TorchDetector  # here: torch takes a second to import
+    from sortie.perception.network.detector import TorchDetector  # here: torch takes a second to import
 
     ours = _surrogate(calibration)
     last: list[tuple[object, Detector]] = []

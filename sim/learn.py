@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sortie.perception.ap import average_precision
 from sortie.perception.detectors import make_detector
+from sortie.perception.metrics.ap import average_precision
 from sortie.policies.catalogue.adaptive import ARMS, features, spend
 from sortie.policies.contract import Directive, FleetView
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.folders import write_text

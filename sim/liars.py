@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sortie.perception.harness.statistics import Difference, compare
-from sortie.scenarios.load import library, load
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.scenarios.reading.load import library, load
 from sortie.sim.compare import pair_up
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sortie.perception.harness.statistics import Difference, compare
-from sortie.scenarios.load import load
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.scenarios.reading.load import load
 from sortie.sim.compare import pair_up
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sortie.fleet.agent import Task
-from sortie.perception.traffic import TARGET_ID, TargetPath
+from sortie.perception.scene.traffic import TARGET_ID, TargetPath
 from sortie.policies.contract import Disc, TaskPhase
 from sortie.scenarios.schema import Mission
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from sortie.perception.ap import Matched, average_precision, judge
+from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
 from sortie.radio.transmission import Status
 from sortie.sim.outcome_fields import REASONS

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hin
 from sortie.fleet.energy.battery import CAUSES, RECORDED
 from sortie.fleet.messages.auth import DropReason
 from sortie.radio.transmission import Status
-from sortie.scenarios.nodes import nearest
+from sortie.scenarios.reading.nodes import nearest
 
 
 class Percentiles(TypedDict):

@@ -11,7 +11,7 @@ import numpy as np
 
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.outcome import outcome
 from sortie.sim.sortie import run_sortie
 

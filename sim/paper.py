@@ -12,13 +12,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sortie.perception.harness import figure_frame, figures, report, rows
-from sortie.perception.harness.found import Asked
-from sortie.perception.harness.instrument import CarNetInstrument
-from sortie.perception.harness.paper import bench_frames, camera_views, measure
-from sortie.perception.harness.picture import PAPER_BUDGETS, Picture, picture
-from sortie.perception.harness.rows import Point, Row
-from sortie.perception.harness.sensitivity import Varied, sensitivity
+from sortie.perception.evaluation import figure_frame, figures, report, rows
+from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.paper import bench_frames, camera_views, measure
+from sortie.perception.evaluation.picture import PAPER_BUDGETS, Picture, picture
+from sortie.perception.evaluation.results import Asked
+from sortie.perception.evaluation.rows import Point, Row
+from sortie.perception.evaluation.sensitivity import Varied, sensitivity
 from sortie.sim.folders import ensure_folder, put_between, replacing
 from sortie.sim.plane import machine, measure_plane, measured_live
 from sortie.sim.sortie import VERSION

@@ -1,7 +1,7 @@
 """What the paper says of the context plane's cost and of its replayed traces, measured on a flown sortie.
 
 The sortie is `paper_replay`: the paper's 120 s with five drones instead of four, its directives enforced by gates and
-its payloads handed to a radio. Names are those that the claims ask for (`sortie.perception.harness.measures.Elsewhere`).
+its payloads handed to a radio. Names are those that the claims ask for (`sortie.perception.evaluation.measures.Elsewhere`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.fleet.messages.wire import descriptor_bytes, encode_directive
-from sortie.perception.harness.verdict import Measured
+from sortie.perception.evaluation.verdict import Measured
 from sortie.policies.contract import Directive, FleetView, Policy
 from sortie.policies.registry import resolve
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.record import SortieRecord
 from sortie.sim.sortie import run_sortie

@@ -79,8 +79,8 @@ def _is_scenario(path: Path) -> bool:
 
 def _is_flow_scenario(text: str, *, golden: bool) -> bool:
     """Which keys stand on top only the reader can tell; a file that it cannot read is a scenario's if it begins as one."""
-    from sortie.scenarios.load import ScenarioError, tree
-    from sortie.scenarios.nodes import child
+    from sortie.scenarios.reading.load import ScenarioError, tree
+    from sortie.scenarios.reading.nodes import child
 
     try:
         root = tree(text, "")
@@ -97,7 +97,7 @@ class ScenarioFile(pytest.File):
 
     def collect(self) -> Iterator[ScenarioItem]:
         """One test an expectation, and one for the golden outcome."""
-        from sortie.scenarios.load import ScenarioError, load
+        from sortie.scenarios.reading.load import ScenarioError, load
         from sortie.sim.expect import in_words
         from sortie.sim.golden import golden_path
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sortie.perception.ap import average_precision
+from sortie.perception.metrics.ap import average_precision
 from sortie.sim.folders import RunError
 from sortie.sim.outcome import matched, transitions
 from sortie.sim.record import HANDSHAKE, SortieRecord

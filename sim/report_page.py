@@ -6,7 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from sortie.scenarios.load import dump
+from sortie.scenarios.reading.load import dump
 from sortie.sim.folders import write_text
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

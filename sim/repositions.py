@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sortie.fleet.coverage import footprint_radius_m
-from sortie.perception.harness.statistics import Difference, compare
-from sortie.scenarios.load import load
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.compare import pair_up
 from sortie.sim.contexts import paired_interval

@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from sortie.scenarios.load import ScenarioError, dump, loads
+from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, ensure_folder, replacing
 from sortie.sim.outcome import outcome

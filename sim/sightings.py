@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from sortie.perception.ap import Matched, match
+from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.types import Boxes
 
 

@@ -21,7 +21,7 @@ from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.traces import follow, read_traces
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc, Policy
 from sortie.radio import Air

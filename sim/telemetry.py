@@ -23,7 +23,7 @@ from sortie.fleet.logs.mavlink import (
     messages,
     write_tlog,
 )
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError
 from sortie.sim.record import SortieRecord

@@ -8,7 +8,7 @@ from typing import Protocol, Self
 
 import pyarrow as pa
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.sortie import Observer
 

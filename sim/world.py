@@ -20,7 +20,7 @@ from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.flight.motion import Motion
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.senses import FlightSenses, Sensed
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
 from sortie.radio import Air

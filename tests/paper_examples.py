@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.evaluation.condition import Condition
+from sortie.perception.evaluation.contract import Exchange, Floats
+from sortie.perception.evaluation.measures import Region
+from sortie.perception.evaluation.verdict import Measured
 from sortie.perception.geometry import CELLS, FULL
-from sortie.perception.harness.condition import Condition
-from sortie.perception.harness.contract import Exchange, Floats
-from sortie.perception.harness.measures import Region
-from sortie.perception.harness.verdict import Measured
 
 DRAWS = 400
 

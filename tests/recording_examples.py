@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sortie.fleet.flight.motion import fly
-from sortie.perception.outside.exchange import moved
-from sortie.perception.outside.writing import write_recording
-from sortie.perception.scene import SceneModel
+from sortie.perception.recordings.exchange import moved
+from sortie.perception.recordings.writing import write_recording
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.world import route_bounds
 

@@ -30,7 +30,7 @@ HOMES = {
     "torch": ("perception/*",),
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/mavlink.py",),
-    "yaml": ("scenarios/load.py",),
+    "yaml": ("scenarios/reading/load.py",),
     "distributed": ("sim/campaign/engine.py",),
     "dask": ("sim/campaign/engine.py",),
     "SALib": ("sim/campaign/*",),
@@ -39,7 +39,7 @@ HOMES = {
 """Third-party libraries with one home each."""
 
 NOT_IMPORTED = {"pickle", "dill", "cloudpickle", "shelve", "marshal"}
-RESTRICTED_UNPICKLER = "perception/outside/unpickle.py"
+RESTRICTED_UNPICKLER = "perception/recordings/unpickle.py"
 """The one file that imports pickle: it looks names up in a table of its own and refuses the rest."""
 NOT_CALLED = {"print", "eval", "exec"}
 
@@ -107,10 +107,10 @@ def test_every_package_at_the_root_is_a_room() -> None:
     [
         ("radio/rates.py", "import sortie.fleet", "radio must not import fleet"),
         ("radio/rates.py", "from sortie.policies.contract import Disc", "radio must not import policies"),
-        ("radio/rates.py", "import sortie.perception.ap as ap", "radio must not import perception"),
+        ("radio/rates.py", "import sortie.perception.metrics.ap as ap", "radio must not import perception"),
         ("policies/catalogue/worked.py", "from sortie.perception import ap", "policies must not import perception"),
-        ("perception/ap.py", "from sortie.radio.air import Air", "perception must not import radio"),
-        ("scenarios/load.py", "import sortie.policies", "scenarios must not import policies"),
+        ("perception/metrics/ap.py", "from sortie.radio.air import Air", "perception must not import radio"),
+        ("scenarios/reading/load.py", "import sortie.policies", "scenarios must not import policies"),
         ("fleet/agent.py", "import numpy, sortie.sim.record", "fleet must not import sim"),
         ("fleet/agent.py", "def f():\n    from sortie.sim import record", "fleet must not import sim"),
         ("fleet/agent.py", "if TYPE_CHECKING:\n    import sortie.sim", "fleet must not import sim"),
@@ -129,9 +129,9 @@ def test_every_package_at_the_root_is_a_room() -> None:
         ("sim/sortie.py", "from torch import nn", "torch is at home in perception/*"),
         ("sim/sortie.py", "import rerun as rr", "rerun is at home in sim/playback/*"),
         ("fleet/agent.py", "from pymavlink.dialects import v20", "pymavlink is at home in fleet/logs/mavlink.py"),
-        ("scenarios/nodes.py", "import yaml", "yaml is at home in scenarios/load.py"),
-        ("perception/outside/uav3d.py", "import pickle", "pickle is not used: it runs what it reads"),
-        ("perception/outside/unpickle.py", "import dill", "dill is not used: it runs what it reads"),
+        ("scenarios/reading/nodes.py", "import yaml", "yaml is at home in scenarios/reading/load.py"),
+        ("perception/recordings/uav3d.py", "import pickle", "pickle is not used: it runs what it reads"),
+        ("perception/recordings/unpickle.py", "import dill", "dill is not used: it runs what it reads"),
         ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),
         ("sim/cli/app.py", "print('done')", "print() is not called in a room"),
         ("policies/registry.py", "f = eval(name)", "eval() is not called in a room"),
@@ -155,7 +155,7 @@ def test_a_planted_violation_is_found(path: str, source: str, what: str) -> None
             "fleet/messages/wire.py",
             "from .cdr import encode\nfrom . import cdr\nfrom sortie.fleet.messages.cdr import decode",
         ),
-        ("perception/model.py", "import torch\nmodel.eval()\nconsole.print(x)"),
+        ("perception/network/model.py", "import torch\nmodel.eval()\nconsole.print(x)"),
         ("perception/nets/head.py", "import torch"),
         ("radio/air.py", "import simpy, numpy, simulator, yamlish"),
     ],

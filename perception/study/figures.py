@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sortie.perception.harness.figures import INK, PAPER, figure_of, legend_below, save
+from sortie.perception.evaluation.figures import INK, PAPER, figure_of, legend_below, save
 from sortie.perception.study.measure import Row
 from sortie.perception.study.plan import Plan
 from sortie.perception.study.report import UNSENT, Found, View

@@ -9,13 +9,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sortie.perception.ap import Matched
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from sortie.perception.harness.evaluation import Evaluation
-from sortie.perception.harness.measures import POINTS, Contrast, Level, Oracle
-from sortie.perception.harness.scores import Bootstrap
-from sortie.perception.harness.statistics import interval
-from sortie.perception.harness.verdict import Measured as Measurement
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.matched import Evaluation
+from sortie.perception.evaluation.measures import POINTS, Contrast, Level, Oracle
+from sortie.perception.evaluation.scores import Bootstrap
+from sortie.perception.evaluation.verdict import Measured as Measurement
+from sortie.perception.metrics.ap import Matched
+from sortie.perception.metrics.bootstrap import interval
 from sortie.perception.study.plan import Measured, Tau, Variant
 
 MODEL_TAU = 0.1

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from sortie.perception.bench.difficulty import Density
-from sortie.perception.harness.condition import CellsBy, Condition, Unsent
+from sortie.perception.benchmark.difficulty import Density
+from sortie.perception.evaluation.condition import CellsBy, Condition, Unsent
 from sortie.perception.training.recipe import Recipe
 
 PLAN = Path(__file__).parent / "variants.toml"

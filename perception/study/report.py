@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sortie.perception.bench.dataset import SIZES
+from sortie.perception.benchmark.dataset import SIZES
 from sortie.perception.study.measure import MODEL_TAU, Row
 from sortie.perception.study.plan import Plan
 

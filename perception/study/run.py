@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sortie.perception.bench.dataset import Benchmark, load_frames, make_split
-from sortie.perception.bench.difficulty import Density, Difficulty
-from sortie.perception.checkpoint import load_weights
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, CellsBy, Condition
-from sortie.perception.harness.evaluate import evaluate
-from sortie.perception.harness.evaluation import FLOOR, Evaluation
-from sortie.perception.harness.instrument import CarNetInstrument
-from sortie.perception.harness.measures import under
-from sortie.perception.model import ModelConfig
+from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+from sortie.perception.benchmark.difficulty import Density, Difficulty
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.matched import FLOOR, Evaluation
+from sortie.perception.evaluation.measures import under
+from sortie.perception.network.checkpoint import load_weights
+from sortie.perception.network.model import ModelConfig
 from sortie.perception.study.measure import F1, Row, optimal_f1, rows_of
 from sortie.perception.study.plan import Measured, Plan, Variant
 from sortie.perception.training.train import TrainResult, train

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.ap import average_precision, match
-from sortie.perception.checkpoint import read_config
-from sortie.perception.detector import SHIPPED_WEIGHTS, ground_truth
 from sortie.perception.geometry import FULL
+from sortie.perception.metrics.ap import average_precision, match
+from sortie.perception.network.checkpoint import read_config
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, ground_truth
 from sortie.perception.surrogate.collect import FLOOR, Asked, collect, read
+from sortie.perception.surrogate.correlation import hang_together, seen_by_several
 from sortie.perception.surrogate.fit import fit
 from sortie.perception.surrogate.judge import WITHIN, Verdict, judge
 from sortie.perception.surrogate.levels import level
 from sortie.perception.surrogate.model import Parameters, save
 from sortie.perception.surrogate.plan import MANNERS, THRESHOLD, Split, scene_model
 from sortie.perception.surrogate.rows import Rows, rows_of
-from sortie.perception.surrogate.together import hang_together, seen_by_several
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)
 LOST = 0.003

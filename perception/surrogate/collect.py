@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.detector import TorchDetector
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.plan import (
     THRESHOLD,
     Job,

@@ -14,14 +14,14 @@ from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import FULL
 from sortie.perception.joining import Heard, joined_many, told
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import Floats
+from sortie.perception.surrogate.draws import Drawn, Luck
 from sortie.perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
 from sortie.perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
-from sortie.perception.surrogate.luck import Drawn, Luck
-from sortie.perception.surrogate.mirages import Mirages
+from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
-from sortie.perception.surrogate.words import mixed, uniform
-from sortie.perception.town import Floats
+from sortie.perception.surrogate.shared_false_positives import Mirages
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, Fleet, Ints, Looks, beside, square
-from sortie.perception.town import Floats
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.schema import Scene
 

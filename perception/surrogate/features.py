@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sortie.perception.geometry import FULL
-from sortie.perception.scene import SceneModel
-from sortie.perception.surrogate.sight import HeightField, Kerbs, next_of
-from sortie.perception.town import Floats
-from sortie.perception.traffic import TARGET_COLOUR, TARGET_SIZE_M
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import Floats
+from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
+from sortie.perception.surrogate.line_of_sight import HeightField, Kerbs, next_of
 from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]

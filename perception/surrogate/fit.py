@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import expit, logit, ndtr, ndtri
 from torch import Tensor
 
-from sortie.perception.overlap import iou_pairs
+from sortie.perception.metrics.overlap import iou_pairs
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES
 from sortie.perception.surrogate.features import axes, on_axes
 from sortie.perception.surrogate.model import (

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sortie.perception.ap import Matched, average_precision, match
-from sortie.perception.harness.statistics import compare, interval, rank, resamples
+from sortie.perception.metrics.ap import Matched, average_precision, match
+from sortie.perception.metrics.bootstrap import compare, interval, rank, resamples
 from sortie.perception.surrogate.collect import Asked
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters

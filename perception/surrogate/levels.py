@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.ap import Matched, average_precision, match
+from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.correlation import towns_of
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import square
 from sortie.perception.surrogate.model import FEW, KINDS, SQUARE, WHOLE, Parameters
 from sortie.perception.surrogate.plan import Job
-from sortie.perception.surrogate.together import towns_of
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Perception
 

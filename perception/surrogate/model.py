@@ -24,10 +24,10 @@ from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
 from sortie.perception.errors import InputError
+from sortie.perception.scene.town import Floats
+from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from sortie.perception.surrogate.features import LOOK_COVARIATES, beside
-from sortie.perception.surrogate.luck import BANDS
-from sortie.perception.town import Floats
 
 Singles = NDArray[np.float32]
 FORMAT = 6

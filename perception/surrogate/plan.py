@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sortie.perception.joining import Rule
-from sortie.perception.scene import SceneModel
-from sortie.perception.traffic import TargetPath
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.traffic import TargetPath
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.schema import Scene, Target
 from sortie.scenarios.streams import stream

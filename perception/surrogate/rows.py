@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.collect import Asked, captures_of
 from sortie.perception.surrogate.exchange import (
     Exchange,
@@ -21,7 +22,6 @@ from sortie.perception.surrogate.exchange import (
 )
 from sortie.perception.surrogate.features import Eyes, Fleet, Looks
 from sortie.perception.surrogate.plan import scene_model
-from sortie.perception.town import Floats
 from sortie.perception.types import Boxes
 
 REACH_M = 2.5

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.bench.dataset import Frames
-from sortie.perception.bench.scenes import DRONES
-from sortie.perception.decode import REFERENCE_SIZE_M
-from sortie.perception.fusion.base import UnsentCells, takes_part
+from sortie.perception.benchmark.dataset import Frames
+from sortie.perception.benchmark.scenes import DRONES
 from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry
-from sortie.perception.model import CarNet
+from sortie.perception.network.decode import REFERENCE_SIZE_M
+from sortie.perception.network.fusion.base import UnsentCells, takes_part
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import warp
 from sortie.perception.training.recipe import Recipe
-from sortie.perception.warp import warp
 from sortie.scenarios.streams import stream
 
 SHARDS = 2

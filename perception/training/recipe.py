@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from sortie.perception.bench.dataset import SIZES, Benchmark
+from sortie.perception.benchmark.dataset import SIZES, Benchmark
 
 PEAK_LR = 2.5e-3
 FULL_SIZE = SIZES["train"][0]

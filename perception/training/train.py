@@ -23,10 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sortie.perception.bench.dataset import Benchmark, Frames, load_frames, make_split
-from sortie.perception.checkpoint import load_weights, read_config
-from sortie.perception.harness.statistics import Difference
-from sortie.perception.model import CarNet, ModelConfig
+from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
+from sortie.perception.metrics.bootstrap import Difference
+from sortie.perception.network.checkpoint import load_weights, read_config
+from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
 from sortie.perception.training.recipe import PEAK_LR, Recipe, benchmark_root
 from sortie.perception.training.validation import history, publish, validate, validate_all

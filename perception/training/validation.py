@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from sortie.perception.bench.dataset import SIZES, Benchmark, Frames
-from sortie.perception.checkpoint import read_facts, save_weights
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE
-from sortie.perception.harness.evaluate import evaluate
-from sortie.perception.harness.instrument import CarNetInstrument
-from sortie.perception.harness.statistics import Difference, compare
-from sortie.perception.model import CarNet
+from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
+from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.perception.network.checkpoint import read_facts, save_weights
+from sortie.perception.network.model import CarNet
 from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
 from sortie.perception.training.recipe import command, of_benchmark
 
@@ -108,7 +108,7 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
     scenes, per_scene = SIZES["validation"]
     return f"""# {name}
 
-Weights of `perception/model.py`, float32: {", ".join(f"{k} {v}" for k, v in model.items())}.
+Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, v in model.items())}.
 
 | run | made by | steps done | loss, mean of the last 50 | minutes on two shared cores |
 |---|---|---|---|---|

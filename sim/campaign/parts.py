@@ -18,7 +18,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sortie.scenarios.campaign import Choice, Column, Grid
+from sortie.scenarios.schema.campaign import Choice, Column, Grid
 from sortie.sim.campaign.plan import FORMAT, Plan
 from sortie.sim.campaign.work import Result
 from sortie.sim.folders import RunError

@@ -20,12 +20,12 @@ import numpy as np
 from sortie.perception.surrogate.model import SHIPPED
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
-from sortie.scenarios.campaign import PARAMS, Campaign
-from sortie.scenarios.files import FIELDS, found_beside, named_files, placed, with_files
-from sortie.scenarios.load import loads
-from sortie.scenarios.load_campaign import Study, as_node, extremes
-from sortie.scenarios.nodes import ScenarioError, assign, plain
+from sortie.scenarios.reading.campaign import Study, as_node, extremes
+from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
+from sortie.scenarios.reading.load import loads
+from sortie.scenarios.reading.nodes import ScenarioError, assign, plain
 from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.schema.campaign import PARAMS, Campaign
 from sortie.scenarios.traces import located
 from sortie.sim.campaign.code import code_version, file_digest
 from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile

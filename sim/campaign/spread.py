@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.scenarios.campaign import (
+from sortie.scenarios.reading.campaign import whole
+from sortie.scenarios.schema.campaign import (
     SAMPLED,
     Campaign,
     Choice,
@@ -24,7 +25,6 @@ from sortie.scenarios.campaign import (
     Triangular,
     Uniform,
 )
-from sortie.scenarios.load_campaign import whole
 from sortie.scenarios.streams import stream
 
 Floats = NDArray[np.float64]

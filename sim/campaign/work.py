@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from sortie.perception.memory import keep_freed
+from sortie.perception.network.memory import keep_freed
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.code import code_version, file_digest
 from sortie.sim.expect import metric

@@ -14,7 +14,7 @@ from sortie.fleet.flight.motion import MotionError
 from sortie.fleet.messages.wire import DescriptorTooLarge
 from sortie.perception.errors import InputError
 from sortie.policies.contract import PolicyError
-from sortie.scenarios.load import ScenarioError
+from sortie.scenarios.reading.load import ScenarioError
 from sortie.scenarios.traces import TraceError
 from sortie.sim.cli import (
     bench,

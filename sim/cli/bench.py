@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sortie.perception.bench.difficulty import Difficulty
-from sortie.perception.bench.manifest import complaints, read
+from sortie.perception.benchmark.difficulty import Difficulty
+from sortie.perception.benchmark.manifest import complaints, read
 from sortie.perception.geometry import Geometry
 from sortie.sim.console import err, out, stages, user_errors
 
@@ -52,7 +52,7 @@ def make(
     workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
 ) -> None:
     """Render the splits; what is there already is kept, and a run that was cut off goes on where it was."""
-    from sortie.perception.bench.dataset import SIZES, Benchmark, make_split
+    from sortie.perception.benchmark.dataset import SIZES, Benchmark, make_split
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
     with user_errors(), stages() as report:
@@ -77,8 +77,8 @@ def show(
 ) -> None:
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
     with user_errors():
-        from sortie.perception.bench.dataset import SIZES, Benchmark
-        from sortie.perception.bench.sheet import save, sheet
+        from sortie.perception.benchmark.contact_sheet import save, sheet
+        from sortie.perception.benchmark.dataset import SIZES, Benchmark
 
         bench = Benchmark.at(folder)
         count, frames = SIZES[split.value]
@@ -95,7 +95,7 @@ def show(
 def verify(folder: FolderArgument) -> None:
     """Hold every file against the manifest; exit code 1 if one is missing or holds other data."""
     with user_errors(), stages() as report:
-        from sortie.perception.bench.dataset import Benchmark
+        from sortie.perception.benchmark.dataset import Benchmark
 
         Benchmark.at(folder)
         found = complaints(folder, partial(report, "files"))
@@ -115,9 +115,9 @@ def survey(
     scenes: Annotated[int, typer.Option(help="How many scenes of each split.", min=1)] = 12,
 ) -> None:
     """Count what the scenes hold, by split and style: cars, who can see them, houses. Nothing is rendered."""
-    from sortie.perception.bench.dataset import SIZES, Benchmark
-    from sortie.perception.bench.survey import by_style
-    from sortie.perception.bench.survey import survey as survey_scene
+    from sortie.perception.benchmark.dataset import SIZES, Benchmark
+    from sortie.perception.benchmark.survey import by_style
+    from sortie.perception.benchmark.survey import survey as survey_scene
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
     table = Table("split", "style", "scenes", "cars a view", "seen alone", "by the fleet", "built", "height m", "lot m")
@@ -146,8 +146,8 @@ def difficulty(
 ) -> None:
     """Measure what each parameter of the difficulty does to AP; a run that was cut off goes on where it was."""
     with user_errors(), stages() as report:
-        from sortie.perception.bench.effects import measure, table, write_table
-        from sortie.perception.detector import SHIPPED_WEIGHTS
+        from sortie.perception.evaluation.difficulty_effects import measure, table, write_table
+        from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
         used = weights or SHIPPED_WEIGHTS
         text = table(

@@ -11,7 +11,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from sortie.policies.registry import resolve
-from sortie.scenarios.load import load, load_contexts
+from sortie.scenarios.reading.load import load, load_contexts
 from sortie.sim.console import out, stages, user_errors
 from sortie.sim.folders import ensure_files
 from sortie.sim.in_flight import REGIONS, Level, flights, means

@@ -52,7 +52,7 @@ def run(
     """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
     folder = out_dir
     try:
-        from sortie.scenarios.load_campaign import load_campaign
+        from sortie.scenarios.reading.campaign import load_campaign
         from sortie.sim.campaign.drive import run_campaign
         from sortie.sim.campaign.engine import open_engine
         from sortie.sim.campaign.plan import make_plan

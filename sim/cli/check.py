@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sortie.scenarios.load import library, load
+from sortie.scenarios.reading.load import library, load
 from sortie.sim import tables
 from sortie.sim.cli.options import SetOption
 from sortie.sim.console import bars, err, out

@@ -11,7 +11,7 @@ import typer
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import POLICIES
 from sortie.policies.registry import own_fusion as own_fusion_of
-from sortie.scenarios.load import load_contexts
+from sortie.scenarios.reading.load import load_contexts
 from sortie.scenarios.schema import Scenario
 from sortie.sim import tables
 from sortie.sim.cli.contexts import compare_contexts, refuse

@@ -16,7 +16,7 @@ from rich.table import Table
 from sortie.perception.detectors import make_detector
 from sortie.policies.catalogue.adaptive import ARMS
 from sortie.policies.registry import resolve
-from sortie.scenarios.contexts import Contexts
+from sortie.scenarios.schema.conditions import Contexts
 from sortie.sim.console import bars, out
 from sortie.sim.contexts import FIXED, Cell, best_fixed, fly_all, summarise
 from sortie.sim.folders import RunError, ensure_files, write_text

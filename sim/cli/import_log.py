@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
-from sortie.scenarios.load import loads
+from sortie.scenarios.reading.load import loads
 from sortie.sim.console import out, user_errors
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
 

@@ -8,7 +8,7 @@ import typer
 
 from sortie.perception.detectors import DETECTORS
 from sortie.policies.registry import POLICIES, parameters
-from sortie.scenarios.load import campaigns, library, load
+from sortie.scenarios.reading.load import campaigns, library, load
 from sortie.scenarios.schema import json_schema
 from sortie.sim.console import out
 
@@ -28,7 +28,7 @@ def list_(
         for name, path in library().items():
             out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
     elif what == "campaigns":
-        from sortie.scenarios.load_campaign import load_campaign
+        from sortie.scenarios.reading.campaign import load_campaign
 
         for name in campaigns():
             out.print(f"[bold]{name}[/bold]  {load_campaign(name).campaign.description}", soft_wrap=True)
@@ -36,7 +36,7 @@ def list_(
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
     elif what == "fusions":
-        from sortie.perception.fusion.registry import FUSIONS  # here: torch takes a second to import
+        from sortie.perception.network.fusion.registry import FUSIONS  # here: torch takes a second to import
 
         for name, fusion in FUSIONS.items():
             out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)

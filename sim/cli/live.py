@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.console import err, out, stages, user_errors
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.named import policy_overrides

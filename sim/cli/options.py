@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.console import err
 from sortie.sim.named import policy_overrides

@@ -11,14 +11,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sortie.perception.harness import report
-from sortie.perception.harness.rows import INSTRUMENTS, Row, differ_by_chance
-from sortie.perception.harness.verdict import Verdict
+from sortie.perception.evaluation import report
+from sortie.perception.evaluation.rows import INSTRUMENTS, Row, differ_by_chance
+from sortie.perception.evaluation.verdict import Verdict
 from sortie.sim.console import out, stages
 from sortie.sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
-    from sortie.perception.harness.picture import Picture
+    from sortie.perception.evaluation.picture import Picture
 
 NARROW, PIPED_WIDTH = 150, 170
 """Columns of a terminal that show both instruments, and those that a pipe or file is given."""
@@ -61,9 +61,9 @@ def paper(
 
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
-    from sortie.perception.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from sortie.perception.harness import figures, rows
-    from sortie.perception.harness.found import Asked
+    from sortie.perception.evaluation import figures, rows
+    from sortie.perception.evaluation.results import Asked
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
     from sortie.sim import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)

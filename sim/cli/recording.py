@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sortie.perception.outside.recorded import open_recording
+from sortie.perception.recordings.recording import open_recording
 from sortie.sim.console import bars, out
 from sortie.sim.folders import RunError, ensure_files
 
@@ -40,9 +40,9 @@ def evaluate(
     save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
 ) -> None:
     """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
-    from sortie.perception.harness.condition import Condition
-    from sortie.perception.harness.evaluation import FLOOR
-    from sortie.perception.outside.instrument import evaluate_recording
+    from sortie.perception.evaluation.condition import Condition
+    from sortie.perception.evaluation.matched import FLOOR
+    from sortie.perception.recordings.instrument import evaluate_recording
 
     ensure_files(save)
     try:
@@ -76,7 +76,7 @@ def from_uav3d(
     split: Annotated[str, typer.Option(help="train or val.")] = "val",
 ) -> None:
     """Scenes, times, poses and cars of a UAV3D split as a recording; detections are yours to add."""
-    from sortie.perception.outside.uav3d import convert
+    from sortie.perception.recordings.uav3d import convert
 
     convert(root, split, out_path)
     out.print(f"kept in [bold]{out_path}[/bold]")

@@ -82,7 +82,7 @@ def study_report(
     ] = None,
 ) -> None:
     """Tell the study: a Markdown report with figures, the rows beside it, and the README's sentences."""
-    from sortie.perception.harness import figures as common
+    from sortie.perception.evaluation import figures as common
     from sortie.perception.study import figures, report
     from sortie.perception.study.measure import to_table
     from sortie.perception.study.plan import read_plan

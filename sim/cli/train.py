@@ -57,10 +57,10 @@ def train(
 
     Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
     """
-    from sortie.perception.bench.dataset import Benchmark  # here: torch takes a second to import
-    from sortie.perception.fusion.registry import FUSIONS
+    from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.geometry import Geometry
-    from sortie.perception.model import ModelConfig
+    from sortie.perception.network.fusion.registry import FUSIONS
+    from sortie.perception.network.model import ModelConfig
     from sortie.perception.training.recipe import Recipe
     from sortie.perception.training.train import device_named
     from sortie.perception.training.train import train as train_detector

@@ -22,7 +22,7 @@ from sortie.policies.verification.invariants import Invariant, InvariantError, p
 from sortie.policies.verification.proof import PLANE, Verdict, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import to_json
-from sortie.scenarios.load import dump, loads
+from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import Policy as PolicySection
 from sortie.scenarios.schema import Scenario
 from sortie.sim.console import bars, err, out

@@ -17,7 +17,7 @@ from sortie.fleet.agent import Platform, Task
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import follow, read_traces
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
 from sortie.scenarios.schema import Scenario

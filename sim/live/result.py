@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.fleet.staleness import LinkHealth
-from sortie.perception.harness.claims import OVERHEAD
+from sortie.perception.evaluation.claims import OVERHEAD
 from sortie.scenarios.schema import Scenario
 from sortie.sim.live.bench import Bench, Fleet
 from sortie.sim.live.reports import HealthChange, Notice, Order

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from sortie.perception.ap import Matched, average_precision
+from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.scenarios.schema import Scenario
 from sortie.sim.outcome import transitions
 from sortie.sim.playback import canvas as c

@@ -14,9 +14,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from sortie.perception.evaluation.picture import Picture, to_world
 from sortie.perception.geometry import CELLS
-from sortie.perception.harness.picture import Picture, to_world
-from sortie.perception.render import CAMERAS
+from sortie.perception.scene.render import CAMERAS
 from sortie.perception.types import Boxes
 from sortie.sim.playback.canvas import MISSION, drone_colour
 from sortie.sim.playback.recording import new_file

@@ -15,7 +15,7 @@ import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, partial_file
 from sortie.sim.playback.canvas import Canvas, Floats

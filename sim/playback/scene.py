@@ -17,9 +17,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from sortie.fleet.coverage import footprint_radius_m
-from sortie.perception.scene import SceneModel
-from sortie.perception.town import KERB_M, LANE_M, PAVEMENT_M
-from sortie.perception.traffic import Cars
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
+from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback import canvas as c

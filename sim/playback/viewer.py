@@ -18,7 +18,7 @@ from pathlib import Path
 import pyarrow as pa
 import rerun as rr
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError
 from sortie.sim.playback.layout import blueprint

@@ -15,13 +15,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
-from sortie.perception.bev import lift
-from sortie.perception.detector import TorchDetector
-from sortie.perception.fusion.base import takes_part
-from sortie.perception.fusion.registry import FUSIONS
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.bev import lift
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.fusion.registry import FUSIONS
+from sortie.perception.network.winograd import WinogradReLU
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
-from sortie.perception.winograd import WinogradReLU
 from sortie.scenarios.schema import Perception, Scene
 
 ROI = (10.0, 20.0, 32.0)

@@ -14,17 +14,17 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
-from sortie.perception.ap import corners, iou_pairs
-from sortie.perception.bev import lift
 from sortie.perception.budget import cells_sent
-from sortie.perception.detector import TorchDetector
-from sortie.perception.fusion.base import takes_part
 from sortie.perception.geometry import FULL
-from sortie.perception.model import CarNet
-from sortie.perception.render import Renderer
-from sortie.perception.scene import SceneModel
+from sortie.perception.metrics.ap import corners, iou_pairs
+from sortie.perception.network.bev import lift
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import warp
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
-from sortie.perception.warp import warp
 from sortie.scenarios.schema import Perception, Scene
 
 FLEET = cross(10.0, 20.0, 0.3)

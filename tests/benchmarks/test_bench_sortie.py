@@ -12,7 +12,7 @@ import sys
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.sortie import run_sortie
 
 JAMMED = "events=[{kind: jam, at_s: 0, position_m: [0, 0, 2000], power_dbm: 0}]"

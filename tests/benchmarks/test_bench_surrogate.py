@@ -13,9 +13,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
 from sortie.perception.detectors import Detector
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture, Share
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Perception, Scene
 from sortie.sim.sortie import run_sortie
 
@@ -30,7 +30,7 @@ def moments(count: int, begin_s: float) -> Moments:
 @pytest.mark.benchmark(group="five egos of four moments")
 @pytest.mark.parametrize("which", ["torch", "surrogate"])
 def test_five_egos_of_four_moments(benchmark: Any, which: str) -> None:
-    from sortie.perception.detector import TorchDetector
+    from sortie.perception.network.detector import TorchDetector
     from sortie.perception.surrogate.detector import SurrogateDetector
 
     scene = SceneModel(Scene(), None, (-50, -50, 50, 50))

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.evaluation.condition import CellsBy
+from sortie.perception.evaluation.contract import Exchange, FleetFrames
 from sortie.perception.geometry import FULL, Geometry
-from sortie.perception.harness.condition import CellsBy
-from sortie.perception.harness.contract import Exchange, FleetFrames
 
 CROSS = 20.0 * np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], float)
 

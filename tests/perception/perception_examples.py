@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene, Target
 

@@ -13,7 +13,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from shapely import affinity
 
-from sortie.perception.ap import (
+from sortie.perception.metrics.ap import (
     CONVENTIONS,
     Convention,
     Matched,
@@ -25,7 +25,7 @@ from sortie.perception.ap import (
     suppress,
     suppressed,
 )
-from sortie.perception.overlap import near_pairs, overlapping
+from sortie.perception.metrics.overlap import near_pairs, overlapping
 from sortie.perception.types import Boxes
 
 box = st.tuples(

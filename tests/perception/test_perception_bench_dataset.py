@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from sortie.perception.bench import manifest
-from sortie.perception.bench.dataset import SIZES, Benchmark, load_frames, make_scene_file, make_split
-from sortie.perception.bench.difficulty import Difficulty
-from sortie.perception.bench.manifest import BenchmarkError, complaints, content_hash
-from sortie.perception.bench.scenes import draw_captures, scene_id
+from sortie.perception.benchmark import manifest
+from sortie.perception.benchmark.dataset import SIZES, Benchmark, load_frames, make_scene_file, make_split
+from sortie.perception.benchmark.difficulty import Difficulty
+from sortie.perception.benchmark.manifest import BenchmarkError, complaints, content_hash
+from sortie.perception.benchmark.scenes import draw_captures, scene_id
 from sortie.perception.geometry import SMALL
 
 BENCH = Benchmark(3)
@@ -114,7 +114,7 @@ def test_a_cut_off_run_goes_on(copy: Path) -> None:
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_files(tmp_path: Path, made: Path) -> None:
     script = (
-        "from pathlib import Path; from sortie.perception.bench.dataset import *\n"
+        "from pathlib import Path; from sortie.perception.benchmark.dataset import *\n"
         f"if __name__ == '__main__': make_split(Benchmark(3), 'tau', Path({str(tmp_path)!r}), scenes=2, workers=1)"
     )
     (tmp_path / "run.py").write_text(script)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sortie.perception.ap import Matched
-from sortie.perception.bench.difficulty import Difficulty
-from sortie.perception.bench.effects import BEGIN, END, Effect, moves, table, write_table
-from sortie.perception.harness.statistics import compare
+from sortie.perception.benchmark.difficulty import Difficulty
+from sortie.perception.evaluation.difficulty_effects import BEGIN, END, Effect, moves, table, write_table
+from sortie.perception.metrics.ap import Matched
+from sortie.perception.metrics.bootstrap import compare
 
 
 def test_every_parameter_but_speed_is_moved_and_alone() -> None:

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perception_examples import EMPTY, capture, only_target
 
-from sortie.perception.bench.dataset import SIZES, Benchmark
-from sortie.perception.bench.difficulty import DENSITIES, Difficulty, Layout
-from sortie.perception.bench.scenes import AREA_M, DRONES, SPLITS, draw_captures, draw_scene, scene_id
-from sortie.perception.bench.survey import Counts, by_style, survey
-from sortie.perception.bench.visibility import in_a_camera, inside, past_houses, past_trees, visible
-from sortie.perception.scene import SceneModel
-from sortie.perception.town import STYLES
+from sortie.perception.benchmark.dataset import SIZES, Benchmark
+from sortie.perception.benchmark.difficulty import DENSITIES, Difficulty, Layout
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, SPLITS, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.survey import Counts, by_style, survey
+from sortie.perception.benchmark.visibility import in_a_camera, inside, past_houses, past_trees, visible
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import STYLES
 from sortie.scenarios.schema import Scene
 
 split_names = st.sampled_from(sorted(SPLITS))

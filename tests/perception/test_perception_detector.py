@@ -9,12 +9,11 @@ import pytest
 import torch
 from perception_examples import capture, cross
 
-from sortie.perception import render
-from sortie.perception.ap import match
-from sortie.perception.detector import TorchDetector, ground_truth
 from sortie.perception.detectors import make_detector
 from sortie.perception.joining import told
-from sortie.perception.scene import SceneModel
+from sortie.perception.metrics.ap import match
+from sortie.perception.network.detector import TorchDetector, ground_truth
+from sortie.perception.scene.scene_model import SceneModel, render
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene, Target
 
@@ -66,8 +65,8 @@ PROGRAM = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
 from perception_examples import cross
-from sortie.perception.detector import TorchDetector
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene
 fleet = cross(10.0, 20.0, 0.3)
@@ -159,7 +158,7 @@ def test_moments_begun_together_are_one_after_the_other(
     scene: SceneModel, fleet: list[Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also when what one needs is no longer kept once the next has begun."""
-    monkeypatch.setattr("sortie.perception.detector.KEPT_CAPTURES", 1)
+    monkeypatch.setattr("sortie.perception.network.detector.KEPT_CAPTURES", 1)
     fleets = [[c._replace(t_s=c.t_s + late) for c in fleet[:3]] for late in (0.0, 0.5, 1.0)]
     asked = [[(ego, [share(c, rho=0.05) for c in f if c is not ego]) for ego in f] for f in fleets]
     detector = TorchDetector(scene, Perception(), seed=1)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from paper_examples import ELSEWHERE, FACTS, MadeInstrument, made_frames
 
-from sortie.perception.ap import average_precision
-from sortie.perception.bench.dataset import SIZES
-from sortie.perception.harness import report, rows
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from sortie.perception.harness.found import Asked, Found
-from sortie.perception.harness.measures import under
-from sortie.perception.harness.paper import bench_frames, measure
-from sortie.perception.harness.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
+from sortie.perception.benchmark.dataset import SIZES
+from sortie.perception.evaluation import report, rows
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.measures import under
+from sortie.perception.evaluation.paper import bench_frames, measure
+from sortie.perception.evaluation.results import Asked, Found
+from sortie.perception.evaluation.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
+from sortie.perception.metrics.ap import average_precision
 
 N = 6
 

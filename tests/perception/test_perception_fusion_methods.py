@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
 
-from sortie.perception.fusion.base import Fusion, takes_part
-from sortie.perception.fusion.registry import DEFAULT, FUSIONS
-from sortie.perception.fusion.traffic import LinkBytes
-from sortie.perception.fusion.v2vnet import V2VNet
-from sortie.perception.fusion.where2comm import HEADS, Where2comm, asked_for, confidence_map
 from sortie.perception.geometry import CHANNELS
+from sortie.perception.network.fusion.base import Fusion, takes_part
+from sortie.perception.network.fusion.registry import DEFAULT, FUSIONS
+from sortie.perception.network.fusion.traffic import LinkBytes
+from sortie.perception.network.fusion.v2vnet import V2VNet
+from sortie.perception.network.fusion.where2comm import HEADS, Where2comm, asked_for, confidence_map
 
 SIDE = 12
 LEARNED = ("disconet", "v2vnet", "where2comm")

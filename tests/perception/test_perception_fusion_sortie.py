@@ -4,12 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from fusion_age import earlier, measure
 from perception_examples import capture, cross
 
-from sortie.perception.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
-from sortie.perception.fusion.age import earlier, measure
 from sortie.perception.joining import SURE, sendable
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
 
@@ -117,7 +117,7 @@ def test_earlier_is_where_a_straight_flight_was() -> None:
 
 
 def test_ages_begin_fresh() -> None:
-    from sortie.perception.checkpoint import load_weights
+    from sortie.perception.network.checkpoint import load_weights
 
     with pytest.raises(ValueError, match=re.escape("ages_s is (0.1,), must begin with 0 and hold no negative age")):
         measure(load_weights(SHIPPED_WEIGHTS), ages_s=(0.1,))
@@ -125,7 +125,7 @@ def test_ages_begin_fresh() -> None:
 
 @pytest.mark.slow
 def test_compensation_gains() -> None:
-    from sortie.perception.checkpoint import load_weights
+    from sortie.perception.network.checkpoint import load_weights
 
     fresh, late = measure(load_weights(SHIPPED_WEIGHTS), scenes=2, frames=1, ages_s=(0.0, 0.5))
     assert fresh.gain.delta == 0.0

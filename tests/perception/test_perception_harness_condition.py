@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
 
 conditions = st.one_of(
     st.just(SINGLE),

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
-from sortie.perception.ap import CONVENTIONS, match, suppress
-from sortie.perception.harness import selection
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from sortie.perception.harness.contract import Exchange
-from sortie.perception.harness.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
-from sortie.perception.harness.scores import Bootstrap
+from sortie.perception.evaluation import selection
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
+from sortie.perception.evaluation.scores import Bootstrap
+from sortie.perception.metrics.ap import CONVENTIONS, match, suppress
 from sortie.perception.types import Boxes
 
 BEST = Condition(0.1, "best-2", roi=True)

@@ -12,17 +12,17 @@ from harness_examples import MadeFrames, made_frames
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.checkpoint import save_weights
-from sortie.perception.decode import decode
-from sortie.perception.fusion.base import takes_part
-from sortie.perception.fusion.registry import FUSIONS
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from sortie.perception.harness.contract import Exchange
-from sortie.perception.harness.evaluate import evaluate
-from sortie.perception.harness.instrument import CarNetInstrument, fingerprint
-from sortie.perception.inference import folded
-from sortie.perception.model import CarNet, ModelConfig
-from sortie.perception.warp import warp
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation.instrument import CarNetInstrument, fingerprint
+from sortie.perception.network.checkpoint import save_weights
+from sortie.perception.network.decode import decode
+from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.fusion.registry import FUSIONS
+from sortie.perception.network.inference import folded
+from sortie.perception.network.model import CarNet, ModelConfig
+from sortie.perception.network.warp import warp
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sortie.perception import budget
+from sortie.perception.evaluation import selection
+from sortie.perception.evaluation.condition import Condition
 from sortie.perception.geometry import FULL, SMALL
-from sortie.perception.harness import selection
-from sortie.perception.harness.condition import Condition
 from sortie.policies.geometry import circle_overlap
 
 CROSS = np.array([(0.0, 0.0), (20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)])

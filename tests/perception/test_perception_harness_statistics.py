@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.perception.ap import Matched, average_precision
-from sortie.perception.harness.statistics import benjamini_hochberg, compare, interval, p_value, rank, resamples
+from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.perception.metrics.bootstrap import benjamini_hochberg, compare, interval, p_value, rank, resamples
 
 
 def units(seed: int, count: int, quality: float = 0.7, found: int = 40, per_score: int = 1000) -> list[Matched]:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception import winograd
-from sortie.perception.inference import _coloured, folded
-from sortie.perception.model import CarNet, ModelConfig, colours
-from sortie.perception.winograd import WinogradReLU, suits
+from sortie.perception.network import winograd
+from sortie.perception.network.inference import _coloured, folded
+from sortie.perception.network.model import CarNet, ModelConfig, colours
+from sortie.perception.network.winograd import WinogradReLU, suits
 
 
 def layer(c: int, o: int, dilation: int = 1, seed: int = 0) -> nn.Conv2d:

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perception_examples import cross
 
-from sortie.perception.ap import suppress
-from sortie.perception.detector import TorchDetector
 from sortie.perception.joining import NMS_IOU, OWN_SAY, Heard, Rule, Told, joined, joined_many, told
-from sortie.perception.overlap import iou_pairs
-from sortie.perception.scene import SceneModel
+from sortie.perception.metrics.ap import suppress
+from sortie.perception.metrics.overlap import iou_pairs
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Share
 from sortie.scenarios.schema import Perception, Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sortie.perception import ap
+from sortie.perception.metrics import ap
 from sortie.perception.types import Boxes
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from paper_examples import Made, papers_world
 
-from sortie.perception.harness.claims import CLAIMS, POLICIES, all_4, conditions, two
-from sortie.perception.harness.condition import FULL_SHARING, SINGLE, Condition
-from sortie.perception.harness.measures import (
+from sortie.perception.evaluation.claims import CLAIMS, POLICIES, all_4, conditions, two
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.measures import (
     Contrast,
     Crossover,
     Kept,

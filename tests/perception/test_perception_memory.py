@@ -10,7 +10,7 @@ import pytest
 
 MAPS = """
 import resource, sys, numpy as np
-from sortie.perception.memory import keep_freed
+from sortie.perception.network.memory import keep_freed
 assert sys.argv[1] == "given back" or keep_freed()
 def maps(): [np.ones(1 << 20) for _ in range(20)]
 maps()

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from perception_examples import cross
 
 from sortie.perception import budget
-from sortie.perception.detector import TorchDetector
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Share
 from sortie.scenarios.schema import Perception, Scene

@@ -8,13 +8,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sortie.perception.checkpoint import load_weights, save_weights
-from sortie.perception.decode import decode
-from sortie.perception.fusion.base import UnsentCells, takes_part
 from sortie.perception.geometry import CELLS, CHANNELS, FULL
-from sortie.perception.model import CarNet
+from sortie.perception.network.checkpoint import load_weights, save_weights
+from sortie.perception.network.decode import decode
+from sortie.perception.network.fusion.base import UnsentCells, takes_part
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import warp as warp_by
 from sortie.perception.training.learn import loss_of, targets
-from sortie.perception.warp import warp as warp_by
 
 CELL_M = FULL.cell_m
 

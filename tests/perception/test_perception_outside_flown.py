@@ -13,13 +13,13 @@ from perception_examples import capture, only_target
 from recording_examples import small
 
 from sortie.perception.detectors import DETECTORS, make_detector
-from sortie.perception.harness.condition import SINGLE, Condition
-from sortie.perception.harness.contract import Exchange
-from sortie.perception.harness.evaluate import evaluate
-from sortie.perception.outside.detector import RecordedDetector
-from sortie.perception.outside.exchange import load_fusion
-from sortie.perception.outside.instrument import RecordedInstrument, evaluate_recording, frames_of
-from sortie.perception.outside.recorded import RecordingError, open_recording
+from sortie.perception.evaluation.condition import SINGLE, Condition
+from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.recordings.detector import RecordedDetector
+from sortie.perception.recordings.exchange import load_fusion
+from sortie.perception.recordings.instrument import RecordedInstrument, evaluate_recording, frames_of
+from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception
 
@@ -236,8 +236,8 @@ def test_a_recording_flies_without_torch(tmp_path: Path) -> None:
     code = f"""
 import sys
 from sortie.perception.detectors import make_detector
-from sortie.perception.harness.condition import SINGLE
-from sortie.perception.outside.instrument import evaluate_recording
+from sortie.perception.evaluation.condition import SINGLE
+from sortie.perception.recordings.instrument import evaluate_recording
 from sortie.scenarios.schema import Perception
 make_detector(None, Perception(detector="recorded", recording={str(path)!r}), 1)
 evaluate_recording({str(path)!r} and __import__("pathlib").Path({str(path)!r}), [SINGLE])

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from recording_examples import score_map, small
 
-from sortie.perception.outside.exchange import moved
-from sortie.perception.outside.recorded import RecordingError, cells_of, open_recording
-from sortie.perception.outside.writing import write_recording
+from sortie.perception.recordings.exchange import moved
+from sortie.perception.recordings.recording import RecordingError, cells_of, open_recording
+from sortie.perception.recordings.writing import write_recording
 
 
 @pytest.fixture

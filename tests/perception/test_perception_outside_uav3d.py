@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sortie.perception.outside.instrument import frames_of
-from sortie.perception.outside.recorded import open_recording
-from sortie.perception.outside.uav3d import (
+from sortie.perception.recordings.instrument import frames_of
+from sortie.perception.recordings.recording import open_recording
+from sortie.perception.recordings.uav3d import (
     CAMERAS,
     UAVS,
     Uav3dError,

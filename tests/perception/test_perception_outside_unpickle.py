@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.perception.outside.unpickle import UnpickleError, load_data, loads_data
+from sortie.perception.recordings.unpickle import UnpickleError, load_data, loads_data
 
 DATA = {
     "infos": [{"token": "a", "n": 3, "x": [0.5, None, True], "t": (1, b"\x00\xff"), "none": b""}],
@@ -159,4 +159,4 @@ def test_a_damaged_pickle_is_data_or_an_error(data: st.DataObject) -> None:
         found = loads_data(bytes(raw))
     except UnpickleError:
         return
-    assert type(found).__module__ in ("builtins", "numpy", "sortie.perception.outside.unpickle")
+    assert type(found).__module__ in ("builtins", "numpy", "sortie.perception.recordings.unpickle")

@@ -5,11 +5,11 @@ import pytest
 from perception_examples import EMPTY, capture, cross, only_target
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.bev import lift
 from sortie.perception.geometry import FULL
 from sortie.perception.geometry import IMAGE_PX as BEV_PX
-from sortie.perception.render import AXES, CAMERAS, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX, Renderer, rotation, tilt
-from sortie.perception.scene import SceneModel
+from sortie.perception.network.bev import lift
+from sortie.perception.scene.render import AXES, CAMERAS, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX, Renderer, rotation, tilt
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene
 
@@ -92,7 +92,9 @@ def test_a_car_appears_where_the_pinhole_puts_it(x: float, y: float, yaw: float,
 def test_the_lift_puts_what_is_flat_where_it_lies(
     monkeypatch: pytest.MonkeyPatch, x: float, y: float, yaw: float, pitch: float, roll: float
 ) -> None:
-    monkeypatch.setattr("sortie.perception.scene.TARGET_SIZE_M", (4.6, 1.9, 0.01))  # a car painted on the road
+    monkeypatch.setattr(
+        "sortie.perception.scene.scene_model.TARGET_SIZE_M", (4.6, 1.9, 0.01)
+    )  # a car painted on the road
     c = capture(8.0, -4.0, yaw=yaw, pitch=pitch, roll=roll)
     bev = lift(Renderer(only_target(x, y), 1).render([c]), [c])[0].numpy()
     rows, columns = np.nonzero(red(np.moveaxis(bev[:3], 0, -1)))

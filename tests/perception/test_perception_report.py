@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 
-from sortie.perception.harness import figures, report, rows
-from sortie.perception.harness.claims import CLAIMS, SECTIONS
-from sortie.perception.harness.rows import Row
-from sortie.perception.harness.scores import split
-from sortie.perception.harness.verdict import Measured
+from sortie.perception.evaluation import figures, report, rows
+from sortie.perception.evaluation.claims import CLAIMS, SECTIONS
+from sortie.perception.evaluation.rows import Row
+from sortie.perception.evaluation.scores import split
+from sortie.perception.evaluation.verdict import Measured
 
 
 @pytest.fixture(scope="module")

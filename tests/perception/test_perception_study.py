@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from sortie.perception.ap import Matched
+from sortie.perception.metrics.ap import Matched
 from sortie.perception.study.measure import Row, from_table, optimal_f1, threshold, to_table
 from sortie.perception.study.plan import PLAN, read_plan
 from sortie.perception.study.report import Found, View, answers, flips, on_frames, report, sign

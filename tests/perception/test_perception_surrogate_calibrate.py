@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sortie.perception.scene.traffic import TARGET_ID, TargetPath
 from sortie.perception.surrogate import collect as collecting
 from sortie.perception.surrogate.calibrate import calibrate
 from sortie.perception.surrogate.collect import Asked, captures_of, collect, read
@@ -17,7 +18,6 @@ from sortie.perception.surrogate.features import square
 from sortie.perception.surrogate.judge import IN_DISC, judge
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Job, draw_target, moment, scene_model
-from sortie.perception.traffic import TARGET_ID, TargetPath
 from sortie.perception.types import Boxes, Capture
 
 STREET = MANNERS.index("street")
@@ -185,8 +185,8 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
 
 
 def truth_of(scene: int, jobs: Sequence[Job]) -> list[Boxes]:
-    from sortie.perception.detector import ground_truth
     from sortie.perception.geometry import FULL
+    from sortie.perception.network.detector import ground_truth
 
     model = scene_model(0, "held-out", scene)
     half = FULL.half_extent_m

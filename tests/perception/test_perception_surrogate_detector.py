@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from perception_examples import EMPTY, capture, cross
 
-from sortie.perception.ap import match
-from sortie.perception.detector import ground_truth
 from sortie.perception.detectors import DetectsMany
 from sortie.perception.geometry import in_square
-from sortie.perception.scene import SceneModel
+from sortie.perception.metrics.ap import match
+from sortie.perception.network.detector import ground_truth
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.draws import Luck
 from sortie.perception.surrogate.exchange import (
     ALARM_COVARIATES,
     FUSED_COVARIATES,
@@ -24,9 +25,8 @@ from sortie.perception.surrogate.exchange import (
     pair,
 )
 from sortie.perception.surrogate.features import Eyes, Fleet
-from sortie.perception.surrogate.luck import Luck
+from sortie.perception.surrogate.hashing import uniform
 from sortie.perception.surrogate.rows import claim
-from sortie.perception.surrogate.words import uniform
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene, Target
 

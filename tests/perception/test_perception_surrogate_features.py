@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
-from sortie.perception.surrogate.sight import NEAR_M, RES_M, Kerbs, next_of
+from sortie.perception.surrogate.line_of_sight import NEAR_M, RES_M, Kerbs, next_of
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene, Target
 

@@ -7,12 +7,12 @@ import pytest
 from perception_examples import capture, cross
 from surrogate_examples import asked
 
+from sortie.perception.surrogate.correlation import seen_by_several
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import Fleet
-from sortie.perception.surrogate.mirages import Mirages, in_common
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import scene_model
-from sortie.perception.surrogate.together import seen_by_several
+from sortie.perception.surrogate.shared_false_positives import Mirages, in_common
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception
 

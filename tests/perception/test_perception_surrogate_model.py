@@ -15,12 +15,13 @@ from perception_examples import EMPTY, cross
 from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
 from sortie.perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
 from sortie.perception.surrogate.fit import BANDS as QUANTILES
 from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
-from sortie.perception.surrogate.luck import BANDS
+from sortie.perception.surrogate.line_of_sight import CAR_TOP_M, HeightField
 from sortie.perception.surrogate.model import (
     BAND,
     FORMAT,
@@ -36,7 +37,6 @@ from sortie.perception.surrogate.model import (
     load,
     save,
 )
-from sortie.perception.surrogate.sight import CAR_TOP_M, HeightField
 from sortie.scenarios.schema import Scene
 
 RNG = np.random.Generator(np.random.PCG64(5))

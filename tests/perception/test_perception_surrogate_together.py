@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from surrogate_examples import asked
 
+from sortie.perception.surrogate.correlation import hang_together
 from sortie.perception.surrogate.model import SHIPPED, Parameters, load
-from sortie.perception.surrogate.together import hang_together
 
 BASE = np.array([0.2, 0.25, 0.2, 0.0], np.float32)
 
@@ -57,7 +57,7 @@ def test_between_two_factors_the_gain_is_straight(
             return 0.25 if own else 0.3 - 0.2 * float(of.alike[3])
         return wanted if own else 0.055 - 0.02 * (float(of.alike[0] / BASE[0]) - 0.5)
 
-    monkeypatch.setattr("sortie.perception.surrogate.together._gain", gain)
+    monkeypatch.setattr("sortie.perception.surrogate.correlation._gain", gain)
     found = hang_together(parameters, [], 0, 0.1, lambda done, of: None)
     assert float(found.alike[0] / BASE[0]) == pytest.approx(factor, rel=1e-4)
     assert float(found.alike[3]) == pytest.approx(0.25, rel=1e-4)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from perception_examples import capture
 
-from sortie.perception.render import Renderer
-from sortie.perception.scene import SceneModel
-from sortie.perception.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, _shadows, block, zigzag
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import KERB_M, PAVEMENT_M, RES_M, TILE_M, TILE_PX, Town, _shadows, block, zigzag
 from sortie.scenarios.schema import Scene
 
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sortie.perception.scene import SceneModel
-from sortie.perception.traffic import TARGET_ID, TargetPath
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.traffic import TARGET_ID, TargetPath
 from sortie.scenarios.schema import Scene, Target
 
 BOUNDS = (-100.0, -100.0, 200.0, 150.0)

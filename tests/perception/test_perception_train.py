@@ -10,9 +10,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from sortie.perception.bench.dataset import Benchmark, Frames, load_frames, make_scene_file
-from sortie.perception.checkpoint import load_weights, read_facts, save_weights
-from sortie.perception.model import CarNet, ModelConfig
+from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
+from sortie.perception.network.checkpoint import load_weights, read_facts, save_weights
+from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.training import train as training
 from sortie.perception.training.learn import Thinning, draw_batch, local_cars
 from sortie.perception.training.recipe import Recipe, command

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.perception.harness import verdict
-from sortie.perception.harness.verdict import HALF_AN_ORDER, Judgement, Measured, Paper, Size, Verdict
+from sortie.perception.evaluation import verdict
+from sortie.perception.evaluation.verdict import HALF_AN_ORDER, Judgement, Measured, Paper, Size, Verdict
 
 UP, DOWN, NOTHING = Paper(4.8, 3.8, 5.8), Paper(-4.8, -5.8, -3.8), Paper(0.8, -0.8, 2.3, significant=False)
 R, N, O, X = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.OPPOSITE, Verdict.NOT_MEASURABLE  # noqa: E741

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sortie.perception.ap import Matched, match
-from sortie.perception.bench.difficulty import Difficulty
-from sortie.perception.bench.scenes import draw_captures, draw_scene
-from sortie.perception.checkpoint import read_facts
-from sortie.perception.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
-from sortie.perception.harness.statistics import compare
-from sortie.perception.scene import SceneModel
+from sortie.perception.benchmark.difficulty import Difficulty
+from sortie.perception.benchmark.scenes import draw_captures, draw_scene
+from sortie.perception.metrics.ap import Matched, match
+from sortie.perception.metrics.bootstrap import compare
+from sortie.perception.network.checkpoint import read_facts
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.study.plan import read_plan
 from sortie.perception.study.run import SHIPPED
 from sortie.perception.types import Share

@@ -38,7 +38,7 @@ from sortie.policies.registry import POLICIES
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.conformance import RULES, full_view, raised_part
 from sortie.policies.verification.views import draw_view, draw_views
-from sortie.scenarios.load import ScenarioError, loads
+from sortie.scenarios.reading.load import ScenarioError, loads
 
 FLEET = fleet_of(5)
 MINE = FLEET.descriptors[0]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sortie.scenarios.files import found_beside, named_files, placed, with_files
-from sortie.scenarios.load import load, loads
+from sortie.scenarios.reading.files import found_beside, named_files, placed, with_files
+from sortie.scenarios.reading.load import load, loads
 
 TEXT = """
 name: own

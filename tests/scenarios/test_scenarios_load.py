@@ -14,8 +14,8 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import sortie.scenarios.load as loader
-from sortie.scenarios.load import ScenarioError, dump, library, load, loads
+import sortie.scenarios.reading.load as loader
+from sortie.scenarios.reading.load import ScenarioError, dump, library, load, loads
 from sortie.scenarios.schema import Policy, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sortie.scenarios import reference
-from sortie.scenarios.load import library, loads
+from sortie.scenarios.reading.load import library, loads
 from sortie.scenarios.schema import Scenario
 
 REMEDY = "run python -m sortie.scenarios.reference"

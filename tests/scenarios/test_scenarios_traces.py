@@ -7,7 +7,7 @@ import csv
 import pytest
 
 from sortie.scenarios import context_traces as ct
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.traces import TraceError, located, read_columns
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from sortie.scenarios.load_campaign import load_campaign
+from sortie.scenarios.reading.campaign import load_campaign
 from sortie.sim.campaign.plan import Plan, make_plan
 from sortie.sim.campaign.rows import Rows
 from sortie.sim.campaign.work import Result, Task, task_key

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sortie.scenarios.load import loads
+from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 
 BASE = """

@@ -12,7 +12,7 @@ from sortie.sim.campaign import code
 
 @pytest.fixture
 def rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name in ("fleet/agent.py", "perception/weights/net.safetensors", "policies/catalogue/learned.json", "sim/campaign/plan.py",
+    for name in ("fleet/agent.py", "perception/network/weights/net.safetensors", "policies/catalogue/learned.json", "sim/campaign/plan.py",
                  "sim/cli/app.py", "sim/campaign/report.py", "perception/study/weights/full-0.safetensors",
                  "scenarios/library/traces/links.json", "fleet/README.md"):  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -28,7 +28,7 @@ def changed(rooms: Path, name: str, text: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "name", ["fleet/agent.py", "fleet/new.py", "perception/weights/net.safetensors", "policies/catalogue/learned.json", "sim/campaign/plan.py"]
+    "name", ["fleet/agent.py", "fleet/new.py", "perception/network/weights/net.safetensors", "policies/catalogue/learned.json", "sim/campaign/plan.py"]
 )  # fmt: skip
 def test_what_decides_a_run_changes_its_code_version(rooms: Path, name: str) -> None:
     assert changed(rooms, name, "after")

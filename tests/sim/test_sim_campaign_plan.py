@@ -10,8 +10,8 @@ import pytest
 from campaign_examples import BASE, CAMPAIGN, plan, write
 
 from sortie.policies.contract import PolicyError
-from sortie.scenarios.load import ScenarioError
-from sortie.scenarios.load_campaign import load_campaign
+from sortie.scenarios.reading.campaign import load_campaign
+from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.campaign.plan import Plan
 from sortie.sim.campaign.work import number, unpack
 from sortie.sim.folders import RunError

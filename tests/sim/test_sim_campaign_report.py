@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.campaign import Sample
+from sortie.scenarios.schema.campaign import Sample
 from sortie.sim.campaign.contexts import contexts, rule, winner
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front

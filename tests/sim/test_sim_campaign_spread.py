@@ -10,16 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.campaign import (
-    Choice,
-    Integers,
-    LogNormal,
-    Normal,
-    Sample,
-    Spread,
-    Triangular,
-    Uniform,
-)
+from sortie.scenarios.schema.campaign import Choice, Integers, LogNormal, Normal, Sample, Spread, Triangular, Uniform
 from sortie.sim.campaign.spread import design, quantile
 
 U = st.floats(0.001, 0.999)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from sortie.perception.bench.dataset import Benchmark
-from sortie.perception.bench.difficulty import DENSITIES, Split
+from sortie.perception.benchmark.dataset import Benchmark
+from sortie.perception.benchmark.difficulty import DENSITIES, Split
 from sortie.perception.geometry import FULL, SMALL
 from sortie.sim.cli.app import app
 from sortie.sim.cli.bench import DensityName, RangeName, SplitName

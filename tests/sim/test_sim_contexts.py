@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sortie.perception.scene import SceneModel
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.catalogue.adaptive import ARMS, FEATURES, read_model
 from sortie.policies.registry import POLICIES
-from sortie.scenarios.contexts import Contexts
-from sortie.scenarios.load import ScenarioError, context_sets, library, load_contexts
+from sortie.scenarios.reading.load import ScenarioError, context_sets, library, load_contexts
 from sortie.scenarios.schema import Perception
+from sortie.scenarios.schema.conditions import Contexts
 from sortie.sim import learn
 from sortie.sim.cli import contexts as commands
 from sortie.sim.cli.app import main
@@ -200,7 +200,7 @@ def test_contexts_are_scored_by_torch_over_the_surrogates_traffic(
     contexts = load_contexts(path)
     assert contexts is not None
     ours = fly_all(contexts, ["all-4", "boxes"])
-    monkeypatch.setattr("sortie.perception.detector.TorchDetector", Seer)
+    monkeypatch.setattr("sortie.perception.network.detector.TorchDetector", Seer)
     theirs = fly_all(contexts, ["all-4", "boxes"], detector_of=torch_answers())
     assert [c.data_bytes for c in theirs] == [c.data_bytes for c in ours]
     assert all(c.ap > 0.9 for c in theirs)
@@ -208,7 +208,7 @@ def test_contexts_are_scored_by_torch_over_the_surrogates_traffic(
 
 
 def test_a_lesson_by_torch_asks_it_at_fewer_moments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sortie.perception.detector.TorchDetector", Seer)
+    monkeypatch.setattr("sortie.perception.network.detector.TorchDetector", Seer)
     monkeypatch.setattr(learn, "SECONDS", 4)
     before = Seer.asked
     lesson = learn.fly_lesson(0, 6, by_torch=True)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from sortie.perception.detectors import DETECTORS
 from sortie.policies.verification.conformance import conform
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.outcome import outcome
 from sortie.sim.sortie import run_sortie
 

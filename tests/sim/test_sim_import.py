@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from sortie.fleet.logs.flightlog import read_log
 from sortie.fleet.logs.logtrace import context_trace
 from sortie.fleet.traces import COLUMNS, read_traces
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.sortie import run_sortie

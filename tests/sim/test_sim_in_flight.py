@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from sim_examples import BASE
 
-from sortie.perception.ap import average_precision
-from sortie.perception.scene import SceneModel
+from sortie.perception.metrics.ap import average_precision
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.model import SHIPPED
-from sortie.scenarios.load import load, load_contexts
+from sortie.scenarios.reading.load import load, load_contexts
 from sortie.scenarios.schema import Scenario
 from sortie.sim.in_flight import Level, flights, means, torch_answers
 from sortie.sim.outcome import accuracy, both_matched

@@ -356,8 +356,8 @@ def other_weights(path):  # type: ignore[no-untyped-def]
     """The shipped weights with a more hesitant head."""
     import torch
 
-    from sortie.perception.checkpoint import load_weights, save_weights
-    from sortie.perception.detector import SHIPPED_WEIGHTS
+    from sortie.perception.network.checkpoint import load_weights, save_weights
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
     net = load_weights(SHIPPED_WEIGHTS)
     with torch.no_grad():

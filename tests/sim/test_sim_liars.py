@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.named import policy_overrides
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

@@ -13,12 +13,12 @@ from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 from rerun.chunk import RrdReader
 from sim_examples import example
 
+from sortie.perception.evaluation import report, rows
+from sortie.perception.evaluation.claims import OVERHEAD
+from sortie.perception.evaluation.measures import Elsewhere
+from sortie.perception.evaluation.picture import Picture
+from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.geometry import CELLS, FULL
-from sortie.perception.harness import report, rows
-from sortie.perception.harness.claims import OVERHEAD
-from sortie.perception.harness.measures import Elsewhere
-from sortie.perception.harness.picture import Picture
-from sortie.perception.harness.sensitivity import Varied
 from sortie.perception.types import Boxes
 from sortie.policies.registry import resolve
 from sortie.sim import paper, plane

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from sortie.perception.harness import report, rows
-from sortie.perception.harness.sensitivity import Varied
+from sortie.perception.evaluation import report, rows
+from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.study import report as study
 from sortie.perception.study.figures import CAPTIONS
 from sortie.perception.study.measure import from_table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.compare import compare
 from sortie.sim.outcome import outcome

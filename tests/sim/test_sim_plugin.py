@@ -15,7 +15,7 @@ from scipy import stats
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.sim.checking import check_scenario
 from sortie.sim.cli.app import app
 from sortie.sim.expect import check, limit

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.scenarios.load import loads
+from sortie.scenarios.reading.load import loads
 from sortie.sim.outcome import outcome
 from sortie.sim.sortie import run_sortie
 

@@ -10,7 +10,7 @@ from recording_examples import record_flight, small
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.perception.outside.recorded import RecordingError
+from sortie.perception.recordings.recording import RecordingError
 from sortie.sim.cli.app import app
 from sortie.sim.compare import compare
 from sortie.sim.sortie import run_sortie
@@ -51,7 +51,7 @@ def test_a_threshold_that_cannot_be_is_told_before_anything_is_evaluated(
     tau: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "sortie.perception.outside.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated")
+        "sortie.perception.recordings.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated")
     )
     done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--tau", tau])
     assert str(done.exception) == f"tau is {tau}, must be 0.01 to 1"

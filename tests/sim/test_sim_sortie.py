@@ -12,7 +12,7 @@ import pytest
 from sim_examples import example
 
 from sortie.policies.contract import Directive, PolicyError
-from sortie.scenarios.load import load
+from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

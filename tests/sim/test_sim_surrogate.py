@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from sortie.scenarios.load import load as read
+from sortie.scenarios.reading.load import load as read
 from sortie.scenarios.schema import Scenario
 from sortie.sim import rundir
 from sortie.sim.outcome import outcome
@@ -65,7 +65,7 @@ def test_sharing_pays_and_replications_differ() -> None:
 
 def test_it_flies_without_torch() -> None:
     code = (
-        "import sys\nfrom sortie.scenarios.load import load\nfrom sortie.sim.sortie import run_sortie\n"
+        "import sys\nfrom sortie.scenarios.reading.load import load\nfrom sortie.sim.sortie import run_sortie\n"
         "run_sortie(load('track_target', ['duration_s=1', 'perception.detector=surrogate']))\n"
         "print('torch' in sys.modules)"
     )

@@ -9,7 +9,7 @@ import pytest
 from sim_examples import example
 
 from sortie.policies.contract import PolicyError
-from sortie.scenarios.load import ScenarioError
+from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.named import policy_overrides
 from sortie.sim.outcome import outcome
 from sortie.sim.record import SortieRecord

@@ -22,7 +22,7 @@ import simpy
 
 from sortie.radio import Air, Status
 from sortie.radio.age import Chain, mean_age_s, share_older
-from sortie.scenarios.load import loads
+from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Radio, Scenario
 from sortie.sim.outcome import outcome
 from sortie.sim.sortie import run_sortie

@@ -16,7 +16,7 @@ from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import Directive, FleetView
 
 REQUEST_MAP_BYTES = 4096 * 2
-"""R = 1 − C as one float16 a feature cell (`sortie.perception.fusion.traffic`)."""
+"""R = 1 − C as one float16 a feature cell (`sortie.perception.network.fusion.traffic`)."""
 
 
 def where2comm(view: FleetView, *, rho: float = 1.0, rounds: int = 1) -> list[Directive]:

@@ -1,0 +1,94 @@
+"""A frame of the benchmark on one page: what five drones saw, what the lift makes of it, and what was there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sortie.perception.benchmark.dataset import Benchmark
+from sortie.perception.benchmark.difficulty import Split
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.visibility import SEEN, inside, visible
+from sortie.perception.network.bev import lift
+from sortie.perception.scene.render import CAMERAS, Renderer
+from sortie.perception.scene.scene_model import SceneModel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SEEN_COLOUR, PEER_COLOUR, HIDDEN_COLOUR = "#ffd23f", "#4cc9f0", "#ff3b5c"
+
+
+def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
+    """A row of views for each drone; below, a bird's-eye image for each with the cars in its square.
+
+    Yellow: the drone sees it; blue: only another does; red: none. By straight lines (`visibility.py`), not by a network.
+
+    Raises:
+        ImportError: matplotlib is missing.
+        ValueError: no such scene or frame.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon
+
+    if index < 0 or frame < 0:
+        raise ValueError(f"scene {index}, frame {frame}: must be 0 or above")
+    config = draw_scene(bench.seed, split, index, bench.difficulty)
+    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
+    views = Renderer(scene, scene_id(bench.seed, split, index)).render(captures)
+    ground = lift(views, captures, bench.geometry).numpy()
+    cars = scene.cars_at(captures[0].t_s)
+    seen = np.stack([visible(scene, c, cars) >= SEEN for c in captures])
+
+    half = bench.geometry.half_extent_m
+    figure = Figure(figsize=(16, 13.2), layout="constrained")
+    axes = figure.subplots(DRONES + 1, len(CAMERAS), height_ratios=[0.5625] * DRONES + [1.0])
+    for d, capture in enumerate(captures):
+        for ax, name, view in zip(axes[d], CAMERAS, views[d], strict=True):
+            ax.imshow(view)
+            ax.set_title(name if d == 0 else "", fontsize=9)
+        axes[d, 0].set_ylabel(f"drone {d}", fontsize=9)
+        ax = axes[DRONES, d]
+        # row 0 is the rearmost, column 0 the rightmost: shown with forward up and left to the left
+        ax.imshow(ground[d, :3].transpose(1, 2, 0)[::-1, ::-1], extent=(half, -half, -half, half))
+        asked = inside(capture, cars, half)
+        c, s = np.cos(capture.true_yaw_rad), np.sin(capture.true_yaw_rad)
+        for k in np.flatnonzero(asked):
+            corners = _corners(cars.length_m[k], cars.width_m[k], cars.yaw_rad[k])
+            corners += (cars.x_m[k] - capture.position_m[0], cars.y_m[k] - capture.position_m[1])
+            local = corners @ np.array([[c, -s], [s, c]])  # forward, left
+            colour = SEEN_COLOUR if seen[d, k] else PEER_COLOUR if seen[:, k].any() else HIDDEN_COLOUR
+            ax.add_patch(Polygon(local[:, ::-1], closed=True, fill=False, edgecolor=colour, linewidth=0.9))
+        others = seen.any(axis=0)
+        counts = f"drone {d}: {asked.sum()} cars: sees {(asked & seen[d]).sum()}, fleet {(asked & others).sum()}"
+        ax.set_title(counts, fontsize=9)
+        ax.set_xlim(half, -half)
+        ax.set_ylim(-half, half)
+    for ax in axes.flat:
+        ax.set_xticks([])
+        ax.set_yticks([])
+    figure.suptitle(
+        f"{split} {index}, frame {frame}: {config.style}, blocks {config.block_m:.0f} m, built {config.building_density:.2f}, "
+        f"mean height {config.building_height_m:.0f} m, trees {config.tree_density:.2f}, sun {config.sun_elevation_deg:.0f}°, "
+        f"overcast {config.overcast:.2f}. Boxes: yellow seen by the drone, blue by another only, red by none.",
+        fontsize=9,
+    )
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """As a PNG, under a temporary name first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.stem}.part.png")
+    figure.savefig(part, dpi=110)
+    part.replace(path)
+
+
+def _corners(length: float, width: float, yaw: float) -> np.ndarray:
+    """[4, 2] around the origin."""
+    box = 0.5 * np.array([(length, width), (length, -width), (-length, -width), (-length, width)])
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.asarray(box @ np.array([[c, s], [-s, c]]))

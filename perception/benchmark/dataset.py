@@ -1,0 +1,211 @@
+"""Splits on disk: one npz file a scene, made in parallel, kept where they exist, and listed in the manifest with their hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sortie.perception.benchmark import manifest
+from sortie.perception.benchmark.difficulty import Difficulty, Layout, Split
+from sortie.perception.benchmark.manifest import COLUMNS, BenchmarkError
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
+from sortie.perception.network.bev import lift
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+
+FORMAT = 1
+"""Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
+SIZES: dict[Split, tuple[int, int]] = {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (240, 1)}
+"""Scenes and frames a scene. The test split has a scene for every frame, as UAV3D's mini-validation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """n fleet-frames: `images` uint8 [n, 5, 4, 256, 256]; `true_pose`, `est_pose` [n, 5, 3] (x, y, yaw, ENU);
+    `cars` [n, m, 5] (x, y, length, width, yaw; NaN-padded); `scene` [n] the scene's label."""
+
+    images: NDArray[np.uint8]
+    true_pose: NDArray[np.float64]
+    est_pose: NDArray[np.float64]
+    cars: NDArray[np.float64]
+    scene: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """Which benchmark: everything that its files follow from."""
+
+    seed: int = 0
+    difficulty: Difficulty = Difficulty()  # noqa: RUF009 (frozen)
+    geometry: Geometry = FULL
+
+    def key(self) -> str:
+        """A short hash of all of it and of the files' format: what names the folder."""
+        text = json.dumps({"format": FORMAT, **asdict(self)}, sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=6).hexdigest()
+
+    @classmethod
+    def at(cls, folder: Path) -> Benchmark:
+        """The one whose manifest lies in `folder`.
+
+        Raises:
+            BenchmarkError: no manifest, or one of another format or with other parameters than this version knows.
+        """
+        data, path = manifest.read(folder), folder / manifest.MANIFEST
+        if data["format"] != FORMAT:
+            raise BenchmarkError(f"{path}: format is {data['format']}, must be {FORMAT}: make it anew")
+        try:
+            told = data["benchmark"]
+            known = {f.name for f in fields(Difficulty)}
+            if set(told["difficulty"]) != known:
+                raise ValueError(f"difficulty has {sorted(set(told['difficulty']) ^ known)} too many or too few")
+            bench = cls(told["seed"], _difficulty(told["difficulty"]), Geometry(**told["geometry"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BenchmarkError(f"{path}: cannot be understood: {error}") from error
+        if bench.key() != data["key"]:
+            raise BenchmarkError(f"{path}: key is {data['key']}, must be {bench.key()}: its parameters were changed")
+        return bench
+
+    def folder(self, root: Path) -> Path:
+        """Where its splits lie under `root`."""
+        return root / f"seed{self.seed}-{self.difficulty.density}-{self.geometry.half_extent_m:g}m-{self.key()}"
+
+
+def _difficulty(told: dict[str, Any]) -> Difficulty:
+    """From JSON, which knows lists but no tuples."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return Layout(**{k: plain(v) for k, v in value.items()})
+        return tuple(value) if isinstance(value, list) else value
+
+    return Difficulty(**{k: plain(v) for k, v in told.items()})
+
+
+def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> Path:
+    """Render `frames` frames of a split's scene into one file, unless it is there already."""
+    if path.exists():
+        return path
+    name = scene_id(bench.seed, split, index)
+    config = draw_scene(bench.seed, split, index, bench.difficulty)
+    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    renderer = Renderer(scene, name)
+    images = np.empty((frames, DRONES, 4, IMAGE_PX, IMAGE_PX), np.uint8)
+    true_pose, est_pose = np.empty((frames, DRONES, 3)), np.empty((frames, DRONES, 3))
+    cars = []
+    for f in range(frames):
+        captures = draw_captures(bench.seed, split, index, f, bench.difficulty)
+        images[f] = lift(renderer.render(captures), captures, bench.geometry).numpy()
+        true_pose[f] = [(*c.position_m[:2], c.true_yaw_rad) for c in captures]
+        est_pose[f] = [c.est_pose for c in captures]
+        at = scene.cars_at(captures[0].t_s)
+        cars.append(np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1))
+    table = np.full((frames, max(len(c) for c in cars), 5), np.nan)
+    for row, c in zip(table, cars, strict=True):
+        row[: len(c)] = c
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+    np.savez(part, images=images, true_pose=true_pose, est_pose=est_pose, cars=table)
+    part.replace(path)
+    return path
+
+
+def _make(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> tuple[str, dict[str, Any]]:
+    """The scene's file, and what the manifest says of it."""
+    make_scene_file(bench, split, index, frames, path)
+    config = draw_scene(bench.seed, split, index, bench.difficulty).model_dump()
+    return path.name, {
+        "index": index,
+        "frames": frames,
+        "sha256": manifest.content_hash(path),
+        "scene": config,
+    }
+
+
+def start_worker() -> None:
+    """For a worker process: one thread each, as there are as many workers as cores."""
+    torch.set_num_threads(1)
+
+
+def make_split(
+    bench: Benchmark,
+    split: Split,
+    root: Path,
+    *,
+    scenes: int | None = None,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """The files of a split, made in parallel where they are missing; a run that was cut off goes on where it was.
+
+    Args:
+        root: folder of benchmarks; this one's own lies under it (`Benchmark.folder`), its manifest beside the splits.
+        scenes: only the first so many.
+        workers: processes; left out, one a core.
+        progress: called with scenes done and scenes to make.
+
+    Raises:
+        ValueError: more scenes than the split has, or none.
+        BenchmarkError: a file on disk is broken, or a worker was killed.
+    """
+    count, frames = SIZES[split]
+    if scenes is not None:
+        if not 1 <= scenes <= count:
+            raise ValueError(f"scenes is {scenes}, must be 1 to the {count} of the {split} split")
+        count = scenes
+    folder = bench.folder(root)
+    paths = [folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in range(count)]
+    known = manifest.listed(folder, split)
+    todo = [k for k, path in enumerate(paths) if not path.exists() or path.name not in known]
+    if todo:
+        entries: list[tuple[str, dict[str, Any]]] = []
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=start_worker)
+        try:
+            jobs = [pool.submit(_make, bench, split, k, frames, paths[k]) for k in todo]
+            for done, job in enumerate(as_completed(jobs), 1):
+                entries.append(job.result())
+                if progress is not None:
+                    progress(done, len(jobs))
+        except BrokenProcessPool as error:
+            raise BenchmarkError(f"{folder}: a worker was killed; what is finished is kept, run it again") from error
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if entries:
+                header = {"format": FORMAT, "key": bench.key(), "benchmark": asdict(bench)}
+                manifest.add(folder, header, split, entries)
+    return paths
+
+
+def load_frames(paths: Sequence[Path]) -> Frames:
+    """All frames of the files, in order, in memory (1.3 MB a fleet-frame).
+
+    Raises:
+        ValueError: no files.
+        BenchmarkError: a file cannot be read.
+    """
+    if not paths:
+        raise ValueError("load_frames needs at least one file")
+    parts = [manifest.read_arrays(path) for path in paths]
+    most = max(p["cars"].shape[1] for p in parts)
+    for p in parts:
+        p["cars"] = np.pad(p["cars"], ((0, 0), (0, most - p["cars"].shape[1]), (0, 0)), constant_values=np.nan)
+    columns = {k: np.concatenate([p[k] for p in parts]) for k in COLUMNS}
+    scene = np.repeat([int(p.stem.split("_")[1]) for p in paths], [len(p["images"]) for p in parts])
+    return Frames(columns["images"], columns["true_pose"], columns["est_pose"], columns["cars"], scene)

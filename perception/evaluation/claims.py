@@ -1,0 +1,272 @@
+"""Every claim of the paper's Evaluation section, in its order, as data: what it says, what of ours answers it, by which rule.
+
+AP differences are in points, absolute APs from 0 to 1, both as the paper prints them. Where a policy is "the best
+two-peer policy" it is the best of best-2, worst-2 and random-2 at that budget, as in the paper. Claims marked
+`follows` are not sentences of the paper but arithmetic on its sentences. The paper's conditions: unsent cells are
+zeros, cells by confidence, a budget's cells not steered by the mission's region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from sortie.perception.evaluation import verdict
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.measures import (
+    Contrast,
+    Crossover,
+    Elsewhere,
+    FleetFrameBytes,
+    Kept,
+    Level,
+    MeanLevel,
+    Measure,
+    Oracle,
+    Peak,
+    Region,
+    UnequalBytes,
+    Widest,
+    WrongChoice,
+)
+from sortie.perception.evaluation.verdict import Judgement, Measured, Paper
+
+CURVE = (0.01, 0.02, 0.05, 0.1, 0.25, 1.0)
+BUDGETS = (0.02, 0.05, 0.1, 0.25)
+TWO_PEERS = ("best-2", "worst-2", "random-2")
+
+Rule = Callable[[Paper, Measured | None], Judgement]
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One claim: a number of the paper, or something that it says without one."""
+
+    id: str
+    place: str
+    """Subsection of the Evaluation, and sentence within it."""
+    says: str
+    """In our words; short enough for a table."""
+    unit: str
+    """AP points, AP, %, MB, kB/s, MB/s, B, ms, s, ×."""
+    paper: Paper
+    measure: Measure
+    rule: Rule = verdict.contrast
+    headline: bool = False
+    """Whether it stands in the README's short table."""
+    follows: bool = False
+    """Arithmetic on the paper's figures, not a sentence of it."""
+
+
+def all_4(rho: float) -> Condition:
+    """Spreading: every peer shares."""
+    return Condition(rho)
+
+
+def two(rho: float) -> tuple[Condition, ...]:
+    """Concentrating: the two-peer policies at the same bytes."""
+    return tuple(Condition(rho, peers) for peers in TWO_PEERS)
+
+
+POLICIES = tuple(tuple(Condition(rho, peers) for rho in BUDGETS) for peers in ("all-4", *TWO_PEERS))
+"""The fixed policies that the paper's oracle switches among, by budget."""
+
+
+def _against_full(rho: float, region: Region = "full") -> Contrast:
+    return Contrast((all_4(rho),), (FULL_SHARING,), region)
+
+
+def _pair(rho: float, a: str, b: str, region: Region = "full") -> Contrast:
+    return Contrast((Condition(rho, a),), (Condition(rho, b),), region)
+
+
+def _overlap_against_uniform(rho: float) -> Contrast:
+    return Contrast((Condition(rho, allocation="overlap"),), (all_4(rho),))
+
+
+POINTS, AP = "AP points", "AP"
+
+SET_UP = (
+    Claim(
+        "bytes.full", "set-up, 6", "Full sharing sends 13.1 MB a fleet-frame", "MB",
+        Paper(13.1), FleetFrameBytes(FULL_SHARING), verdict.exact,
+    ),
+)  # fmt: skip
+
+GAIN = (
+    Claim("single", "gain, 1", "AP of a single drone", AP, Paper(0.185, digits=3), Level(SINGLE), verdict.level),
+    Claim("full", "gain, 2", "AP at full sharing", AP, Paper(0.371, digits=3), Level(FULL_SHARING), verdict.level),
+    Claim(
+        "gain", "gain, 2", "Cooperation gains", POINTS,
+        Paper(18.5, 16.9, 20.3), Contrast((FULL_SHARING,), (SINGLE,)), headline=True,
+    ),
+    Claim(
+        "curve.0.1", "gain, 5", "ρ = 0.1 against full sharing", POINTS,
+        Paper(-2.0, -3.4, -0.8), _against_full(0.1), headline=True,
+    ),
+    Claim(
+        "kept.0.1", "gain, 5", "ρ = 0.1 keeps most of the gain", "%",
+        Paper(89.0, digits=0), Kept(all_4(0.1)), verdict.most, headline=True, follows=True,
+    ),
+    Claim(
+        "kept.0.05", "gain, 6", "ρ = 0.05 keeps, of the gain", "%",
+        Paper(58.0, digits=0), Kept(all_4(0.05)), headline=True,
+    ),
+    Claim(
+        "curve.0.05", "gain, 6", "ρ = 0.05 against full sharing", POINTS,
+        Paper(-7.8), _against_full(0.05), follows=True,
+    ),
+    Claim("curve.0.01", "gain, 7", "ρ = 0.01 against full sharing", POINTS, Paper(-24.0, digits=0), _against_full(0.01), headline=True),
+    Claim(
+        "starved", "gain, 7", "ρ = 0.01 is worse than a single drone", POINTS,
+        Paper(-5.4), Contrast((all_4(0.01),), (SINGLE,)), headline=True, follows=True,
+    ),
+    Claim(
+        "curve.0.02", "budget, 2", "ρ = 0.02 against full sharing", POINTS,
+        Paper(-19.1), _against_full(0.02), follows=True,
+    ),
+    Claim("level.0.01", "gain, 7", "AP at ρ = 0.01", AP, Paper(0.131, digits=3), Level(all_4(0.01)), verdict.level, follows=True),
+    Claim("level.0.02", "budget, 2", "AP at ρ = 0.02", AP, Paper(0.180, digits=3), Level(all_4(0.02)), verdict.level, follows=True),
+    Claim("level.0.05", "gain, 6", "AP at ρ = 0.05", AP, Paper(0.293, digits=3), Level(all_4(0.05)), verdict.level, follows=True),
+    Claim("level.0.1", "gain, 5", "AP at ρ = 0.1", AP, Paper(0.351, digits=3), Level(all_4(0.1)), verdict.level, follows=True),
+    Claim("level.0.25", "figure, a", "AP at ρ = 0.25 (drawn, not printed)", AP, Paper(), Level(all_4(0.25)), verdict.level),
+)  # fmt: skip
+
+MISSION = (
+    Claim("mission.full", "mission, 2", "Mission AP at full sharing", AP, Paper(0.763, digits=3), Level(FULL_SHARING, "mission"), verdict.level),
+    Claim("mission.0.05", "mission, 2", "Mission AP at ρ = 0.05", AP, Paper(0.773, digits=3), Level(all_4(0.05), "mission"), verdict.level),
+    Claim("mission.0.1", "mission, 2", "Mission AP at ρ = 0.1", AP, Paper(0.784, digits=3), Level(all_4(0.1), "mission"), verdict.level),
+    Claim(
+        "mission.widest", "mission, 3", "Mission AP at ρ 0.05–0.1, widest from full sharing", POINTS,
+        Paper(2.2, -0.5, 5.1, significant=False),
+        Widest((_against_full(0.05, "mission"), _against_full(0.1, "mission"))), headline=True,
+    ),
+    Claim(
+        "mission.tenth", "mission, 4", "Mission AP at ρ = 0.1 against full sharing", POINTS,
+        Paper(significant=False), _against_full(0.1, "mission"),
+    ),
+    Claim(
+        "mission.peak", "figure, a", "Mission AP peaks at 5–10 % of the bytes", "%",
+        Paper(low=5.0, high=10.0, digits=0), Peak(tuple(map(all_4, CURVE)), "mission"), verdict.same_place,
+    ),
+)  # fmt: skip
+
+PEERS = (
+    Claim(
+        "matched", "peers, 2", "Matched policies differ in bytes by", "%",
+        Paper(0.0), UnequalBytes(POLICIES), verdict.exact,
+    ),
+    Claim(
+        "peers.worst-best", "peers, 3", "ρ = 0.25: worst-2 − best-2", POINTS,
+        Paper(0.8, -0.8, 2.3, significant=False), _pair(0.25, "worst-2", "best-2"), headline=True,
+    ),
+    Claim(
+        "peers.worst-random", "peers, 3", "ρ = 0.25: worst-2 − random-2", POINTS,
+        Paper(0.1, -1.1, 1.3, significant=False), _pair(0.25, "worst-2", "random-2"),
+    ),
+    Claim(
+        "peers.best-random", "peers, 3", "ρ = 0.25: best-2 − random-2", POINTS,
+        Paper(-0.7, significant=False), _pair(0.25, "best-2", "random-2"), follows=True,
+    ),
+    Claim(
+        "peers.all", "peers, 6", "ρ = 0.25: all four over the best two", POINTS,
+        Paper(4.8, 3.8, 5.8), Contrast((all_4(0.25),), two(0.25)), headline=True,
+    ),
+)  # fmt: skip
+
+_CONCENTRATING = tuple(Contrast(two(rho), (all_4(rho),)) for rho in BUDGETS)
+FLIP = (
+    Claim(
+        "flip.0.02", "budget, 2", "ρ = 0.02: the best two over all four", POINTS,
+        Paper(7.7, 6.6, 8.9), _CONCENTRATING[0], headline=True,
+    ),
+    Claim(
+        "flip.0.05", "budget, 3", "ρ = 0.05: the best two over all four", POINTS,
+        Paper(1.4, 0.2, 2.7), _CONCENTRATING[1], headline=True,
+    ),
+    Claim(
+        "flip.0.1", "budget, 5", "ρ = 0.1: the best two over all four", POINTS,
+        Paper(-4.0, -5.3, -2.8), _CONCENTRATING[2], headline=True,
+    ),
+    Claim("flip.0.25", "budget, 6", "ρ = 0.25: the best two over all four", POINTS, Paper(-4.8, -5.8, -3.8), _CONCENTRATING[3]),
+    Claim(
+        "flip.crossover", "budget, 7", "The lead changes between 5 and 10 % of the bytes, at", "%",
+        Paper(low=5.0, high=10.0, digits=0), Crossover(_CONCENTRATING), verdict.same_place, headline=True,
+    ),
+    Claim(
+        "wrong.starved", "budget, 9", "The winner at ρ = 0.25, used at 0.02, loses", POINTS,
+        Paper(-7.7), WrongChoice(POLICIES, chosen_at=3, judged_at=0), headline=True,
+    ),
+    Claim(
+        "wrong.plentiful", "budget, 9", "The winner at ρ = 0.02, used at 0.25, loses", POINTS,
+        Paper(-4.8), WrongChoice(POLICIES, chosen_at=0, judged_at=3), headline=True,
+    ),
+    Claim("oracle.level", "budget, 11", "Mean AP of the oracle", AP, Paper(0.320, digits=3), MeanLevel(POLICIES, fixed=False), verdict.level),
+    Claim("fixed.level", "budget, 11", "Mean AP of the best fixed policy", AP, Paper(0.299, digits=3), MeanLevel(POLICIES, fixed=True), verdict.level),
+    Claim("oracle", "budget, 11", "The oracle over the best fixed policy", POINTS, Paper(2.1), Oracle(POLICIES), headline=True),
+    Claim(
+        "oracle.held-out", "budget, 13", "The same, chosen on half of the frames, judged on the rest", POINTS,
+        Paper(2.0), Oracle(POLICIES, held_out=True), headline=True,
+    ),
+)  # fmt: skip
+
+ALLOCATION = tuple(
+    Claim(
+        f"allocation.{rho:g}", "budget, 18", f"ρ = {rho:g}: allocation by overlap − uniform", POINTS,
+        Paper(significant=False), _overlap_against_uniform(rho), headline=rho == 0.1,
+    )
+    for rho in BUDGETS
+)  # fmt: skip
+
+COMPOSITION = (
+    Claim("compose.best", "composition, 2", "AP of best-2 at ρ = 0.02", AP, Paper(0.257, digits=3), Level(Condition(0.02, "best-2")), verdict.level),
+    Claim("compose.worst", "composition, 2", "AP of worst-2 at ρ = 0.02", AP, Paper(0.257, digits=3), Level(Condition(0.02, "worst-2")), verdict.level),
+    Claim(
+        "compose.tie", "composition, 2", "ρ = 0.02, full scene: best-2 − worst-2", POINTS,
+        Paper(0.0, significant=False), _pair(0.02, "best-2", "worst-2"), headline=True,
+    ),
+    Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at ρ = 0.02", AP, Paper(0.787, digits=3), Level(Condition(0.02, "best-2"), "mission"), verdict.level),
+    Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at ρ = 0.02", AP, Paper(0.728, digits=3), Level(Condition(0.02, "worst-2"), "mission"), verdict.level),
+    Claim(
+        "compose.mission", "composition, 5", "ρ = 0.02, mission: best-2 − worst-2", POINTS,
+        Paper(5.9, 2.5, 9.4), _pair(0.02, "best-2", "worst-2", "mission"), headline=True,
+    ),
+    Claim(
+        "compose.spread", "composition, 7", "ρ = 0.05, mission: all four over the best two", POINTS,
+        Paper(3.1, -0.6, 7.0, significant=False), Contrast((all_4(0.05),), two(0.05), "mission"), headline=True,
+    ),
+)  # fmt: skip
+
+OVERHEAD = (
+    Claim("plane.descriptor", "overhead, 3", "A descriptor", "B", Paper(180.0, digits=0), Elsewhere("descriptor_bytes"), verdict.exact),
+    Claim("plane.counted", "overhead, 3", "Four descriptors at 10 Hz and 80 directives a second, by the wire's sizes", "kB/s", Paper(10.1), Elsewhere("counted_kb_per_s"), verdict.exact, headline=True),
+    Claim("plane.rate", "overhead, 3", "Context plane as flown", "kB/s", Paper(10.1), Elsewhere("context_kb_per_s"), verdict.same_order),
+    Claim("plane.data", "overhead, 4", "Data plane that it steers", "MB/s", Paper(105.0, digits=0), Elsewhere("data_mb_per_s"), verdict.same_order),
+    Claim("plane.share", "overhead, 5", "Context over data", "%", Paper(0.01, digits=2), Elsewhere("context_percent"), verdict.at_most, headline=True),
+    Claim("plane.median", "overhead, 6", "A policy decision, median", "ms", Paper(0.10, digits=2), Elsewhere("policy_ms_p50"), verdict.at_most, headline=True),
+    Claim("plane.p99", "overhead, 6", "A policy decision, 99th percentile", "ms", Paper(0.13, digits=2), Elsewhere("policy_ms_p99"), verdict.at_most),
+    Claim("plane.deadline", "overhead, 7", "The 100 ms deadline over a decision's median", "×", Paper(1000.0, digits=0), Elsewhere("deadline_over_p50"), verdict.at_least),
+    Claim("plane.core", "overhead, 8", "Of one core, the ROS 2 prototype uses", "%", Paper(9.0, digits=0), Elsewhere("ros2_core_percent"), verdict.at_most),
+    Claim("plane.x86.data", "overhead, 9", "Data plane in an x86 container", "MB/s", Paper(62.0, digits=0), Elsewhere("x86_container_mb_per_s"), verdict.same_order),
+    Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("x86_policy_ms_p50"), verdict.at_most),
+    Claim("plane.roi", "overhead, 11", "A phase change shrinks feature payloads", "×", Paper(10.0, digits=0), Elsewhere("roi_shrinks"), verdict.same_order, headline=True),
+    Claim("plane.battery", "overhead, 12", "Battery decay moves agent 1 down the rate ladder, rungs met", "of 3", Paper(3.0, digits=0), Elsewhere("battery_rungs"), verdict.exact),
+    Claim("plane.link", "overhead, 12", "A link drop at 60 s leaves agent 2 with detections, after", "s", Paper(0.1), Elsewhere("link_drop_s"), verdict.at_most, headline=True),
+)  # fmt: skip
+
+SECTIONS: dict[str, tuple[Claim, ...]] = {
+    "Set-up": SET_UP,
+    "Cooperative gain and the byte–accuracy frontier": GAIN,
+    "Mission context": MISSION,
+    "Peer selection": PEERS,
+    "Budget sensitivity": FLIP,
+    "Allocation": ALLOCATION,
+    "Composition of context axes": COMPOSITION,
+    "Overhead of the context plane": OVERHEAD,
+}
+CLAIMS: tuple[Claim, ...] = tuple(claim for claims in SECTIONS.values() for claim in claims)
+
+
+def conditions(claims: Iterable[Claim] = CLAIMS) -> tuple[Condition, ...]:
+    """What has to be evaluated for the claims, each once, in their order."""
+    return tuple(dict.fromkeys(c for claim in claims for c in claim.measure.conditions()))

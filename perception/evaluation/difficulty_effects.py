@@ -1,0 +1,219 @@
+"""What each parameter of the difficulty does to AP: one is moved at a time, the scenes stay as they are otherwise.
+
+Scene k of every row has the same streams, so rows differ in the parameter alone and differences are paired by scene.
+The scenes are a benchmark of their own (seed 7), so that nobody looks at the test split in passing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sortie.perception.benchmark.dataset import FORMAT, Frames, start_worker
+from sortie.perception.benchmark.difficulty import Difficulty
+from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.metrics.ap import Matched
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.perception.network.bev import lift
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+
+SEED = 7
+SCENES = 12
+CONDITIONS: tuple[Condition, ...] = (SINGLE, FULL_SHARING)
+BEGIN, END = "<!-- effects: begin -->", "<!-- effects: end -->"
+"""Around the table in the README; `write_table` replaces what is between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One parameter moved."""
+
+    parameter: str
+    value: str
+    difficulty: Difficulty
+
+
+def _moved(name: str, value: Any) -> Difficulty:
+    return replace(Difficulty(), **{name: value})
+
+
+def moves() -> list[Move]:
+    """The default first, then every parameter at the ends of its range, or well beyond for the errors and the fleet."""
+    d = Difficulty()
+    out = [
+        Move("as it is", "", d),
+        Move("density", "sparse", replace(d, density="sparse")),
+        Move("density", "dense", replace(d, density="dense")),
+        Move("unseen", "as seen in training", replace(d, unseen=d.seen)),
+    ]
+    for name, ends, unit in (
+        ("building_density", d.building_density, ""),
+        ("building_height_m", d.building_height_m, " m"),
+        ("tree_density", d.tree_density, ""),
+        ("sun_elevation_deg", d.sun_elevation_deg, "°"),
+        ("overcast", d.overcast, ""),
+        ("brightness", d.brightness, ""),
+        ("spacing_m", (10.0, 40.0), " m"),
+        ("altitude_m", (45.0, 80.0), " m"),
+    ):
+        out += [Move(name, f"{end:g}{unit}", _moved(name, (end, end))) for end in ends]
+    for name, values, unit in (
+        ("slot_sigma_m", (0.0, 3.0), " m"),
+        ("yaw_sigma_deg", (0.0, 45.0), "°"),
+        ("tilt_sigma_deg", (0.0, 10.0), "°"),
+        ("position_error_sigma_m", (0.0, 0.5), " m"),
+        ("heading_error_sigma_deg", (0.0, 1.0), "°"),
+    ):
+        out += [Move(name, f"{value:g}{unit}", _moved(name, value)) for value in values]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """What a move did."""
+
+    move: Move
+    gain: Difference
+    """AP alone (a) and with all five sharing all (b)."""
+    change: Difference | None
+    """AP under full sharing: as it is (a), moved (b); None for the first row."""
+
+
+def measure(
+    weights: Path,
+    store: Path,
+    *,
+    scenes: int = SCENES,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Effect]:
+    """Render and evaluate every move on the same scenes; finished scenes are kept in `store`, a later call goes on.
+
+    About 45 CPU seconds a scene.
+
+    Raises:
+        ValueError: weights that are missing or do not fit.
+    """
+    rows = moves()
+    told = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
+    mark = CarNetInstrument.load(weights).fingerprint + json.dumps(told, sort_keys=True)
+    folder = store / hashlib.blake2b(mark.encode(), digest_size=6).hexdigest()
+    paths = [folder / f"scene_{k}.npz" for k in range(scenes)]
+    todo = [k for k, path in enumerate(paths) if not path.exists()]
+    if todo:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=start_worker)
+        try:
+            jobs = [pool.submit(evaluate_scene, weights, k, rows, paths[k]) for k in todo]
+            for done, job in enumerate(as_completed(jobs), 1):
+                job.result()
+                if progress is not None:
+                    progress(done, len(jobs))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    kept = [_read(path, len(rows)) for path in paths]
+    units = [[[m for scene in kept for m in scene[r][c]] for c in range(len(CONDITIONS))] for r in range(len(rows))]
+    label = np.repeat(np.arange(scenes), len(kept[0][0][0]))
+    return [
+        Effect(move, compare(alone, shared, label), compare(units[0][1], shared, label) if r else None)
+        for r, (move, (alone, shared)) in enumerate(zip(rows, units, strict=True))
+    ]
+
+
+def evaluate_scene(weights: Path, index: int, rows: Sequence[Move], path: Path) -> None:
+    """One scene under every move, one frame each; towns that moves share are drawn once."""
+    instrument = CarNetInstrument.load(weights)
+    towns: dict[str, SceneModel] = {}
+    renderers: dict[str, Renderer] = {}
+    arrays: dict[str, Any] = {}
+    with torch.inference_mode():
+        for r, move in enumerate(rows):
+            config = draw_scene(SEED, "test", index, move.difficulty)
+            key = config.model_dump_json()
+            if key not in towns:
+                towns[key] = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+                renderers[key] = Renderer(towns[key], scene_id(SEED, "test", index))
+            captures = draw_captures(SEED, "test", index, 0, move.difficulty)
+            at = towns[key].cars_at(captures[0].t_s)
+            frames = Frames(
+                images=lift(renderers[key].render(captures), captures, instrument.geometry).numpy()[None],
+                true_pose=np.array([[(*c.position_m[:2], c.true_yaw_rad) for c in captures]]),
+                est_pose=np.array([[c.est_pose for c in captures]]),
+                cars=np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1)[None],
+                scene=np.array([index]),
+            )
+            result = evaluate(instrument, frames, CONDITIONS, regions=("full",))
+            for c, condition in enumerate(CONDITIONS):
+                for e, unit in enumerate(result.matched(condition)):
+                    arrays |= {f"{r}.{c}.{e}.{f}": getattr(unit, f) for f in Matched.__slots__}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+    np.savez(part, **arrays)
+    part.replace(path)
+
+
+def _read(path: Path, rows: int) -> list[list[list[Matched]]]:
+    """[rows][conditions][egos]"""
+    with np.load(path, allow_pickle=False) as file:
+        egos = sum(name.startswith("0.0.") and name.endswith(".truths") for name in file.files)
+
+        def unit(key: str) -> Matched:
+            return Matched(file[f"{key}.score"], file[f"{key}.hit"], int(file[f"{key}.truths"]))
+
+        return [[[unit(f"{r}.{c}.{e}") for e in range(egos)] for c in range(len(CONDITIONS))] for r in range(rows)]
+
+
+def table(effects: Sequence[Effect], weights: Path, scenes: int) -> str:
+    """The effects as Markdown, with their date and weights."""
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:12]
+    lines = [
+        f"Measured {datetime.now(UTC):%Y-%m-%d} with `{weights.name}` (SHA-256 {digest}…): {scenes} scenes of seed {SEED}'s test layouts, "
+        f"one fleet-frame × five egos each, AP@0.5 without a threshold. Change: of AP under full sharing against the first row, "
+        "paired by scene, 95 %; bold where the interval leaves out 0. A bootstrap over few scenes is too sure of itself: "
+        "below twenty, take small changes for hints.",
+        "",
+        "| parameter | moved to | AP alone | AP sharing all | cooperation | change |",
+        "|---|---|---|---|---|---|",
+    ]
+    for e in effects:
+        change = "–"
+        if e.change is not None:
+            change = f"{e.change.delta:+.3f} [{e.change.low:+.3f}, {e.change.high:+.3f}]"
+            change = f"**{change}**" if e.change.low > 0 or e.change.high < 0 else change
+        name = f"`{e.move.parameter}`" if e.change is not None else e.move.parameter
+        lines.append(
+            f"| {name} | {e.move.value} | {e.gain.ap_a:.3f} | {e.gain.ap_b:.3f} | {e.gain.delta:+.3f} | {change} |"
+        )
+    return "\n".join(lines)
+
+
+def write_table(readme: Path, text: str) -> None:
+    """Put a table between the markers of a README, under a temporary name first.
+
+    Raises:
+        ValueError: the README or its markers are missing.
+    """
+    if not readme.is_file():
+        raise ValueError(f"{readme}: missing, the table goes between {BEGIN} and {END} in it")
+    before, begin, rest = readme.read_text("utf-8").partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(f"{readme}: {BEGIN} and {END} are missing, the table goes between them")
+    part = readme.with_name(f".{readme.name}.part")
+    part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")
+    part.replace(readme)

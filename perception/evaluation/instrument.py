@@ -1,0 +1,162 @@
+"""Our network as the harness's instrument: features of a fleet-frame once, then every exchange of it in batches."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sortie.perception.evaluation.condition import CellsBy
+from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
+from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.network.checkpoint import load_weights
+from sortie.perception.network.decode import decode
+from sortie.perception.network.fusion.base import PerCell
+from sortie.perception.network.inference import folded
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import Support, arriving, rows, support
+
+CPU = torch.device("cpu")
+BATCH = 5
+"""Egos fused at once; on a CPU larger batches leave the cache and gain nothing."""
+
+
+class CarNetInstrument:
+    """A network on frames that carry `images` uint8 [n, d, 4, 256, 256]."""
+
+    def __init__(self, net: CarNet, device: torch.device = CPU) -> None:
+        self.fingerprint = fingerprint(net)
+        self.geometry: Geometry = net.config.geometry
+        self._device = device
+        self._net = folded(net).to(device)
+
+    @classmethod
+    def load(cls, weights: Path, device: torch.device = CPU) -> CarNetInstrument:
+        """From a weights file; ValueError where it is missing or does not fit."""
+        return cls(load_weights(weights), device)
+
+    def start_worker(self) -> None:
+        """For a thread of `evaluate`: frames side by side, each in one thread, beat two threads in every operation."""
+        if self._device.type == "cpu":
+            torch.set_num_threads(1)
+
+    @torch.inference_mode()
+    def look(self, frames: FleetFrames, frame: int) -> CarNetView:
+        images = torch.from_numpy(np.ascontiguousarray(frames.images[frame]))  # type: ignore[attr-defined]
+        est = frames.est_pose[frame] - np.array([*frames.est_pose[frame].mean(axis=0)[:2], 0.0])
+        return CarNetView(
+            self._net, self._net.encoder(images.to(self._device)), torch.from_numpy(est).float().to(self._device)
+        )
+
+
+def fingerprint(net: CarNet) -> str:
+    """A hash of the network's configuration and every weight."""
+    digest = hashlib.blake2b(repr(net.config).encode(), digest_size=16)
+    for name, tensor in sorted(net.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+class CarNetView:
+    """The features of one fleet-frame, and what the network finds from them.
+
+    A fusion that works cell by cell (`PerCell`) is asked only about cells where something arrived; the others are the
+    ego's own, or, where silent peers count as zeros, what the ego makes of that many zeros, worked out once a view.
+    """
+
+    def __init__(self, net: CarNet, features: torch.Tensor, est: torch.Tensor) -> None:
+        self._net, self._features, self._est = net, features, est
+        self._table = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
+        self._under: dict[int, Support] = {}
+        self._silent: dict[tuple[int, tuple[int, ...]], torch.Tensor] = {}
+
+    @torch.inference_mode()
+    def rank(self, by: CellsBy) -> NDArray[np.floating]:
+        """Confidence: the highest score of the cell's head pixels, each drone alone; norm: of its feature vector."""
+        if by == "norm":
+            plane = self._features.norm(dim=1)
+        else:
+            plane = F.max_pool2d(self._net.head(self._features)[:, :1], 2)[:, 0]
+        out: NDArray[np.floating] = plane.cpu().numpy()
+        return out
+
+    @torch.inference_mode()
+    def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[Floats]:
+        """Each ego's boxes before suppression (see `contract.View`)."""
+        out: list[Floats] = []
+        for at in range(0, len(exchanges), BATCH):
+            fused = torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]])  # [n, 4096, 80]
+            maps = fused.view(-1, CELLS, CELLS, fused.shape[-1]).permute(0, 3, 1, 2)
+            out += [
+                decode(one, floor, self._net.config.geometry).double().numpy() for one in self._net.head(maps).cpu()
+            ]
+        return out
+
+    def _fuse(self, e: Exchange) -> torch.Tensor:
+        """[4096, 80]: what one ego makes of its own features and what it was sent."""
+        own = self._table[e.ego * CELLS**2 : (e.ego + 1) * CELLS**2]
+        if not e.peers:
+            return own
+        sent = torch.from_numpy(e.sent.reshape(len(e.peers), -1)).to(own.device)
+        under = self._support(e.ego, e.peers)
+        weights, arrived = arriving(under, sent)
+        inside, arrived = under.inside.flatten(1), arrived.flatten(1)
+        if not isinstance(self._net.fusion, PerCell):
+            return self._dense(e, own, under, weights, arrived if e.unsent == "masked" else inside)
+        at = arrived.any(dim=0).nonzero().squeeze(1)
+        base = own if e.unsent == "masked" else self._zeros(e, own, inside, len(at))
+        if not len(at):
+            return base
+        said = torch.cat([own[at][None], self._gather(e, under, weights, at)])
+        part = (arrived if e.unsent == "masked" else inside)[:, at]
+        return base.index_copy(0, at, self._mix(said, part))
+
+    def _support(self, ego: int, peers: tuple[int, ...]) -> Support:
+        """Of these peers under the ego; all of a view's are worked out once."""
+        if ego not in self._under:
+            self._under[ego] = support(self._est[ego], self._est, self._net.config.geometry.cell_m)
+        every = self._under[ego]
+        return Support(*(part[list(peers)] for part in every))
+
+    def _gather(self, e: Exchange, under: Support, weights: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+        """[peers, p, 80]: what arrived at these cells of the ego's grid."""
+        k = len(e.peers)
+        first = torch.tensor(e.peers, device=at.device)[:, None, None] * CELLS**2
+        taps = under.cells.view(k, -1, 4)[:, at] + first
+        moved = rows(self._table, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
+        return moved.view(k, len(at), -1)
+
+    def _mix(self, said: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
+        """Fuse [1 + k, p, 80] cell by cell; the ego takes part everywhere, every link has weight 1."""
+        fusion = self._net.fusion
+        assert isinstance(fusion, PerCell)  # noqa: S101 (tells the type checker)
+        part = torch.cat([torch.ones_like(part[:1]), part])
+        mixed: torch.Tensor = fusion.mix(said, part, torch.ones_like(part, dtype=said.dtype))
+        return torch.where(part[1:].any(dim=0)[:, None], mixed, said[0])
+
+    def _zeros(self, e: Exchange, own: torch.Tensor, inside: torch.Tensor, arrived: int) -> torch.Tensor:
+        """The ego beside silent peers that count as zeros."""
+        if arrived == len(own):
+            return own  # every cell is about to be replaced
+        key = (e.ego, e.peers)
+        if key not in self._silent:
+            said = torch.cat([own[None], own.new_zeros(len(e.peers), *own.shape)])
+            self._silent[key] = self._mix(said, inside)
+        return self._silent[key]
+
+    def _dense(
+        self, e: Exchange, own: torch.Tensor, under: Support, weights: torch.Tensor, part: torch.Tensor
+    ) -> torch.Tensor:
+        """The whole map, for a fusion that looks beyond its cell."""
+        every = torch.arange(len(own), device=own.device)
+        said = torch.cat([own[None], self._gather(e, under, weights, every)])
+        part = torch.cat([torch.ones_like(part[:1]), part]).view(1, -1, CELLS, CELLS)
+        agents = said.view(1, -1, CELLS, CELLS, own.shape[1]).permute(0, 1, 4, 2, 3)
+        fused: torch.Tensor = self._net.fusion(agents, part, torch.ones(1, len(said), device=own.device))
+        return fused[0].permute(1, 2, 0).reshape(own.shape)

@@ -1,0 +1,66 @@
+"""The paper's Evaluation on the benchmark: every condition that a claim needs, evaluated once, and every claim judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
+from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.evaluation.claims import conditions
+from sortie.perception.evaluation.contract import FleetFrames, Instrument
+from sortie.perception.evaluation.evaluate import Region, evaluate
+from sortie.perception.evaluation.measures import under
+from sortie.perception.evaluation.results import Asked, Found
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+
+
+def measure(
+    instrument: Instrument,
+    frames: FleetFrames,
+    asked: Asked,
+    *,
+    store: Path | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Found:
+    """Evaluate what the claims need, all instruments over the same features.
+
+    Args:
+        instrument, frames: a model and what it looks at.
+        store: a folder for finished frames; a later call with the same arguments goes on from there.
+        workers: frames worked on side by side; the numbers do not depend on it.
+        progress: called with frames done and frames in all.
+    """
+    every = dict.fromkeys(under(c, unsent, asked.cells_by) for unsent in asked.unsent for c in conditions())
+    regions: tuple[Region, ...] = ("full", "mission", "ego")
+    found = evaluate(instrument, frames, tuple(every), regions=regions, store=store, workers=workers, progress=progress)
+    return Found(found, asked)
+
+
+def bench_frames(
+    seed: int, count: int | None, root: Path, progress: Callable[[int, int], None] | None = None
+) -> Frames:
+    """The first `count` frames (None: all) of the benchmark's test split, each of a scene of its own; made where they are
+    missing.
+
+    Raises:
+        ValueError: more frames than the split has.
+    """
+    scenes, per_scene = SIZES["test"]
+    if count is not None and not 1 <= count <= scenes * per_scene:
+        raise ValueError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
+    return load_frames(make_split(Benchmark(seed), "test", root, scenes=count, progress=progress))
+
+
+def camera_views(seed: int, frame: int) -> NDArray[np.uint8]:
+    """[drone, camera, height, width, 3]: what the drones' cameras see in a frame of the test split, rendered anew."""
+    bench, name = Benchmark(seed), scene_id(seed, "test", frame)
+    scene = SceneModel(draw_scene(seed, "test", frame, bench.difficulty), None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    captures = draw_captures(seed, "test", frame, 0, bench.difficulty)
+    views: NDArray[np.uint8] = Renderer(scene, name).render(captures)
+    return views

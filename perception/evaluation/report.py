@@ -1,0 +1,224 @@
+"""The paper's table as Markdown: the whole report, and the short section of the repository's README. Pure text."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from sortie.perception.evaluation.rows import INSTRUMENTS, Row
+from sortie.perception.evaluation.sensitivity import Varied
+from sortie.perception.evaluation.verdict import Verdict
+
+BEGIN, END = "<!-- paper:begin -->", "<!-- paper:end -->"
+MINUS = "−"
+_DECIMALS = {"AP points": 1, "AP": 3, "MB": 1, "kB/s": 1, "MB/s": 1, "%": 1, "B": 0, "ms": 3, "s": 2, "×": 1, "of 3": 0}
+
+
+def signed(value: float, decimals: int = 1) -> str:
+    """A difference with its sign."""
+    text = f"{value:+.{decimals}f}"
+    return f"{0:.{decimals}f}" if float(text) == 0 else text.replace("-", MINUS)
+
+
+def figure(value: float | None, low: float | None, high: float | None, unit: str, decimals: int | None = None) -> str:
+    """A figure with its interval, in its unit; a dash where there is none."""
+    if value is None:
+        return "–" if low is None or high is None else f"{low:g}–{high:g}{_suffix(unit)}"
+    places = _DECIMALS[unit] if decimals is None else decimals
+    if unit == "AP points":
+        text = signed(value, places)
+        return text if low is None or high is None else f"{text} [{signed(low, places)}, {signed(high, places)}]"
+    text = _plain(value, places) + _suffix(unit)
+    return text if low is None or high is None else f"{text} [{_plain(low, places)}, {_plain(high, places)}]"
+
+
+def papers(row: Row) -> str:
+    """What the paper prints."""
+    text = figure(row.paper_value, row.paper_low, row.paper_high, row.unit, row.digits)
+    if row.rule == "contrast" and not row.paper_significant:
+        return "n.s." if row.paper_value is None else f"{text} n.s."
+    return f"({text})" if row.follows and text != "–" else text
+
+
+def ours(row: Row) -> str:
+    """What we measured."""
+    if row.value is None:
+        return "none" if row.verdict == Verdict.NOT_REPRODUCED else "–"
+    small = row.rule != "contrast" and 0 < abs(row.value) < 10.0 ** -_DECIMALS[row.unit]
+    text = f"{row.value:.1g}{_suffix(row.unit)}" if small else figure(row.value, row.low, row.high, row.unit)
+    contains_zero = row.low is not None and row.high is not None and row.low <= 0 <= row.high
+    return f"{text} n.s." if row.rule == "contrast" and contains_zero else text
+
+
+def verdict(row: Row) -> str:
+    """The verdict, and how the sizes compare."""
+    mark = {
+        Verdict.REPRODUCED: "**reproduced**",
+        Verdict.NOT_REPRODUCED: "*not reproduced*",
+        Verdict.OPPOSITE: "*opposite*",
+    }.get(Verdict(row.verdict), row.verdict)
+    return f"{mark}, {row.size}" if row.size and row.rule != "exact" else mark
+
+
+def tally(rows: Iterable[Row]) -> str:
+    """How many claims got which verdict."""
+    count = Counter(row.verdict for row in rows)
+    return ", ".join(f"{count[v]} {v}" for v in Verdict if count[v])
+
+
+def report(
+    rows: Sequence[Row],
+    facts: Mapping[str, Any],
+    figures: Sequence[tuple[str, str]] = (),
+    varied: Sequence[Varied] = (),
+) -> str:
+    """The whole report; `figures` are file names beside it and what they show, `varied` claims at other settings."""
+    shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
+    lines = ["# The paper's Evaluation, claim by claim", "", _made(facts), ""]
+    lines += [f"- {INSTRUMENTS[i]}: {tally(r for r in rows if r.instrument == i)}." for i in shown]
+    lines += [f"- measured on a flown sortie: {tally(r for r in rows if not r.instrument)}.", "", _RULE, ""]
+    for name, caption in figures:
+        lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
+    for section in dict.fromkeys(r.section for r in rows):
+        lines += [f"## {section}", "", *_section([r for r in rows if r.section == section], shown), ""]
+    if varied:
+        lines += _sensitivity(rows, varied)
+    return "\n".join(lines)
+
+
+def short(rows: Sequence[Row], facts: Mapping[str, Any], link: str) -> str:
+    """The README's section: the headline claims, between its markers."""
+    chosen = [r for r in rows if r.headline]
+    head = [BEGIN, "", _made(facts), ""]
+    for i, name in INSTRUMENTS.items():
+        if its := [r for r in rows if r.instrument == i]:
+            head.append(f"- {name}: {tally(its)}.")
+    head += [f"- measured on a flown sortie: {tally(r for r in rows if not r.instrument)}.", ""]
+    shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in chosen)]
+    table = ["| claim | paper | ours | verdict | masked |", "|---|---|---|---|---|"]
+    for several in _by_claim(chosen):
+        first = several.get(shown[0] if shown else "", several.get(""))
+        if first is None:
+            continue
+        other = several.get("masked") if "masked" in shown[1:] else None
+        masked = "" if other is None else ours(other)
+        table.append(f"| {first.says} | {papers(first)} | {ours(first)} | {verdict(first)} | {masked} |")
+    tail = [
+        "",
+        "AP differences in points with 95 % intervals; *ours* is the paper's instrument (cells that were not sent count "
+        "as zeros), *masked* leaves them out of the fusion, as sorties do. In brackets: arithmetic on the paper's figures.",
+        f"All claims, figures, and how each verdict is reached: [{link}]({link}).",
+        "",
+        END,
+    ]
+    return "\n".join([*head, *table, *tail])
+
+
+def put_into(text: str, section: str, begin: str = BEGIN, end: str = END) -> str:
+    """A README with its section between the markers replaced.
+
+    Raises:
+        ValueError: the markers are missing, doubled or in the wrong order.
+    """
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"must hold {begin} and {end} once each, in this order")
+    before, _, rest = text.partition(begin)
+    return before + section + rest.partition(end)[2]
+
+
+_RULE = """\
+**How verdicts are reached** (`perception/evaluation/verdict.py`, which tells what was fixed when). A difference is
+significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
+or in neither, or not in the paper and here wholly within half a point of zero; *opposite*: significant in both, with
+other signs; *not reproduced*: significant in one alone. The size is told apart: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
+That *most* of the gain is kept asks for an interval above one half. Absolute APs are not comparable between benchmarks, as the paper says itself. Counted bytes have to round to the
+paper's print; times and rates have to lie within half an order of magnitude, or beyond it on the side that makes the
+claim stronger. Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of
+a difference adjusted by Benjamini and Hochberg over the table's differences under the same instrument, for reading
+beside the verdict, which goes by the interval as the paper's does. "The best two" is the best of best-2, worst-2 and
+random-2 at that budget, chosen on all frames, as the paper does; the choice is in no interval. In brackets: not printed
+in the paper, but arithmetic on what it prints."""
+
+
+_SENSITIVITY = """\
+The paper names neither its score threshold nor the centre of its mission region. Here are the claims that could hang on
+them, over both, from the same detections; a star marks another verdict than above."""
+
+
+def _section(rows: Sequence[Row], shown: Sequence[str]) -> list[str]:
+    if not any(r.instrument for r in rows):
+        lines = ["| claim | sentence | paper | ours | verdict | |", "|---|---|---|---|---|---|"]
+        return lines + [f"| {r.says} | {r.place} | {papers(r)} | {ours(r)} | {verdict(r)} | {r.note} |" for r in rows]
+    head = "".join(f" {INSTRUMENTS[i]} | q | verdict |" for i in shown)  # type: ignore[index]
+    lines = [f"| claim | sentence | paper |{head} |", "|---|---|---|" + "---|---|---|" * len(shown) + "---|"]
+    for several in _by_claim(rows):
+        first = next(iter(several.values()))
+        cells = "".join(
+            f" {ours(r)} | {'' if r.q is None else _level(r.q)} | {verdict(r)} |" if (r := several.get(i)) else " | | |"
+            for i in shown
+        )
+        notes = list(dict.fromkeys(r.note for r in several.values() if r.note))
+        lines.append(f"| {first.says} | {first.place} | {papers(first)} |{cells} {'; masked: '.join(notes)} |")
+    return lines
+
+
+def _sensitivity(rows: Sequence[Row], varied: Sequence[Varied]) -> list[str]:
+    """A table a knob and instrument, its settings in columns; a star where the verdict is not that of the table above."""
+    lines = ["## What the verdicts hang on", "", _SENSITIVITY, ""]
+    first = {(r.id, r.instrument): r for r in rows}
+    for knob, title in (("tau", "score threshold τ"), ("disc", "mission disc")):
+        for i, name in INSTRUMENTS.items():
+            its = [v for v in varied if (v.knob, v.instrument) == (knob, i)]
+            if not its:
+                continue
+            settings = list(dict.fromkeys(v.setting for v in its))
+            lines += [
+                f"**{title}**, {name}:",
+                "",
+                f"| claim | {' | '.join(settings)} |",
+                "|---|" + "---|" * len(settings),
+            ]
+            for claim in dict.fromkeys(v.id for v in its):
+                row = first[claim, i]
+                cells = {
+                    v.setting: ours(replace(row, value=v.value, low=v.low, high=v.high, verdict=v.verdict))
+                    + (" *" if v.verdict != row.verdict else "")
+                    for v in its
+                    if v.id == claim
+                }
+                lines.append(f"| {row.says} | {' | '.join(cells[s] for s in settings)} |")
+            lines.append("")
+    return lines
+
+
+def _by_claim(rows: Iterable[Row]) -> list[dict[str, Row]]:
+    """Rows of one claim together, by instrument, claims in their order."""
+    claims: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        claims.setdefault(row.id, {})[row.instrument] = row
+    return list(claims.values())
+
+
+def _made(facts: Mapping[str, Any]) -> str:
+    """One paragraph: on what, by what, how exactly."""
+    return (
+        f"Made by `{facts['command']}`: {facts['frames']} frames of {facts['scenes']} scenes of the benchmark's test split "
+        f"(seed {facts['seed']}), five egos each; weights `{facts['weights']}` ({facts['fingerprint'][:12]}), cells by "
+        f"{facts['cells_by']}, score threshold τ = {facts['tau']:g}; {facts['draws']} resamples. "
+        f"Sortie {facts['version']}; {facts['cpu_s']:.0f} CPU-seconds on {facts['machine']}."
+    )
+
+
+def _plain(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}".replace("-", MINUS)
+
+
+def _suffix(unit: str) -> str:
+    return {"AP": "", "AP points": "", "×": " ×", "of 3": " of 3"}.get(unit, f" {unit}")
+
+
+def _level(q: float) -> str:
+    return "< 0.01" if q < 0.01 else f"{min(q, 1.0):.{2 if q >= 0.1 else 3}f}" if math.isfinite(q) else ""

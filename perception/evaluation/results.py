@@ -1,0 +1,66 @@
+"""What an evaluation for the paper found, to be asked under any instrument, threshold and disc. Free of torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sortie.perception.evaluation.condition import CellsBy, Unsent
+from sortie.perception.evaluation.matched import FLOOR, Evaluation
+from sortie.perception.evaluation.scores import Bootstrap, By
+from sortie.perception.metrics.bootstrap import DRAWS
+
+TAU = 0.1
+"""UAV3D's head cuts its scores there."""
+Disc = Literal["mission", "ego"]
+"""Around the mission's target, or around the ego."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """How the table is measured. The defaults are the paper's instrument, with masked fusion beside it.
+
+    Raises:
+        ValueError: naming the field, its value and the bound.
+    """
+
+    unsent: tuple[Unsent, ...] = ("zero", "masked")
+    cells_by: CellsBy = "confidence"
+    tau: float = TAU
+    """Boxes with a lower score do not count."""
+    by: By = "frame"
+    """What the bootstrap resamples."""
+    draws: int = DRAWS
+
+    def __post_init__(self) -> None:
+        if not self.unsent:
+            raise ValueError("unsent names no instrument, must name zero, masked or both")
+        if not FLOOR <= self.tau < 1.0:
+            raise ValueError(f"tau is {self.tau:g}, must be at least {FLOOR:g} and below 1")
+        if self.draws < 1:
+            raise ValueError(f"draws is {self.draws}, must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An evaluation of the paper's conditions under every instrument that was asked for."""
+
+    evaluation: Evaluation
+    asked: Asked
+    _made: dict[tuple[Unsent, float, Disc], Bootstrap] = field(default_factory=dict)
+    _cut: dict[float, Evaluation] = field(default_factory=dict)
+
+    def scores(self, unsent: Unsent, *, tau: float | None = None, disc: Disc = "mission") -> Bootstrap:
+        """Bootstrapped APs of one instrument, at the threshold that was asked for or another."""
+        key = (unsent, self.asked.tau if tau is None else tau, disc)
+        if key not in self._made:
+            if key[1] not in self._cut:
+                self._cut[key[1]] = self.evaluation.at(key[1])
+            self._made[key] = Bootstrap(
+                self._cut[key[1]], unsent, self.asked.cells_by, disc=disc, by=self.asked.by, draws=self.asked.draws
+            )
+        return self._made[key]
+
+    def all_scores(self) -> dict[Unsent, Bootstrap]:
+        """Those of every instrument, as asked."""
+        return {unsent: self.scores(unsent) for unsent in self.asked.unsent}

@@ -1,0 +1,164 @@
+"""The paper's table as rows: each claim under each way of fusing, with its verdict; to and from Parquet. Free of torch."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy.special import ndtri
+
+from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, conditions
+from sortie.perception.evaluation.condition import Unsent
+from sortie.perception.evaluation.measures import Elsewhere, Level, Region, Scores
+from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.metrics.bootstrap import benjamini_hochberg
+
+INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
+"""What a cell that was not sent counts as, and the column that shows it."""
+_NORMAL = ndtri([0.025, 0.975])
+_DRAWS = ndtri((np.arange(999) + 0.5) / 999)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One claim under one instrument. Missing figures are None."""
+
+    id: str
+    section: str
+    place: str
+    says: str
+    unit: str
+    headline: bool
+    follows: bool
+    rule: str
+    paper_value: float | None
+    paper_low: float | None
+    paper_high: float | None
+    paper_significant: bool
+    digits: int
+    instrument: str
+    """zero or masked; empty for what does not depend on it."""
+    value: float | None
+    low: float | None
+    high: float | None
+    p: float | None
+    q: float | None
+    """p adjusted by Benjamini and Hochberg over the table's contrasts of the same instrument."""
+    note: str
+    verdict: str
+    size: str
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """The AP of one way of sharing, for the figures."""
+
+    peers: str
+    rho: float
+    allocation: str
+    instrument: str
+    region: str
+    ap: float
+    low: float
+    high: float
+
+
+def points(scores: Mapping[Unsent, Scores]) -> list[Point]:
+    """Every condition of the claims in both regions, with its 95 % interval."""
+    out = []
+    for instrument, its in scores.items():
+        for region in get_args(Region):
+            for c in conditions():
+                m = Level(c, region).measure(its)
+                low, high = (m.value if bound is None else bound for bound in (m.low, m.high))
+                out.append(Point(c.peers, c.rho, c.allocation, instrument, region, m.value, low, high))
+    return out
+
+
+def judge(
+    scores: Mapping[Unsent, Scores], elsewhere: Mapping[str, Measured], claims: Sequence[Claim] = CLAIMS
+) -> list[Row]:
+    """Measure and judge every claim.
+
+    Args:
+        scores: by instrument; each answers for the claims' conditions as they stand there (unsent cells "zero").
+        elsewhere: what was measured in other rooms, by the name that `Elsewhere` gives it.
+    """
+    rows: list[Row] = []
+    for instrument, its in scores.items():
+        measured = {c.id: c.measure.measure(its) for c in claims if not isinstance(c.measure, Elsewhere)}
+        tested = [i for i, m in measured.items() if m.p is not None]
+        adjusted = dict(zip(tested, benjamini_hochberg([measured[i].p or 0.0 for i in tested]), strict=True))
+        rows += [_row(c, instrument, measured[c.id], adjusted.get(c.id)) for c in claims if c.id in measured]
+    rows += [_row(c, "", elsewhere.get(c.measure.name), None) for c in claims if isinstance(c.measure, Elsewhere)]
+    place = {c.id: i for i, c in enumerate(claims)}
+    return sorted(rows, key=lambda r: place[r.id])
+
+
+def differ_by_chance(rows: Iterable[Row], claims: Sequence[Claim] = CLAIMS) -> float:
+    """In how many verdicts two tables of the same truth would differ on average, each made on frames of its own: every
+    figure is taken to be normal about what it is here, as wide as its interval, which moves along."""
+    by_id = {c.id: c for c in claims}
+    expected = 0.0
+    for row in rows:
+        if row.value is None or row.low is None or row.high is None or row.id not in by_id:
+            continue
+        claim, wide = by_id[row.id], (row.high - row.low) / (_NORMAL[-1] - _NORMAL[0])
+        drawn = (Measured(row.value + d, row.low + d, row.high + d) for d in (wide * _DRAWS).tolist())
+        count = Counter(claim.rule(claim.paper, m).verdict for m in drawn)
+        expected += 1.0 - sum((n / len(_DRAWS)) ** 2 for n in count.values())
+    return expected
+
+
+def _row(claim: Claim, instrument: str, ours: Measured | None, q: float | None) -> Row:
+    judgement = claim.rule(claim.paper, ours)
+    shown = Measured(float("nan")) if ours is None else ours
+    section = next((name for name, claims in SECTIONS.items() if claim in claims), "")
+    return Row(
+        id=claim.id, section=section, place=claim.place, says=claim.says, unit=claim.unit, headline=claim.headline,
+        follows=claim.follows, rule=claim.rule.__name__, paper_value=claim.paper.value, paper_low=claim.paper.low,
+        paper_high=claim.paper.high, paper_significant=claim.paper.significant, digits=claim.paper.digits,
+        instrument=instrument, value=None if shown.value != shown.value else shown.value, low=shown.low,
+        high=shown.high, p=shown.p, q=q, note=shown.note, verdict=str(judgement.verdict), size=str(judgement.size),
+    )  # fmt: skip
+
+
+_TYPES = {"str": pa.string(), "float": pa.float64(), "bool": pa.bool_(), "int": pa.int32()}
+SCHEMA = pa.schema([(f.name, _TYPES[str(f.type).split(" |")[0]]) for f in fields(Row)])
+
+
+def to_table(rows: Iterable[Row], facts: Mapping[str, Any]) -> pa.Table:
+    """The rows, with what the run was made with as JSON in the schema's metadata."""
+    return pa.Table.from_pylist([asdict(r) for r in rows], SCHEMA.with_metadata({"sortie": json.dumps(dict(facts))}))
+
+
+def from_table(table: pa.Table) -> tuple[list[Row], dict[str, Any]]:
+    """Rows and facts back.
+
+    Raises:
+        ValueError: a column that is missing.
+    """
+    missing = sorted(set(SCHEMA.names) - set(table.column_names))
+    if missing:
+        raise ValueError(f"column {missing[0]} is missing")
+    facts: dict[str, Any] = json.loads((table.schema.metadata or {}).get(b"sortie", b"{}"))
+    return [Row(**r) for r in table.select(SCHEMA.names).to_pylist()], facts
+
+
+def read(path: Path) -> tuple[list[Row], dict[str, Any]]:
+    """The table of a report.
+
+    Raises:
+        ValueError: no such file, or not one of these; the message names it.
+    """
+    try:
+        return from_table(pq.read_table(path))
+    except (OSError, pa.ArrowInvalid, ValueError) as error:
+        raise ValueError(f"{path}: not the table of a report ({error})") from None

@@ -1,0 +1,138 @@
+"""Who shares with an ego, how many cells each, and which: pure functions of estimated poses and rank maps. Free of torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.perception.budget import index_bytes, payload_bytes
+from sortie.perception.evaluation.condition import Allocation, Condition
+from sortie.perception.geometry import CELLS as GRID
+from sortie.perception.geometry import FULL, Geometry
+from sortie.scenarios.streams import stream
+
+CELLS = GRID * GRID
+FOOTPRINT_M = 60.0 * math.tan(math.radians(35.0))
+"""The paper's 42 m: the radius that a 70° lens sees from 60 m."""
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Disc = tuple[float, float, float]
+"""x, y, radius in metres, ENU."""
+
+
+def footprint_overlap(xy_m: Floats, radius_m: Floats) -> Floats:
+    """[d, d]: the part of drone i's footprint that drone j's covers too, 0 … 1, from positions [d, 2] and radii [d].
+
+    Footprints are discs; the common part of two discs is a lens of two circular segments.
+    """
+    xy_m, radius_m = np.asarray(xy_m, np.float64), np.asarray(radius_m, np.float64)
+    d = np.hypot(*(xy_m[:, None] - xy_m[None]).transpose(2, 0, 1))
+    a, b = np.broadcast_arrays(radius_m[:, None], radius_m[None])
+    apart = np.maximum(d, 1e-12)
+    x = np.clip((d * d + a * a - b * b) / (2 * apart * a), -1, 1)
+    y = np.clip((d * d + b * b - a * a) / (2 * apart * b), -1, 1)
+    kite = np.sqrt(np.maximum((a + b - d) * (d + a - b) * (d - a + b) * (d + a + b), 0.0)) / 2
+    lens = a * a * np.arccos(x) + b * b * np.arccos(y) - kite
+    area = np.where(d >= a + b, 0.0, np.where(d <= np.abs(a - b), np.pi * np.minimum(a, b) ** 2, lens))
+    return np.asarray(np.clip(area / (np.pi * a * a), 0.0, 1.0))
+
+
+def choose(
+    condition: Condition, ego: int, overlap: Floats, key: tuple[int, ...] = (), seed: int = 0
+) -> tuple[int, ...]:
+    """The peers that share with `ego`, most overlapping first.
+
+    Args:
+        condition: its `peers` is asked.
+        ego: the receiver.
+        overlap: [d] of each drone's footprint with the ego's; equal ones go by the lower id.
+        key: names the frame, so that random peers are its own whatever else is evaluated.
+        seed: of the random peers.
+
+    Raises:
+        ValueError: more peers than there are, or all-k where the fleet has another number.
+    """
+    others = [i for i in range(len(overlap)) if i != ego]
+    if condition.k > len(others) or (condition.rule == "all" and condition.k != len(others)):
+        raise ValueError(f"peers is {condition.peers!r}, must fit a fleet with {len(others)} peers")
+    ranked = sorted(others, key=lambda i: (-overlap[i], i))
+    if condition.rule == "worst":
+        ranked = ranked[len(ranked) - condition.k :]
+    elif condition.rule == "random":
+        drawn = stream(seed, 0, (*key, ego), "harness.random_peers").permutation(len(ranked))[: condition.k]
+        ranked = [ranked[i] for i in sorted(drawn.tolist())]
+    return tuple(ranked[: condition.k])
+
+
+def total_cells(rho: float, peers: int) -> int:
+    """⌊ρ · peers · 4096⌋, `peers` being all that the fleet has."""
+    return math.floor(rho * peers * CELLS + 1e-9)
+
+
+def allocate(total: int, overlap: Sequence[float], allocation: Allocation, most: int = CELLS) -> list[int]:
+    """Part `total` cells among the chosen peers: their sum is `total` unless every peer sends all it has.
+
+    Quotas are equal or proportional to `overlap`; a peer whose quota passes `most` sends all and the rest is parted
+    anew among the others (alike, where none of those overlaps). Quotas are rounded down, and the cells that are left
+    over go one each by the largest fraction; equal fractions by more overlap, then by place in the list.
+    """
+    k = len(overlap)
+    share = [Fraction(float(o)) if allocation == "overlap" else Fraction(1) for o in overlap]
+    out = [0] * k
+    open_, left = list(range(k)), total
+    while open_:
+        if not sum(share[i] for i in open_):
+            share = [Fraction(1)] * k
+        whole = sum(share[i] for i in open_)
+        quota = {i: share[i] * left / whole for i in open_}
+        full = [i for i in open_ if quota[i] >= most]
+        if not full:
+            for i in open_:
+                out[i] = math.floor(quota[i])
+            spare = left - sum(out[i] for i in open_)
+            for i in sorted(open_, key=lambda i: (out[i] - quota[i], -overlap[i], i))[:spare]:
+                out[i] += 1
+            return out
+        for i in full:
+            out[i] = most
+            left -= most
+            open_.remove(i)
+    return out
+
+
+def in_disc(pose: Floats, disc: Disc, geometry: Geometry = FULL) -> Bools:
+    """[d, 64, 64]: the cells whose centres lie in the disc, on the grids of drones at `pose` [d, 3] (x, y, yaw)."""
+    along = (np.arange(GRID) + 0.5 - GRID / 2) * geometry.cell_m
+    dx, dy = disc[0] - pose[:, 0], disc[1] - pose[:, 1]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    forward, left = c * dx + s * dy, c * dy - s * dx
+    row, column = (along - forward[:, None]) ** 2, (along - left[:, None]) ** 2
+    return np.asarray(row[:, :, None] + column[:, None, :] <= disc[2] ** 2)
+
+
+def sending_order(rank: NDArray[np.floating], first: Bools | None = None) -> NDArray[np.int16]:
+    """[d, 64, 64]: each cell's place in its sender's order, 0 sent first; what a budget of b cells sends is `order < b`.
+
+    Args:
+        rank: [d, 64, 64], higher first; equal ones by the lower index.
+        first: [d, 64, 64] bool, cells that come before all others, each part ranked in itself.
+    """
+    d = len(rank)
+    score = -rank.reshape(d, CELLS).astype(np.float64)
+    by = np.argsort(score, axis=1, kind="stable")
+    if first is not None:
+        late = np.take_along_axis(~first.reshape(d, CELLS), by, axis=1)
+        by = np.take_along_axis(by, np.argsort(late, axis=1, kind="stable"), axis=1)
+    place = np.empty((d, CELLS), np.int16)
+    np.put_along_axis(place, by, np.arange(CELLS, dtype=np.int16)[None], axis=1)
+    return place.reshape(d, GRID, GRID)
+
+
+def link_bytes(cells: Sequence[int]) -> tuple[int, int]:
+    """Bytes to one ego: payload (cells × 80 × 2) and, apart, the index (512 B bitmap or 12 bits a cell, per link)."""
+    return sum(payload_bytes(c) for c in cells), sum(index_bytes(c) for c in cells)

@@ -1,0 +1,86 @@
+"""Weights on disk: safetensors with the network's configuration and its history in the metadata."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+
+from sortie.perception.errors import InputError
+from sortie.perception.network.fusion.registry import FUSIONS
+from sortie.perception.network.model import CarNet, ModelConfig
+
+
+def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -> None:
+    """Write every tensor of `net` and its configuration, under a temporary name first; `facts` is JSON about its making."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    metadata = {"model": json.dumps(asdict(net.config)), "sortie": json.dumps(facts or {})}
+    save_file(
+        {k: v.contiguous() for k, v in net.state_dict().items() if v.dtype.is_floating_point}, part, metadata=metadata
+    )
+    part.chmod(0o644)  # the library makes it private
+    part.replace(path)
+
+
+def load_weights(path: Path) -> CarNet:
+    """A network in evaluation mode from a safetensors file.
+
+    Raises:
+        InputError: naming the file, and the tensor or configuration field that is missing, unknown or of another shape.
+    """
+    net = CarNet(read_config(path))
+    found = load_file(path)
+    wanted = {k: v for k, v in net.state_dict().items() if v.dtype.is_floating_point}
+    for name, tensor in wanted.items():
+        if name not in found:
+            raise InputError(f"{path}: tensor {name} is missing")
+        if found[name].shape != tensor.shape:
+            raise InputError(f"{path}: tensor {name} has shape {list(found[name].shape)}, must be {list(tensor.shape)}")
+        if not bool(torch.isfinite(found[name]).all()):
+            raise InputError(f"{path}: tensor {name} holds values that are not finite")
+    extra = sorted(set(found) - set(wanted))
+    if extra:
+        raise InputError(f"{path}: tensor {extra[0]} is not part of the network")
+    net.load_state_dict(found, strict=False)
+    return net.eval()
+
+
+def read_config(path: Path) -> ModelConfig:
+    """The configuration of the network that a weights file holds; the default's where the file says nothing of it."""
+    given = _metadata(path).get("model", {})
+    known = {f.name: f for f in fields(ModelConfig)}
+    for name in given:
+        if name not in known:
+            raise InputError(f"{path}: model.{name} is not known, must be one of {', '.join(known)}")
+    config = ModelConfig(**given)
+    for name, value, allowed in (
+        ("fusion", config.fusion, tuple(FUSIONS)),
+        ("exchange", config.exchange, ("rectified", "signed")),
+        ("decoder", config.decoder, ("shallow", "deep")),
+        ("half_extent_m", config.half_extent_m, (102.4, 51.2)),
+    ):
+        if value not in allowed:
+            raise InputError(f"{path}: model.{name} is {value!r}, must be one of {', '.join(map(str, allowed))}")
+    return config
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """What the file says of its making: data, runs, validation."""
+    facts: dict[str, Any] = _metadata(path).get("sortie", {})
+    return facts
+
+
+def _metadata(path: Path) -> dict[str, dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such weights file; `sortie train` makes one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {k: json.loads(v) for k, v in (file.metadata() or {}).items() if k in ("model", "sortie")}
+    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: not a weights file of this project ({error})") from None

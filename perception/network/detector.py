@@ -1,0 +1,354 @@
+"""The detector as a sortie uses it: render when asked, encode once, fuse what was delivered, find the cars.
+
+A capture costs nothing until a job needs it. Features, confidences and single-drone boxes of a capture are
+kept for the latest 64 captures, so a frame that is shared to four peers is rendered and encoded once. Every
+network call has the same shapes whatever else is asked for, so the same capture gives the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sortie.perception import budget
+from sortie.perception.errors import InputError
+from sortie.perception.geometry import CELLS, FULL, in_square
+from sortie.perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
+from sortie.perception.metrics.ap import suppress
+from sortie.perception.network.bev import lift
+from sortie.perception.network.checkpoint import load_weights
+from sortie.perception.network.decode import decode
+from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.fusion.registry import FUSIONS
+from sortie.perception.network.inference import folded
+from sortie.perception.network.memory import keep_freed
+from sortie.perception.network.warp import arriving, rows, support
+from sortie.perception.scene.render import VIEWS_SHAPE, Renderer
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import Bytes
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Perception
+
+WEIGHTS = Path(__file__).parent / "weights"
+SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
+KEPT_CAPTURES = 64
+MAPS, LATE = ("features", "raw"), ("detections", "tracks")
+Disc = tuple[float, float, float]
+Jobs = Sequence[tuple[Capture, Sequence[Share]]]
+R = TypeVar("R")
+
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth", "shipped"]
+
+
+def shipped(fusion: str) -> Path:
+    """The weights that a fusion flies with when the scenario names none; those without parameters of their own take DiscoNet's."""
+    return SHIPPED_WEIGHTS if FUSIONS[fusion].shares != "features" else WEIGHTS / f"{fusion}.safetensors"
+
+
+def ground_truth(
+    scene: SceneModel,
+    t_s: float,
+    centre_xy: tuple[float, float],
+    half_extent: float = FULL.half_extent_m,
+    yaw_rad: float = 0.0,
+) -> Boxes:
+    """The cars at `t_s` whose centres lie in the square about `centre_xy` (ENU, m) that is turned by `yaw_rad`.
+
+    Every such car counts, also one that no drone could see. Scores are 1.
+    """
+    cars = scene.cars_at(t_s)
+    xy = np.stack([cars.x_m, cars.y_m], axis=1)
+    inside = in_square(xy, [(*centre_xy, yaw_rad)], half_extent)[:, 0]
+    cars = cars.where(inside)
+    columns = (
+        xy[inside],
+        np.stack([cars.length_m, cars.width_m], 1),
+        cars.yaw_rad,
+        np.ones(len(cars)),
+    )
+    return Boxes(*(column.astype(np.float32) for column in columns))
+
+
+@dataclass(slots=True)
+class _Encoded:
+    """What is known of one capture, or under way: its features [80, 64, 64], and, when asked for, what it shows alone."""
+
+    features: Future[Tensor]
+    out: Future[Tensor] | None = None
+    """The head's output [7, 128, 128] without peers."""
+    boxes: Future[Boxes] | None = None
+    in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Future[Tensor]] = field(default_factory=dict)
+    """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
+
+
+Known = Mapping[Capture, _Encoded]
+
+
+class TorchDetector:
+    """The network over one scene.
+
+    Args:
+        scene: what there is to see.
+        config: the scenario's `perception` section.
+        seed, replication: the sortie's (sensor noise follows from them).
+        weights: a safetensors file; None takes the one shipped for `perception.fusion`.
+
+    Raises:
+        ValueError: weights that are missing or do not fit, naming file and tensor, or that learned another fusion.
+
+    One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
+    side as torch has threads when the detector is made (`torch.set_num_threads`). Tasks begin in the order in which they
+    are handed in, and what a task waits for is settled, and handed in, before it is. The numbers do not depend on it.
+    """
+
+    def __init__(
+        self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
+    ) -> None:
+        self._scene, self._config = scene, config
+        self._fusion = FUSIONS[config.fusion]
+        path = shipped(config.fusion) if weights is None else weights
+        net = load_weights(path)
+        if self._fusion.shares == "features" and net.config.fusion != config.fusion:
+            raise InputError(
+                f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
+            )
+        if net.config.geometry != FULL:
+            raise InputError(
+                f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
+            )
+        keep_freed()
+        self._net = folded(net)
+        self._renderer = Renderer(scene, seed, replication)
+        self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
+        self._pool = ThreadPoolExecutor(
+            torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)
+        )
+
+    def detect(self, jobs: Jobs) -> list[Boxes]:
+        """Each ego's boxes from its own features and what it was sent, ENU, best first.
+
+        A late share's map lies where its sender was at the capture, both poses being known: what has moved since
+        lags, what stands still fits. Without `motion_compensation` it lies where its sender is now, if that is among
+        the egos. Boxes travel in world coordinates and need none.
+        """
+        return self.begin(jobs)()
+
+    def begin(self, jobs: Jobs) -> Callable[[], list[Boxes]]:
+        """Render what the jobs need and have the rest worked out in the background; the boxes are there when called for."""
+        if self._fusion.shares == "nothing":
+            jobs = [(ego, ()) for ego, _ in jobs]
+        known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
+        shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
+        look = {s.capture for s in shared if s.representation in LATE}
+        look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
+        for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
+            if capture in look:
+                self._look_alone(capture)
+            else:
+                self._head_alone(capture)
+        if self._fusion.shares == "boxes":
+            for share in shared:
+                if share.representation in MAPS:
+                    self._head_in_part(share, known)
+        now = {ego.drone: ego for ego, _ in jobs}
+        # as things stand: what is asked for later stands behind these tasks, and none may wait for it
+        known = {capture: replace(kept) for capture, kept in known.items()}
+        found = [self._task(self._find, ego, shares, now, known) for ego, shares in jobs]
+        return lambda: [f.result() for f in found]
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
+        return ground_truth(self._scene, t_s, ego.position_m[:2], FULL.half_extent_m, ego.true_yaw_rad)
+
+    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+        """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
+        self._encode([capture])
+        return len(self._sendable(self._look_alone(capture).result()).inside(roi))
+
+    def camera_views(self, capture: Capture) -> Bytes:
+        """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
+        views: Bytes = self._renderer.render([capture])[0]
+        return views
+
+    def _task(self, do: Callable[..., R], *what: Any) -> Future[R]:
+        """Have it done by one thread."""
+
+        def task() -> R:
+            with torch.inference_mode():
+                return do(*what)
+
+        return self._pool.submit(task)
+
+    def _encode(self, captures: Iterable[Capture]) -> Known:
+        """Render what is not kept yet, encode it in the background, and drop the oldest beyond the limit."""
+        wanted = list(dict.fromkeys(captures))
+        missing = [c for c in wanted if c not in self._kept]
+        views = np.empty((len(missing), *VIEWS_SHAPE), np.uint8)
+        encoded: dict[Capture, _Encoded] = {}
+
+        def encode(i: int, seen: Future[None]) -> Tensor:
+            seen.result()
+            image = lift(views[i : i + 1], missing[i : i + 1])
+            with self._reckoning():
+                features: Tensor = self._net.encoder(image)[0]
+            return features
+
+        def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
+            """Render, and encode what is rendered while the last views are on their way."""
+            sights = {i: self._task(see, i) for i in over}
+            encoded.update({missing[i]: _Encoded(self._task(encode, i, seen)) for i, seen in sights.items()})
+            try:
+                return [seen.result() for seen in sights.values()]
+            finally:  # the moment's cars leave the scenery when nobody looks any more
+                wait(sights.values())
+
+        self._renderer.render(missing, side_by_side, views)
+        self._kept.update(encoded)
+        for capture in wanted:
+            self._kept.move_to_end(capture)
+        while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
+            self._kept.popitem(last=False)
+        return {capture: self._kept[capture] for capture in wanted}
+
+    def _must_rank(self, share: Share) -> bool:
+        """Whether the sender's own head is needed to say which cells it sent."""
+        if share.representation != "features" or self._config.cells_by != "confidence":
+            return False
+        return _is_ranked(share)
+
+    def _reckoning(self) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16, enabled=self._config.precision == "bfloat16")
+
+    def _head(self, features: Tensor) -> Tensor:
+        """[1, 80, 64, 64] → [7, 128, 128]."""
+        with self._reckoning():
+            out: Tensor = self._net.head(features)[0]
+        return out.float()
+
+    def _head_alone(self, capture: Capture) -> Future[Tensor]:
+        """The head's output without peers, worked out once."""
+        kept = self._kept[capture]
+        if kept.out is None:
+            features = kept.features
+            kept.out = self._task(lambda: self._head(features.result()[None]))
+        return kept.out
+
+    def _look_alone(self, capture: Capture) -> Future[Boxes]:
+        """What the capture shows without peers, worked out once."""
+        kept = self._kept[capture]
+        if kept.boxes is None:
+            out = self._head_alone(capture)
+            kept.boxes = self._task(lambda: self._place(out.result(), capture.est_pose))
+        return kept.boxes
+
+    def _place(self, out: Tensor, pose: Pose) -> Boxes:
+        """The boxes of a head's output [7, 128, 128] in the world, suppressed."""
+        local = decode(out, self._config.score_threshold).numpy()
+        return suppress(Boxes.placed(local, pose), NMS_IOU)
+
+    def _sent(self, share: Share, known: Known) -> Tensor:
+        """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""
+        if share.representation == "raw":
+            return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
+        kept = known[share.capture]
+        if not _is_ranked(share):
+            rank = np.zeros((CELLS, CELLS))
+        elif self._config.cells_by == "norm":
+            rank = kept.features.result().norm(dim=0).numpy()
+        else:
+            assert kept.out is not None  # noqa: S101 (`_must_rank`)
+            rank = F.max_pool2d(kept.out.result()[:1], 2)[0].numpy()
+        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
+
+    def _is_fused(self, share: Share) -> bool:
+        return self._fusion.shares == "features" and share.representation in MAPS
+
+    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
+        """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
+        maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
+        out = self._fuse(ego, maps, now, known) if maps else None
+        if out is not None:
+            own = self._place(out, ego.est_pose)
+        elif (alone := known[ego].boxes) is not None:
+            own = alone.result()
+        else:
+            own = self._place(self._head(known[ego].features.result()[None]), ego.est_pose)
+        late = [self._told(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+        return joined(ego.est_pose, own, out is not None, late, self._config.join)
+
+    def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Tensor | None:
+        """The head's output after fusion; None where no peer has a say in any cell."""
+        # relative to the ego, so that float32 keeps millimetres kilometres from the origin
+        x, y, yaw = ego.est_pose
+        poses = [self._lies(s, now) for s in maps]
+        there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
+        under = support(torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
+        weights, arrived = arriving(under, torch.stack([self._sent(s, known).flatten() for s in maps]))
+        weight = torch.tensor([[s.weight for s in maps]])
+        part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
+        if not bool(part[:, 1:].any()):
+            return None
+        tables = [known[s.capture].features.result().permute(1, 2, 0).reshape(CELLS**2, -1) for s in maps]
+        taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
+
+        def said(at: Tensor) -> Tensor:
+            return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
+
+        fused = self._net.fusion.fuse(known[ego].features.result(), said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+        return self._head(fused)
+
+    def _lies(self, share: Share, now: Mapping[int, Capture]) -> Pose:
+        """The pose that places a share's map in the world."""
+        capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
+        return capture.est_pose
+
+    def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
+        """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
+        if share.representation in MAPS:
+            lies, part = self._lies(share, now), _part(share)
+            out = known[share.capture].in_part[part].result()
+            cut = share.representation != "raw" and _is_ranked(share)
+            said = Told(self._place(out, lies), share.weight, lies, part[1], cut)
+        else:
+            alone = known[share.capture].boxes
+            assert alone is not None  # noqa: S101 (asked for with the job)
+            said = told(share, alone.result())
+        return replace(said, boxes=self._sendable(said.boxes))
+
+    def _sendable(self, boxes: Boxes) -> Boxes:
+        """What of a drone's boxes it sends: in late fusion those that are sure."""
+        return sendable(boxes) if self._fusion.shares == "boxes" else boxes
+
+    def _head_in_part(self, share: Share, known: Known) -> None:
+        """The head's output from what was sent of a map, worked out once for a capture and a budget."""
+        kept = known[share.capture]
+        if _part(share) in kept.in_part:
+            return
+
+        out = kept.out  # as it stands: a task waits for none behind it
+
+        def head() -> Tensor:
+            features, sent = kept.features.result(), self._sent(share, known)
+            if out is not None and bool(sent.all()):
+                return out.result()
+            return self._head((features * sent)[None])
+
+        kept.in_part[_part(share)] = self._task(head)
+
+
+def _part(share: Share) -> tuple[float, Disc | None, tuple[int, ...]]:
+    return (1.0, None, ()) if share.representation == "raw" else (share.rho, share.roi, share.missing)
+
+
+def _is_ranked(share: Share) -> bool:
+    """Whether cells stand in an order: some did not fit the budget, or some did not arrive (the best are sent first)."""
+    return bool(share.missing) or budget.must_choose(share.rho, share.roi, *share.capture.est_pose)

@@ -1,0 +1,63 @@
+"""DiscoNet's fusion (Li et al., NeurIPS 2021), written from its description.
+
+A small edge network gives one logit per agent and cell from the ego's features beside the agent's; a softmax over
+the agents that take part weighs them.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+from torch.nn.utils.fusion import fuse_linear_bn_eval
+
+from sortie.perception.geometry import CHANNELS
+from sortie.perception.network.fusion.base import PerCell, weighted_sum
+
+
+class EdgeWeights(nn.Module):
+    """One logit ≥ 0 per row and agent: per-cell layers 160 → 128 → 32 → 8 → 1, batch norm on the first three."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (2 * CHANNELS, 128, 32, 8)
+        self.layers = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in pairwise(widths))
+        self.norms = nn.ModuleList(nn.BatchNorm1d(b) for b in widths[1:])
+        self.last = nn.Linear(widths[-1], 1)
+
+    def forward(self, said: Tensor) -> Tensor:
+        """[agents, p, 80], the ego first → [agents, p]."""
+        first, norm = self.layers[0], self.norms[0]
+        # the ego's half of the first layer is the same beside every agent
+        ego = F.linear(said[0], first.weight[:, :CHANNELS])  # type: ignore[index]
+        x = F.linear(said, first.weight[:, CHANNELS:], first.bias)  # type: ignore[index,arg-type]
+        x += ego
+        x = F.relu(norm(x.flatten(0, 1)), inplace=True)
+        for layer, norm in zip(list(self.layers)[1:], list(self.norms)[1:], strict=True):
+            x = F.relu(norm(layer(x)), inplace=True)
+        logit: Tensor = F.relu(self.last(x)).view(said.shape[:2])
+        return logit
+
+
+class DiscoNet(PerCell):
+    """Softmax over agents per cell; a link's weight multiplies its softmax weight."""
+
+    name = "disconet"
+    about = "an edge network's softmax over agents, cell by cell (DiscoNet)"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.edge = EdgeWeights()
+
+    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        logit = (self.edge(said) + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf)
+        return weighted_sum(logit.softmax(dim=0), said)
+
+    def fold(self) -> None:
+        edge: Any = self.edge
+        for i, (layer, norm) in enumerate(zip(edge.layers, edge.norms, strict=True)):
+            edge.layers[i] = fuse_linear_bn_eval(layer, norm)
+            edge.norms[i] = nn.Identity()

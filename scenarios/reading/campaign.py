@@ -1,0 +1,205 @@
+"""A campaign file in, a `Study` out: the campaign, its base scenario, and everything varied held against the schema.
+
+What is wrong is told as for scenarios, in one line with the campaign file's own place, before anything is flown.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sortie.scenarios.reading.files import found_beside
+from sortie.scenarios.reading.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
+from sortie.scenarios.reading.nodes import Node, ScenarioError, assign, child, dotted, plain
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.campaign import (
+    Campaign,
+    Choice,
+    Column,
+    Grid,
+    Integers,
+    Linspace,
+    Normal,
+    Spread,
+    Triangular,
+    Uniform,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A campaign as read."""
+
+    campaign: Campaign
+    base: Scenario
+    """With `set` put in, and without its own expectations."""
+    columns: dict[str, tuple[Any, ...]]
+    """By varied field: the values of a file's column."""
+    folder: Path
+    """Where it lies: files that its policies are in are looked for there too."""
+    root: Node
+    """The file's own tree."""
+    drones: int
+    """At most so many in a run."""
+    phases: int
+    """At most so many in a run's mission, whether they begin before its end or not."""
+
+    def where(self, *path: str | int) -> str:
+        """`FILE:LINE: a.b` of a field of the campaign's file; the line of what is above a field that is left out."""
+        node = self.root
+        for part in path:
+            node = child(node, part) or node
+        return f"{node.where}: {dotted(path)}"
+
+
+def load_campaign(path_or_name: str | Path) -> Study:
+    """Read a campaign from a file, or from the library by its bare name.
+
+    Raises:
+        ScenarioError: one line that says which file, line and field, what is wrong and the bound; also of the base.
+    """
+    text, source = read(path_or_name)
+    root = tree(text, source)
+    if isinstance(root.value, dict) and "campaign" not in root.value and "name" in root.value:
+        raise ScenarioError(f"{source}: is a scenario, a campaign begins with `campaign: its_name` and names its base")
+    campaign = validated(root, Campaign)
+    here = Path(source).parent
+    base = _base(campaign.base, here, root)
+    written = child(root, "set") or root
+    sections = base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}
+    resolved = as_node(sections, written.source, written.line)  # what set breaks elsewhere in the base is told there
+    for name, node in _section(root, "set").items():
+        resolved = _put(resolved, name, _relined(node))
+    base = found_beside(validated(resolved, Scenario), here)
+    columns: dict[str, tuple[Any, ...]] = {}
+    varied = _section(root, "vary")
+    for name, spread in campaign.vary.items():
+        if isinstance(spread, Column):
+            columns[name] = _column(spread, here, varied[name])
+    _check_lengths(campaign, columns, varied)
+    sections = base.model_dump(mode="json", exclude_none=True)
+    drones, phases = base.fleet.drones, len(base.mission.phases)
+    for name, spread in campaign.vary.items():
+        at = varied[name]
+        resolved = as_node(sections, at.source, at.line)
+        for value in extremes(spread, columns.get(name, ())):
+            made = validated(_put(resolved, name, as_node(value, at.source, at.line)), Scenario)
+            drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
+    return Study(campaign, base, columns, here, root, drones, phases)
+
+
+def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """A scenario's plain sections with dotted fields changed; not validated.
+
+    Raises:
+        ScenarioError: a path that leads through a plain value or to an entry that is not there.
+    """
+    node = as_node(base)
+    for name, value in values.items():
+        node = assign(node, name.split("."), as_node(value))
+    made = plain(node)
+    assert isinstance(made, dict)  # noqa: S101
+    return made
+
+
+def as_node(value: Any, source: str = "vary", line: int = 0) -> Node:
+    """A plain value as nodes that all say they stand at one place."""
+    if isinstance(value, dict):
+        return Node({key: as_node(v, source, line) for key, v in value.items()}, source, line)
+    if isinstance(value, list | tuple):
+        return Node([as_node(v, source, line) for v in value], source, line)
+    return Node(value, source, line, text=f"{value:g}" if isinstance(value, float) else str(value))
+
+
+def _relined(node: Node) -> Node:
+    return as_node(plain(node), node.source, node.line)
+
+
+def _section(root: Node, name: str) -> dict[str, Node]:
+    node = root.value.get(name) if isinstance(root.value, dict) else None
+    return dict(node.value) if node is not None and isinstance(node.value, dict) else {}
+
+
+def _put(root: Node, name: str, new: Node) -> Node:
+    """`assign`, with a path that leads nowhere told at the line that names it."""
+    try:
+        return assign(root, name.split("."), new)
+    except ScenarioError as error:
+        raise ScenarioError(f"{new.where}{str(error).removeprefix(new.source)}") from None
+
+
+def _base(name: str, here: Path, root: Node) -> Scenario:
+    """From the library, or a file beside the campaign's; what is wrong within it is told at its own line."""
+    at = f"{(child(root, 'base') or root).where}: base: "
+    path = {**library(), **campaigns(), **context_sets()}.get(name, here / name)
+    try:
+        text, source = read(path)
+    except ScenarioError as error:
+        raise ScenarioError(f"{at}{error}") from None
+    top = tree(text, source)
+    for key, what in (("campaign", "a campaign itself"), ("contexts", "a set of contexts")):
+        if child(top, key) is not None and child(top, "name") is None:
+            raise ScenarioError(f"{at}{name}, must be a scenario, it is {what}")
+    return load(path)
+
+
+def extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:
+    """The values that a spread can take, or its ends; of one without ends its middle alone."""
+    if isinstance(spread, Uniform | Triangular | Integers):
+        yield from (spread.low, spread.high)
+    elif isinstance(spread, Linspace):
+        yield from (whole(end) for end in (spread.low, spread.high))
+    elif isinstance(spread, Choice | Grid):
+        yield from spread.values
+    elif isinstance(spread, Column):
+        yield from column
+    elif isinstance(spread, Normal):
+        yield from (end for end in (spread.low, spread.high) if end is not None)
+        if spread.low is None and spread.high is None:
+            yield spread.mean
+    else:
+        yield spread.median
+
+
+def whole(value: float) -> float | int:
+    """A whole number as one, so that it does where the schema asks for one (it does for a number as well)."""
+    return int(value) if value == int(value) else value
+
+
+def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
+    path = here / spread.file
+    at = f"{node.where}: {path}"
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            if spread.column not in (rows.fieldnames or ()):
+                has = ", ".join(rows.fieldnames or ()) or "nothing"
+                raise ScenarioError(f"{at}: no column {spread.column}, it has {has}")
+            values = tuple(_number(row[spread.column] or "") for row in rows)
+    except FileNotFoundError:
+        raise ScenarioError(f"{at}: no such file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(f"{at}: cannot be read, {getattr(error, 'strerror', None) or error}") from None
+    if not values:
+        raise ScenarioError(f"{at}: column {spread.column} has no rows, must have at least one")
+    return values
+
+
+def _number(text: str) -> Any:
+    """A whole number or a number, if it is one as scenarios write them; else the text itself."""
+    value, problem, doubt = read_scalar(text.strip())
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and not (problem or doubt)
+    return value if is_number else text
+
+
+def _check_lengths(campaign: Campaign, columns: dict[str, tuple[Any, ...]], varied: dict[str, Node]) -> None:
+    first: dict[str, str] = {}
+    for name, values in columns.items():
+        spread = campaign.vary[name]
+        assert isinstance(spread, Column)  # noqa: S101
+        other = first.setdefault(spread.file, name)
+        if len(columns[other]) != len(values):
+            raise ScenarioError(f"{varied[name].where}: vary.{name}: {len(values)} rows, must be {len(columns[other])}")

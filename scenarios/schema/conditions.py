@@ -1,0 +1,46 @@
+"""The schema of a set of contexts: one base scenario under many conditions, on which policies are compared.
+
+`sortie.scenarios.reading.load.load_contexts` reads the file; `sortie compare FILE --policies …` flies it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from sortie.scenarios.schema.scenario import Section
+from sortie.scenarios.schema.scenario import _inconsistent as inconsistent
+
+Override = Annotated[str, Field(min_length=3, description="As after `--set`.")]
+
+
+class Context(Section):
+    """One condition."""
+
+    name: str = Field(pattern=r"^[a-z0-9_]+$", max_length=64, description="Short name.")
+    rho: float = Field(gt=0, le=1, description="The budget: what a drone sends over all its links, of full sharing.")
+    metric: Literal["full_scene", "mission"] = Field(
+        "full_scene", description="The AP that counts: everywhere, or in the mission disc."
+    )
+    set: tuple[Override, ...] = Field((), max_length=50, description="What differs from the base scenario.")
+
+
+class Contexts(Section):
+    """A set of contexts, compared as a whole."""
+
+    description: str = Field("", max_length=2000, description="One paragraph for people.")
+    base: str = Field(min_length=1, description="A library scenario's name, or a file.")
+    set: tuple[Override, ...] = Field((), max_length=50, description="What holds in every context.")
+    seeds: tuple[Annotated[int, Field(ge=0, lt=2**63)], ...] = Field(
+        (1,), min_length=1, max_length=100, description="Each context is flown once with each."
+    )
+    contexts: tuple[Context, ...] = Field(min_length=1, max_length=1000, description="The contexts.")
+
+    @model_validator(mode="after")
+    def _named_once(self) -> Contexts:
+        names = [c.name for c in self.contexts]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise inconsistent(("contexts", i, "name"), repr(name), "named once")
+        return self

@@ -1,0 +1,183 @@
+"""What age costs, and what moving late features by the known ego motion gives back: `python tests/validation/fusion_age.py`.
+
+Five drones fly straight at a given speed. Each ego has its own features of now and its peers' of `age` ago, all cells;
+they are placed by the pose that the peer had then (compensated), or by the one it has now, as if they were fresh
+(ignored). What has driven on in the meantime lags either way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sortie.perception.benchmark.dataset import Benchmark
+from sortie.perception.benchmark.difficulty import Split
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene
+from sortie.perception.metrics.ap import Matched, match, suppress
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.perception.network.bev import lift
+from sortie.perception.network.decode import decode
+from sortie.perception.network.detector import ground_truth
+from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.inference import folded
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import warp
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Boxes, Capture
+
+AGES_S = (0.0, 0.1, 0.2, 0.5, 1.0)
+SPEED_MPS = 10.0
+SCORE_THRESHOLD, NMS_IOU = 0.1, 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class AgeRow:
+    """AP@0.5 of five egos with peers' features of one age; intervals are paired, by whole scenes."""
+
+    age_s: float
+    gain: Difference
+    """Age ignored (a) and compensated (b)."""
+    lost: Difference
+    """Fresh (a) and compensated (b)."""
+    over_single: Difference
+    """A drone alone (a) and compensated (b)."""
+
+
+def earlier(capture: Capture, age_s: float, speed_mps: float = SPEED_MPS) -> Capture:
+    """Where the drone was `age_s` before, had it flown straight ahead; the error of its estimate is the same."""
+    back = age_s * speed_mps
+    dx, dy = back * np.cos(capture.true_yaw_rad), back * np.sin(capture.true_yaw_rad)
+
+    def moved(xyz: tuple[float, float, float]) -> tuple[float, float, float]:
+        return float(xyz[0] - dx), float(xyz[1] - dy), xyz[2]
+
+    return capture._replace(
+        t_s=capture.t_s - age_s, position_m=moved(capture.position_m), est_position_m=moved(capture.est_position_m)
+    )
+
+
+def measure(
+    net: CarNet,
+    *,
+    bench: Benchmark = Benchmark(),  # noqa: B008 (frozen)
+    split: Split = "test",
+    scenes: int = 12,
+    frames: int = 4,
+    ages_s: Sequence[float] = AGES_S,
+    speed_mps: float = SPEED_MPS,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[AgeRow]:
+    """One row an age, from `scenes` × `frames` fleet-frames rendered now and at every age.
+
+    Raises:
+        ValueError: an age below 0, or ages that do not begin with 0.
+    """
+    if not len(ages_s) or ages_s[0] != 0.0 or min(ages_s) < 0.0:
+        raise ValueError(f"ages_s is {tuple(ages_s)}, must begin with 0 and hold no negative age")
+    net = folded(net)
+    units: dict[tuple[str, float], list[Matched]] = {}
+    scene_of: list[int] = []
+    for index in range(scenes):
+        # a margin for where the fleet comes from
+        reach = AREA_M + speed_mps * max(ages_s)
+        scene = SceneModel(draw_scene(bench.seed, split, index, bench.difficulty), None, (-reach, -reach, reach, reach))
+        renderer = Renderer(scene, bench.seed)
+        for frame in range(frames):
+            fleet = draw_captures(bench.seed, split, index, frame, bench.difficulty)
+            for key, boxes in _frame(net, renderer, fleet, ages_s, speed_mps).items():
+                truths = (ground_truth(scene, e.t_s, e.position_m[:2], net.config.half_extent_m, e.true_yaw_rad) for e in fleet)  # fmt: skip
+                units.setdefault(key, []).extend(match(b, t) for b, t in zip(boxes, truths, strict=True))
+            scene_of += [index] * DRONES
+            if progress is not None:
+                progress(index * frames + frame + 1, scenes * frames)
+    fresh, single = units["compensated", 0.0], units["single", 0.0]
+    return [
+        AgeRow(
+            age,
+            compare(units["ignored", age], units["compensated", age], scene_of),
+            compare(fresh, units["compensated", age], scene_of),
+            compare(single, units["compensated", age], scene_of),
+        )
+        for age in ages_s
+    ]
+
+
+@torch.inference_mode()
+def _frame(
+    net: CarNet, renderer: Renderer, fleet: Sequence[Capture], ages_s: Sequence[float], speed_mps: float
+) -> dict[tuple[str, float], list[Boxes]]:
+    """Boxes of every ego alone and, for each age, with its peers' features placed in the two ways."""
+    geometry = net.config.geometry
+    middle = np.mean([c.est_pose[:2] for c in fleet], axis=0)
+
+    def poses(captures: Sequence[Capture]) -> torch.Tensor:
+        return torch.from_numpy(np.array([c.est_pose for c in captures]) - [*middle, 0.0]).float()
+
+    def boxes(fused: torch.Tensor, ego: int) -> Boxes:
+        local = decode(net.head(fused)[0], SCORE_THRESHOLD, geometry).numpy()
+        return suppress(Boxes.placed(local, fleet[ego].est_pose), NMS_IOU)
+
+    now, own = poses(fleet), torch.empty(0)
+    everywhere = torch.ones(DRONES - 1, 1, 64, 64, dtype=torch.bool)
+    ones = torch.ones(1, DRONES - 1)
+    out: dict[tuple[str, float], list[Boxes]] = {}
+    for age in ages_s:
+        then = [earlier(c, age, speed_mps) for c in fleet]
+        features = net.encoder(lift(renderer.render(then), then, geometry))
+        if age == 0.0:
+            own = features
+            out["single", age] = [boxes(own[ego : ego + 1], ego) for ego in range(DRONES)]
+        for how, there in (("compensated", poses(then)), ("ignored", now)):
+            if how == "ignored" and age == 0.0:
+                out[how, age] = out["compensated", age]
+                continue
+            found = []
+            for ego in range(DRONES):
+                peers = [i for i in range(DRONES) if i != ego]
+                moved, sent, inside = warp(features[peers], everywhere, now[ego], there[peers], geometry.cell_m)
+                part = takes_part(sent[None, :, 0], inside[None, :, 0], ones, "masked")
+                agents = torch.cat([own[ego : ego + 1], moved])[None]
+                found.append(boxes(net.fusion(agents, part, F.pad(ones, (1, 0), value=1.0)), ego))
+            out[how, age] = found
+    return out
+
+
+def table(rows: Sequence[AgeRow]) -> str:
+    """Markdown."""
+
+    def sure(d: Difference) -> str:
+        return f"{d.delta:+.3f} [{d.low:+.3f}, {d.high:+.3f}]"
+
+    lines = [
+        "| age | age ignored | compensated | gain of compensation | compensated − fresh | compensated − single |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {r.age_s:g} s | {r.gain.ap_a:.3f} | {r.gain.ap_b:.3f} | {sure(r.gain)} | {sure(r.lost)} | {sure(r.over_single)} |"
+        for r in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    import argparse
+    import sys
+
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("weights", type=Path, nargs="?", default=SHIPPED_WEIGHTS)
+    parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--speed-mps", type=float, default=SPEED_MPS)
+    args = parser.parse_args()
+    sys.stdout.write(
+        table(measure(load_weights(args.weights), scenes=args.scenes, frames=args.frames, speed_mps=args.speed_mps))
+    )
