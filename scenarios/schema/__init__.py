@@ -4,51 +4,31 @@ The fields' descriptions are the reference (`sortie list schema` exports them as
 Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward, y left, z up).
 """
 
-from sortie.scenarios.schema.scenario import (
-    MIN_TILE_BYTES,
-    Airframe,
-    Battery,
+from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, Soc
+from sortie.scenarios.schema.context import Context
+from sortie.scenarios.schema.events import (
+    BaseEvent,
     BatteryFault,
-    Bursts,
     CellFailure,
     ClockSkew,
-    Context,
-    DecisionExpectation,
-    DroneId,
     DroneLost,
-    DroneOverride,
     Event,
-    Expectation,
-    Fleet,
-    Formation,
     Jam,
     Lie,
     LinkDrop,
-    Mission,
-    Motion,
-    Perception,
-    Phase,
-    PhaseName,
-    PointM,
-    Policy,
-    PolicyChange,
-    PolicyCommand,
-    Radio,
-    Region,
-    Route,
-    Scenario,
-    Scene,
-    Section,
-    Soc,
     Spoof,
-    Target,
-    Viewpoints,
-    ViewReplay,
-    json_schema,
 )
+from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
+from sortie.scenarios.schema.fleet import Airframe, Battery, DroneOverride, Fleet, Formation, Motion, Route, Viewpoints
+from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
+from sortie.scenarios.schema.perception import Perception, Scene
+from sortie.scenarios.schema.policy import Policy, PolicyChange, PolicyCommand, ViewReplay
+from sortie.scenarios.schema.radio import MIN_TILE_BYTES, Bursts, Radio
+from sortie.scenarios.schema.scenario import Scenario, json_schema
 
 __all__ = [
     "Airframe",
+    "BaseEvent",
     "Battery",
     "BatteryFault",
     "Bursts",

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue, model_validator
 
-from sortie.scenarios.schema.scenario import Section
-from sortie.scenarios.schema.scenario import _inconsistent as inconsistent
+from sortie.scenarios.schema.base import Section, inconsistent
 
 # --- how a field is spread ------------------------------------------------------------------------
 

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.scenario import Section
-from sortie.scenarios.schema.scenario import _inconsistent as inconsistent
+from sortie.scenarios.schema.base import Section, inconsistent
 
 Override = Annotated[str, Field(min_length=3, description="As after `--set`.")]
 

@@ -1,0 +1,38 @@
+"""`context`: rate, staleness and form of the descriptors."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from sortie.scenarios.schema.base import Section
+
+
+class Context(Section):
+    rate_hz: float = Field(
+        10.0,
+        gt=0,
+        le=10,
+        description="Descriptors a second and drone, at most 10 (the plane's bound); also the frame rate.",
+    )
+    degraded_after_periods: float = Field(
+        3.0, gt=0, le=100, description="A descriptor older than this marks the link degraded."
+    )
+    detached_after_periods: float = Field(
+        10.0, gt=0, le=1000, description="A descriptor older than this marks the peer detached."
+    )
+    authentication: bool = Field(True, description="HMAC-SHA256 and a replay counter on every descriptor (28 B).")
+    publish_every: int = Field(
+        1, ge=1, le=100, description="A descriptor every so many frames; ages count in periods of that length."
+    )
+    grid_cells: Literal[0, 4, 8, 16] = Field(16, description="Coverage cells a side on the air; 0 leaves the grid out.")
+    grid_bits: Literal[1, 2] = Field(2, description="Bits of a coverage cell on the air; 1 is seen well or not.")
+    number_bits: Literal[8, 10, 12, 16, 24, 32] = Field(
+        32,
+        description="Bits of a descriptor's number on the air: fixed point over its field's range, or 32-bit floats.",
+    )
+    trust: bool = Field(
+        True,
+        description="Drones hold each other's claims against poses, arrivals and the fleet, and discount whom they doubt.",
+    )

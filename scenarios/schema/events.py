@@ -1,0 +1,78 @@
+"""`events`: what goes wrong, and when."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from sortie.scenarios.schema.base import DroneId, Section
+
+
+class BaseEvent(Section):
+    at_s: float = Field(ge=0, description="When it begins.")
+
+
+class LinkDrop(BaseEvent):
+    kind: Literal["link_drop"]
+    drone: DroneId = Field(description="Whose links fade.")
+    peer: DroneId | None = Field(None, description="The other end; left out, every link of the drone.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    loss_db: float = Field(30.0, gt=0, le=200, description="Extra loss, both directions.")
+
+
+class Jam(BaseEvent):
+    kind: Literal["jam"]
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    position_m: tuple[float, float, float] = Field(description="The jammer, ENU (x, y, z).")
+    power_dbm: float = Field(20.0, ge=-50, le=60, description="Its power in the channel.")
+
+
+class DroneLost(BaseEvent):
+    kind: Literal["drone_lost"]
+    drone: DroneId = Field(description="Who falls silent and leaves.")
+
+
+class BatteryFault(BaseEvent):
+    kind: Literal["battery_fault"]
+    drone: DroneId = Field(description="Whose battery fails.")
+    lost_fraction: float = Field(gt=0, le=1, description="Fraction of the remaining energy that is gone at once.")
+
+
+class CellFailure(BaseEvent):
+    kind: Literal["cell_failure"]
+    drone: DroneId = Field(description="Whose pack loses a cell: its voltage and its energy are gone.")
+
+
+class ClockSkew(BaseEvent):
+    kind: Literal["clock_skew"]
+    drone: DroneId = Field(description="Whose clock is off.")
+    skew_s: float = Field(
+        ge=-3600, le=3600, description="Added to its stamps; negative makes its descriptors look old."
+    )
+
+
+class Spoof(BaseEvent):
+    kind: Literal["spoof"]
+    drone: DroneId = Field(description="Whose descriptors are imitated.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    attack: Literal["forged", "replayed", "malformed", "oversized"] = Field(
+        "forged", description="What is put on the air."
+    )
+    rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
+
+
+class Lie(BaseEvent):
+    kind: Literal["lie"]
+    drone: DroneId = Field(description="Who lies, in its own descriptors.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    about: Literal["coverage", "goodput", "battery"] = Field("coverage", description="What is false.")
+    claim: Literal["much", "little"] = Field(
+        "much",
+        description="All cells new, 500 Mb/s to everyone, a full battery; or nothing seen, 0.1 Mb/s, an empty one.",
+    )
+
+
+Event = Annotated[
+    LinkDrop | Jam | DroneLost | BatteryFault | CellFailure | ClockSkew | Spoof | Lie, Field(discriminator="kind")
+]

@@ -1,0 +1,180 @@
+"""`fleet`: drones, formation, route, motion, airframe and battery."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from sortie.scenarios.schema.base import DroneId, PointM, Section, Soc, inconsistent
+
+
+class Formation(Section):
+    shape: Literal["cross", "line", "wedge", "grid", "circle"] = Field(
+        "cross", description="Slots around the moving reference point."
+    )
+    spacing_m: float = Field(
+        20.0, gt=0, le=500, description="Distance between neighbouring slots (arc length for circle)."
+    )
+    altitude_m: float = Field(60.0, ge=10, le=400, description="Height of the formation above the ground.")
+
+
+class Route(Section):
+    waypoints_m: tuple[PointM, ...] = Field(
+        ((0.0, 0.0),),
+        min_length=1,
+        max_length=1000,
+        description="Ground track of the reference point, ENU (x, y); one point hovers.",
+    )
+    speed_mps: float = Field(5.0, gt=0, le=30, description="Ground speed along the route.")
+    turn_time_s: float = Field(4.0, gt=0, le=60, description="Time over which a corner is rounded.")
+
+
+class Motion(Section):
+    wind_mps: tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]] = Field(
+        (2.0, 1.0), description="Mean wind, the velocity of the air, ENU (x, y)."
+    )
+    gust_sigma_mps: float = Field(0.8, ge=0, le=15, description="Standard deviation of each gust component.")
+    gust_time_s: float = Field(3.0, gt=0, le=120, description="Correlation time of gusts.")
+    pose_jitter_m: float = Field(
+        0.4, ge=0, le=20, description="Standard deviation of each drone's true offset from its slot, per axis."
+    )
+    pose_jitter_time_s: float = Field(2.5, gt=0, le=120, description="Correlation time of the offset.")
+    pose_error_m: float = Field(
+        0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis."
+    )
+    heading_error_deg: float = Field(
+        0.2,
+        ge=0,
+        le=45,
+        description="Standard deviation of the heading estimate's error; 0.2° is a dual-antenna receiver, a magnetometer has degrees.",
+    )
+
+
+class Viewpoints(Section):
+    """How far the formation gives way to a policy that chooses viewpoints; the others are asked nothing."""
+
+    reach_m: float = Field(
+        40.0, ge=0, le=50, description="How far from its slot a drone may stand when its policy asks; 0: nowhere else."
+    )
+    speed_mps: float = Field(3.0, gt=0, le=15, description="Fastest that it moves within the formation.")
+    acceleration_mps2: float = Field(1.0, gt=0, le=5, description="Most that it accelerates for it.")
+    separation_m: float = Field(
+        10.0, gt=0, le=500, description="No two drones closer than this, unless their slots are."
+    )
+    fence_m: tuple[float, float, float, float] | None = Field(
+        None, description="Geofence that every drone keeps within, ENU (x_min, y_min, x_max, y_max); left out, none."
+    )
+
+    @model_validator(mode="after")
+    def _fence_holds_something(self) -> Viewpoints:
+        if self.fence_m is not None:
+            x_min, y_min, x_max, y_max = self.fence_m
+            if not (x_min < x_max and y_min < y_max):
+                raise inconsistent(("fence_m",), f"{self.fence_m}", "x_min < x_max and y_min < y_max")
+        return self
+
+
+class Airframe(Section):
+    mass_kg: float = Field(2.04, gt=0, le=100, description="All-up mass without payload, battery included.")
+    payload_kg: float = Field(0.0, ge=0, le=100, description="What is carried besides.")
+    disc_area_m2: float = Field(0.503, gt=0, le=50, description="Area that all rotors sweep.")
+    figure_of_merit: float = Field(
+        0.478,
+        ge=0.1,
+        le=0.9,
+        description="Ideal over true power at the rotors in hover; real small propellers 0.5 to 0.7.",
+    )
+    tip_speed_mps: float = Field(120.0, ge=10, le=300, description="Speed of the blades' tips in hover, no payload.")
+    drag_area_m2: float = Field(0.01509, ge=0, le=5, description="Drag over dynamic pressure.")
+    air_density_kgpm3: float = Field(1.225, ge=0.3, le=1.5, description="1.225 at sea level, 1.11 at 1,000 m.")
+    power_model: Literal["level", "momentum"] = Field(
+        "level",
+        description="level: the formula for level flight, and m·g·v_z while climbing; momentum: momentum theory with climb's inflow, vertical gusts and acceleration.",
+    )
+
+
+class Battery(Section):
+    capacity_wh: float = Field(130.0, gt=0, le=5000, description="Energy of a full pack at rest (open circuit).")
+    cells: int = Field(4, ge=1, le=24, description="LiPo cells in series.")
+    initial_soc: Soc = Field(0.95, description="State of charge at take-off.")
+    cell_resistance_mohm: float = Field(
+        13.0, ge=0, le=500, description="Internal resistance of one cell with its wiring."
+    )
+    drivetrain_efficiency: float = Field(0.8, gt=0, le=1, description="Rotor power over electric power.")
+    avionics_w: float = Field(8.0, ge=0, le=500, description="Flight controller, sensors, cameras.")
+    compute_idle_w: float = Field(10.0, ge=0, le=200, description="Companion computer at rest.")
+    compute_active_w: float = Field(
+        40.0,
+        ge=0,
+        le=200,
+        description="Companion computer while it runs perception, the whole draw.",
+    )
+    radio_idle_w: float = Field(2.0, ge=0, le=50, description="Radio while it listens.")
+    radio_tx_w: float = Field(6.0, ge=0, le=50, description="Radio while it sends, the whole draw.")
+    landing_soc: float = Field(0.1, ge=0, lt=1, description="The drone lands when its charge reaches this.")
+    cutoff_cell_v: float = Field(
+        0.0, ge=0, le=4.2, description="It also lands when a cell's mean voltage under load falls below this; 0: never."
+    )
+    polarisation_mohm: float = Field(
+        0.0, ge=0, le=500, description="Resistance of one cell that builds up over polarisation_time_s under load."
+    )
+    polarisation_time_s: float = Field(20.0, gt=0, le=3600, description="Time constant of polarisation.")
+    ambient_c: float | None = Field(
+        None,
+        ge=-40,
+        le=60,
+        description="Temperature of the air, and of the pack at take-off; left out, packs stay at 25 °C.",
+    )
+    cycles: float = Field(0.0, ge=0, le=10000, description="Full cycles behind the pack, which age it.")
+    life_cycles: float = Field(
+        300.0, gt=0, le=10000, description="Cycles to a pack's end of life: 80 % of its capacity, twice its resistance."
+    )
+
+    @model_validator(mode="after")
+    def _still_a_pack(self) -> Battery:
+        if self.cycles > 2 * self.life_cycles:
+            bound = f"at most twice life_cycles = {self.life_cycles:g}"
+            raise inconsistent(("cycles",), f"{self.cycles:g}", bound)
+        return self
+
+
+class DroneOverride(Section):
+    drone: DroneId = Field(description="Whose battery or load differs.")
+    initial_soc: Soc | None = Field(None, description="As fleet.battery.initial_soc.")
+    capacity_wh: float | None = Field(None, gt=0, le=5000, description="As fleet.battery.capacity_wh.")
+    cell_resistance_mohm: float | None = Field(None, ge=0, le=500, description="As fleet.battery.cell_resistance_mohm.")
+    cycles: float | None = Field(None, ge=0, le=10000, description="As fleet.battery.cycles.")
+    payload_kg: float | None = Field(None, ge=0, le=100, description="As fleet.airframe.payload_kg.")
+
+
+class Fleet(Section):
+    drones: int = Field(5, ge=1, le=200, description="Number of drones; ids are 0 … drones − 1.")
+    formation: Formation = Formation()
+    route: Route = Route()
+    motion: Motion = Motion()
+    viewpoints: Viewpoints = Viewpoints()
+    airframe: Airframe = Airframe()
+    battery: Battery = Battery()
+    overrides: tuple[DroneOverride, ...] = Field(
+        (), description="Drones whose battery or payload differs from the fleet's."
+    )
+    trace: str | None = Field(
+        None,
+        description="CSV or Parquet (fleet/traces.py): drones named in it take pose or battery from it, not from the models.",
+    )
+
+    @model_validator(mode="after")
+    def _overrides_fit(self) -> Fleet:
+        seen: set[int] = set()
+        for i, override in enumerate(self.overrides):
+            at = ("overrides", i, "drone")
+            if override.drone >= self.drones:
+                raise inconsistent(at, f"{override.drone}", f"below fleet.drones = {self.drones}")
+            if override.drone in seen:
+                raise inconsistent(at, f"{override.drone}", "named once, it has an override above")
+            seen.add(override.drone)
+            if override.cycles is not None and override.cycles > 2 * self.battery.life_cycles:
+                bound = f"at most twice fleet.battery.life_cycles = {self.battery.life_cycles:g}"
+                raise inconsistent(("overrides", i, "cycles"), f"{override.cycles:g}", bound)
+        return self

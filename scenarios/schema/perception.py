@@ -1,0 +1,89 @@
+"""`perception`: the scene, the detector, fusion and scoring."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from sortie.scenarios.schema.base import Section, inconsistent
+
+
+class Scene(Section):
+    seed: int = Field(7, ge=0, description="Layout of the town; separate from the sortie's seed.")
+    style: Literal["town", "old_town", "suburb", "yard"] = Field(
+        "town",
+        description="Lots and houses: a town's, a dense old town's, a suburb's with gardens, a works yard's halls.",
+    )
+    block_m: float = Field(80.0, ge=40, le=400, description="Distance between parallel roads.")
+    building_density: float = Field(0.6, ge=0, le=1, description="Fraction of building lots that are built on.")
+    building_height_m: float = Field(10.0, ge=3, le=25, description="Mean height of buildings.")
+    tree_density: float = Field(0.5, ge=0, le=1, description="Fraction of tree spots along roads that hold a tree.")
+    parked_density: float = Field(0.35, ge=0, le=1, description="Fraction of kerb spots with a parked car.")
+    moving_cars_per_km: float = Field(10.0, ge=0, le=100, description="Moving cars per kilometre of lane.")
+    moving_speed_mps: float = Field(8.0, gt=0, le=40, description="Mean speed of moving cars.")
+    sun_azimuth_deg: float = Field(212.5, ge=0, le=360, description="Where the sun stands, from east towards north.")
+    sun_elevation_deg: float = Field(56.9, ge=20, le=90, description="How high it stands; low suns cast long shadows.")
+    overcast: float = Field(0.0, ge=0, le=1, description="Cloud: 0 casts dark shadows, 1 casts none.")
+    brightness: float = Field(1.0, ge=0.1, le=1.5, description="Exposure: a factor on every image.")
+
+
+class Perception(Section):
+    detector: Literal["torch", "surrogate", "recorded", "none"] = Field(
+        "torch",
+        description="The detector: the network, its fast surrogate, a recording of another model, or none: the traffic alone.",
+    )
+    fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "where2comm"] = Field(
+        "disconet",
+        description="How what peers sent is fused; weights belong to a fusion, none and late take any; the surrogate takes its calibration's, or none.",
+    )
+    weights: str | None = Field(
+        None,
+        description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one.",
+    )
+    recording: str | None = Field(
+        None, description="What the recorded detector saw: an npz file or a Zarr folder (perception/outside)."
+    )
+    recorded_fusion: str | None = Field(
+        None,
+        description="path/to/file.py:function that fuses recorded features; left out, boxes arrive where their cells were sent.",
+    )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32",
+        description="What the torch detector's encoder and head reckon in; bfloat16 may be faster on processors with AMX, is as fast on those with AVX-512 BF16 alone, and far slower on others.",
+    )
+    sample_rate_hz: float = Field(
+        2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
+    )
+    compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
+    fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
+    max_age_s: float = Field(
+        0.5,
+        gt=0,
+        le=60,
+        description="Received payloads older than this are not fused; a drone that rested longer sees nothing.",
+    )
+    motion_compensation: bool = Field(
+        True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
+    )
+    join: Literal["nms", "average"] = Field(
+        "nms",
+        description="How boxes of several drones become one list: the best of those that overlap, or their weighted mean.",
+    )
+    score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
+    cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
+    unsent_cells: Literal["masked", "zero"] = Field(
+        "masked",
+        description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
+    )
+    scene: Scene = Scene()
+
+    @model_validator(mode="after")
+    def _recording_where_recorded(self) -> Perception:
+        recorded = self.detector == "recorded"
+        if recorded and self.recording is None:
+            raise inconsistent(("recording",), "missing", "given where detector is recorded")
+        for name in ("recording", "recorded_fusion"):
+            if not recorded and getattr(self, name) is not None:
+                raise inconsistent((name,), f"{getattr(self, name)!r}", f"left out where detector is {self.detector}")
+        return self
