@@ -26,9 +26,9 @@ from pettingzoo import ParallelEnv
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
-from sortie.sim.outcome import matched
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import VERSION, run_sortie
+from sortie.sim.engine.sortie import VERSION, run_sortie
+from sortie.sim.results.outcome import matched
+from sortie.sim.results.record import SortieRecord
 
 RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)
 BUDGETS = (0.02, 0.1, 0.25, 1.0)

@@ -12,7 +12,7 @@ from sortie.perception.recordings.exchange import moved
 from sortie.perception.recordings.writing import write_recording
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.world import route_bounds
+from sortie.sim.engine.world import route_bounds
 
 REACH_M = 45.0
 

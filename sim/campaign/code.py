@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from sortie.sim.sortie import VERSION
+from sortie.sim.engine.sortie import VERSION
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 ROOMS = ("scenarios", "radio", "policies", "perception", "fleet", "sim")
@@ -16,8 +16,8 @@ SUFFIXES = (".py", ".json", ".safetensors")
 """Sources, and what is learned and shipped beside them."""
 LIBRARIES = ("numpy", "scipy", "simpy", "networkx", "numba", "torch")
 LOOKS = (
-    "sim/cli/*", "sim/playback/*", "sim/tables.py", "sim/pytest_plugin.py", "sim/console.py",
-    "sim/expect.py", "sim/golden.py", "sim/compare.py", "sim/paper.py", "sim/campaign/*.py", "perception/study/*",
+    "sim/cli/*", "sim/playback/*", "sim/cli/tables.py", "sim/check/plugin.py", "sim/cli/console.py",
+    "sim/check/expectations.py", "sim/check/golden.py", "sim/studies/compare.py", "sim/studies/paper.py", "sim/campaign/*.py", "perception/study/*",
     "scenarios/library/*", "scenarios/schema.json",
 )  # fmt: skip
 """Only look at runs, drive them, or reach them in their tasks: a change there leaves results as they are."""

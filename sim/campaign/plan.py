@@ -30,11 +30,11 @@ from sortie.scenarios.traces import located
 from sortie.sim.campaign.code import code_version, file_digest
 from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
 from sortie.sim.campaign.work import task_key
+from sortie.sim.engine.pilot import named
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.named import policy_overrides
-from sortie.sim.outcome_fields import check_number, open_keys
-from sortie.sim.pilot import named
-from sortie.sim.sortie import run_sortie
+from sortie.sim.policy_text import policy_overrides
+from sortie.sim.results.outcome_fields import check_number, open_keys
 
 FORMAT = 1
 

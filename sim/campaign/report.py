@@ -9,12 +9,12 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from sortie.sim.campaign.contexts import contexts, rule, winner
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
 from sortie.sim.campaign.rows import Rows, figure, figures, is_accuracy, judged, read_rows
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.statistics import Estimate, Floats, estimate, paired
+from sortie.sim.campaign.winners import contexts, rule, winner
 from sortie.sim.folders import RunError, write_text
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"

@@ -20,11 +20,11 @@ from pydantic import ValidationError
 from sortie.perception.network.memory import keep_freed
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.code import code_version, file_digest
-from sortie.sim.expect import metric
+from sortie.sim.check.expectations import metric
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 Task = tuple[int, str]
 """A run's number and its task."""

@@ -22,7 +22,6 @@ from sortie.sim.cli import (
     campaign,
     check,
     compare,
-    contexts,
     export,
     fly,
     import_log,
@@ -36,9 +35,12 @@ from sortie.sim.cli import (
     verify,
     view,
 )
-from sortie.sim.console import err, out
+from sortie.sim.cli import (
+    conditions as contexts,
+)
+from sortie.sim.cli.console import err, out
+from sortie.sim.engine.sortie import VERSION
 from sortie.sim.folders import RunError
-from sortie.sim.sortie import VERSION
 
 
 class _Commands(TyperGroup):
@@ -65,7 +67,7 @@ app.add_typer(campaign.app, name="campaign")
 app.add_typer(study.study, name="study")
 COMMANDS: dict[str, Callable[..., None]] = {
     "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_,
-    "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": contexts.learn,
+    "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,
     "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
     "import": import_log.import_log, "live": live.live,
 }  # fmt: skip

@@ -13,7 +13,7 @@ from rich.table import Table
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.manifest import complaints, read
 from sortie.perception.geometry import Geometry
-from sortie.sim.console import err, out, stages, user_errors
+from sortie.sim.cli.console import err, out, stages, user_errors
 
 app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
 

@@ -12,10 +12,10 @@ from rich.table import Table
 
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load, load_contexts
-from sortie.sim.console import out, stages, user_errors
+from sortie.sim.cli.console import out, stages, user_errors
+from sortie.sim.cli.tables import points
 from sortie.sim.folders import ensure_files
-from sortie.sim.in_flight import REGIONS, Level, flights, means
-from sortie.sim.tables import points
+from sortie.sim.studies.in_flight import REGIONS, Level, flights, means
 
 if TYPE_CHECKING:
     from sortie.perception.surrogate.judge import Verdict

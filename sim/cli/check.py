@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from sortie.scenarios.reading.load import library, load
-from sortie.sim import tables
+from sortie.sim.cli import tables
+from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import SetOption
-from sortie.sim.console import bars, err, out
 
 
 def check(
@@ -20,7 +20,7 @@ def check(
     ] = False,
 ) -> None:
     """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
-    from sortie.sim.checking import check_scenario, flights
+    from sortie.sim.check.checking import check_scenario, flights
 
     names = list(library()) if scenarios == ["all"] else scenarios
     loaded = [(name, load(name, set_ or [])) for name in names]  # all of them, before the first one flies

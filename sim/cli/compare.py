@@ -13,12 +13,12 @@ from sortie.policies.registry import POLICIES
 from sortie.policies.registry import own_fusion as own_fusion_of
 from sortie.scenarios.reading.load import load_contexts
 from sortie.scenarios.schema import Scenario
-from sortie.sim import tables
-from sortie.sim.cli.contexts import compare_contexts, refuse
+from sortie.sim.cli import tables
+from sortie.sim.cli.conditions import compare_contexts, refuse
+from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
-from sortie.sim.compare import compare as compare_policies
-from sortie.sim.console import bars, out
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+from sortie.sim.studies.compare import compare as compare_policies
 
 
 def compare(

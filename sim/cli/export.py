@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from sortie.sim import rundir
-from sortie.sim.console import out
+from sortie.sim.cli.console import out
 from sortie.sim.folders import RunError, ensure_folder
+from sortie.sim.results import run_folder
 
 BAG, TLOG = "bag", "sortie.tlog"
 BEGIN = "2026-01-01T00:00:00"
@@ -47,19 +47,19 @@ def export(
     first, end = (1970, 2038) if mcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
     if tlog:
-        from sortie.sim.telemetry import ORIGIN, parse_origin, read_key, save_tlog
+        from sortie.sim.export.telemetry import ORIGIN, parse_origin, read_key, save_tlog
 
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
         where = ORIGIN if origin is None else parse_origin(origin)
-        frames = save_tlog(rundir.load(run), path, began_us, where, secret)
+        frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
         return
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
     ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap"})
-    record = rundir.load(run)
+    record = run_folder.load(run)
     try:
-        from sortie.sim.bag import write_bag
+        from sortie.sim.export.bag import write_bag
 
         counts = write_bag(record, path, began_us * 1000)
     except ImportError as error:

@@ -10,14 +10,15 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from sortie.sim import rundir, tables
+from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
+from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
-from sortie.sim.console import bars, out
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
-from sortie.sim.sortie import run_sortie
-from sortie.sim.watchers import Watcher, Watchers
+from sortie.sim.results import run_folder
 
 
 def fly(
@@ -56,8 +57,8 @@ def fly(
         flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
-    path = out_dir or rundir.default_path(flown, seed, number)
-    rundir.ensure_writable(path)
+    path = out_dir or run_folder.default_path(flown, seed, number)
+    run_folder.ensure_writable(path)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         record = run_sortie(flown, None, seed, replication=number, progress=ticker, observer=watchers or None)
@@ -65,10 +66,10 @@ def fly(
     def save_recording(folder: Path) -> None:
         from sortie.sim.playback.recording import save_rrd
 
-        save_rrd(record, folder / rundir.RECORDING)
+        save_rrd(record, folder / run_folder.RECORDING)
 
-    instead = rundir.in_place_of(path, record.fingerprint)
-    result = rundir.save(record, path, save_recording if recording else None)
+    instead = run_folder.in_place_of(path, record.fingerprint)
+    result = run_folder.save(record, path, save_recording if recording else None)
     out.print(tables.outcome_table(result))
     out.print(tables.transitions_table(result))
     report(result)
@@ -91,7 +92,7 @@ def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) ->
 
         watchers.append(LiveViewer())
     if mavlink is not None:
-        from sortie.sim.telemetry import MavlinkEndpoint, read_key
+        from sortie.sim.export.telemetry import MavlinkEndpoint, read_key
 
         watchers.append(MavlinkEndpoint(mavlink, pace or None, key=None if key is None else read_key(key)))
     return Watchers(watchers)

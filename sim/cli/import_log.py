@@ -14,7 +14,7 @@ import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.scenarios.reading.load import loads
-from sortie.sim.console import out, user_errors
+from sortie.sim.cli.console import out, user_errors
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
 
 Array = np.ndarray[Any, Any]

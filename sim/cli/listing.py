@@ -10,7 +10,7 @@ from sortie.perception.detectors import DETECTORS
 from sortie.policies.registry import POLICIES, parameters
 from sortie.scenarios.reading.load import campaigns, library, load
 from sortie.scenarios.schema import json_schema
-from sortie.sim.console import out
+from sortie.sim.cli.console import out
 
 
 def list_(

@@ -11,9 +11,9 @@ import typer
 from rich.table import Table
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.console import err, out, stages, user_errors
+from sortie.sim.cli.console import err, out, stages, user_errors
 from sortie.sim.folders import RunError, ensure_files, write_text
-from sortie.sim.named import policy_overrides
+from sortie.sim.policy_text import policy_overrides
 
 if TYPE_CHECKING:
     from sortie.sim.live.result import LiveResult
@@ -99,7 +99,7 @@ def _share(value: float | None) -> str:
 
 def _show(result: LiveResult) -> None:
     from sortie.sim.live.result import overhead_rows
-    from sortie.sim.live.words import changes_in_words
+    from sortie.sim.live.sentences import changes_in_words
 
     where = f"{result.begin_s:g}–{result.begin_s + result.flown_s:.0f} s"
     losses = f", {result.loss:.0%} of descriptors lost" if result.loss else ""

@@ -8,8 +8,8 @@ import typer
 
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.sim.console import err
-from sortie.sim.named import policy_overrides
+from sortie.sim.cli.console import err
+from sortie.sim.policy_text import policy_overrides
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
 SetOption = Annotated[

@@ -14,7 +14,7 @@ from rich.table import Table
 from sortie.perception.evaluation import report
 from sortie.perception.evaluation.rows import INSTRUMENTS, Row, differ_by_chance
 from sortie.perception.evaluation.verdict import Verdict
-from sortie.sim.console import out, stages
+from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def paper(
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import Asked
     from sortie.perception.network.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
-    from sortie.sim import paper as making
+    from sortie.sim.studies import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
     if chosen is None:

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from sortie.perception.recordings.recording import open_recording
-from sortie.sim.console import bars, out
+from sortie.sim.cli.console import bars, out
 from sortie.sim.folders import RunError, ensure_files
 
 app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sortie.sim import rundir
-from sortie.sim.console import out
+from sortie.sim.cli.console import out
+from sortie.sim.results import run_folder
 
 PAGE = "report.html"
 
@@ -20,9 +20,9 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one HTML page that needs nothing else: figures, outcome, and the decisions in words."""
-    from sortie.sim.report_page import save_page
+    from sortie.sim.results.report import save_page
 
-    record = rundir.load(run)
+    record = run_folder.load(run)
     path = out_path or run / PAGE
     save_page(record, path)
     out.print(f"kept in [bold]{path}[/bold]", soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sortie.sim.console import out, stages, user_errors
+from sortie.sim.cli.console import out, stages, user_errors
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
 
 if TYPE_CHECKING:

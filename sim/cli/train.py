@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sortie.sim.console import out, stages, user_errors
+from sortie.sim.cli.console import out, stages, user_errors
 from sortie.sim.folders import ensure_files
 
 
@@ -64,7 +64,7 @@ def train(
     from sortie.perception.training.recipe import Recipe
     from sortie.perception.training.train import device_named
     from sortie.perception.training.train import train as train_detector
-    from sortie.sim import tables
+    from sortie.sim.cli import tables
     from sortie.sim.playback.training import TrainingLog
 
     half_extent_m = float(range_.value)

@@ -25,11 +25,11 @@ from sortie.policies.verification.views import to_json
 from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import Policy as PolicySection
 from sortie.scenarios.schema import Scenario
-from sortie.sim.console import bars, err, out
-from sortie.sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
+from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
+from sortie.sim.cli.console import bars, err, out
 from sortie.sim.folders import RunError, write_text
-from sortie.sim.overhead import SCENARIO, SECONDS, host_s, measure
-from sortie.sim.plane import machine
+from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
+from sortie.sim.studies.plane_cost import machine
 
 COLOURS = {"holds": "green", "proved": "green", "fails": "red", "refuted": "red", "not proved": "yellow"}
 OWN_INVARIANTS = "INVARIANTS"

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sortie.sim import rundir
-from sortie.sim.console import err, out
+from sortie.sim.cli.console import err, out
 from sortie.sim.folders import RunError
+from sortie.sim.results import run_folder
 
 
 def view(
@@ -25,9 +25,9 @@ def view(
 
     if at_s and picture is None:
         raise RunError("--at goes with --picture: the viewer has a time line of its own")
-    path = run / rundir.RECORDING
+    path = run / run_folder.RECORDING
     if not path.is_file():
-        save_rrd(rundir.load(run), path)
+        save_rrd(run_folder.load(run), path)
     if picture is None:
         open_viewer(path)
         return

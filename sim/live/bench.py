@@ -7,11 +7,11 @@ from collections import Counter
 
 from sortie.fleet.messages.auth import Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic, links
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
 from sortie.sim.live.messages import unpack_bytes
 from sortie.sim.live.node import opened
 from sortie.sim.live.reports import Count, News, Report
-from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic, links
 
 PAYLOAD_DEPTH = 16
 """Samples kept of a payload topic until they are taken: a bench that is late by more loses count."""

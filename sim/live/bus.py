@@ -1,4 +1,4 @@
-"""The bus: one participant's ends of the topics of `sortie.sim.topics`, on loopback unless told otherwise."""
+"""The bus: one participant's ends of the topics of `sortie.sim.export.topics`, on loopback unless told otherwise."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
+from sortie.sim.export.topics import Kind, Topic
 from sortie.sim.live.messages import dds_type
-from sortie.sim.topics import Kind, Topic
 
 LOOPBACK = """\
 <CycloneDDS><Domain Id="any">

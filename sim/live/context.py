@@ -21,9 +21,9 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
 from sortie.scenarios.schema import Scenario
-from sortie.sim.mission import MissionPlan
-from sortie.sim.sortie import run_sortie
-from sortie.sim.world import cars_in_reach, route_bounds
+from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.world import cars_in_reach, route_bounds
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,15 +11,15 @@ from sortie.fleet.agent import Agent, PlaneRules
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.pilot import Audit, Pilot, plan_of, schedule_policies
+from sortie.sim.engine.sortie import PHASE_SHARE
+from sortie.sim.engine.world import at
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
 from sortie.sim.live.reports import Failed, Go, Home, Notice, Ready, Report
-from sortie.sim.pilot import Audit, Pilot, plan_of, schedule_policies
-from sortie.sim.record import Recorder
-from sortie.sim.sortie import PHASE_SHARE
-from sortie.sim.world import at
+from sortie.sim.results.record import Recorder
 
 POLL_S = 0.02
 """How often a process that waits for others looks at its pipe."""

@@ -17,7 +17,7 @@ from cyclonedds.idl.types import array, float32, int32, sequence, uint8, uint16,
 
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram
 from sortie.fleet.messages.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
-from sortie.sim.topics import BYTES_NAME
+from sortie.sim.export.topics import BYTES_NAME
 
 DEFINITIONS = {
     DESCRIPTOR_NAME: DESCRIPTOR_MSG,

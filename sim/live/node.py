@@ -27,10 +27,10 @@ from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
 from sortie.scenarios.streams import stream
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
 from sortie.sim.live.reports import Count, HealthChange, News, Order, Report
-from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from sortie.fleet.staleness import LinkHealth
-from sortie.sim.topics import Kind
+from sortie.sim.export.topics import Kind
 
 
 class HealthChange(NamedTuple):

@@ -11,11 +11,11 @@ import numpy as np
 from sortie.fleet.staleness import LinkHealth
 from sortie.perception.evaluation.claims import OVERHEAD
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.pilot import named
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic
 from sortie.sim.live.bench import Bench, Fleet
 from sortie.sim.live.reports import HealthChange, Notice, Order
-from sortie.sim.pilot import named
-from sortie.sim.plane import machine
-from sortie.sim.topics import CONTEXT, PAYLOADS, Kind, Topic
+from sortie.sim.studies.plane_cost import machine
 
 PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
 """The paper's figures, by the claim that states them."""

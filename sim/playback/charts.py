@@ -16,11 +16,11 @@ import rerun as rr
 
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.scenarios.schema import Scenario
-from sortie.sim.outcome import transitions
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas, Floats, line
-from sortie.sim.sightings import Sighting
-from sortie.sim.words import decision_in_words, event_in_words
+from sortie.sim.results.outcome import transitions
+from sortie.sim.results.sentences import decision_in_words, event_in_words
+from sortie.sim.results.sightings import Sighting
 
 AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")

@@ -23,8 +23,8 @@ from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
 from sortie.sim.playback.layout import blueprint, legend
 from sortie.sim.playback.scene import Drawing
-from sortie.sim.record import SortieRecord
-from sortie.sim.sightings import sightings
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.sightings import sightings
 
 APPLICATION = "sortie"
 

@@ -26,7 +26,7 @@ from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
 from sortie.sim.playback.links import Links
 from sortie.sim.playback.received import Received
-from sortie.sim.sightings import Sighting
+from sortie.sim.results.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
 CARS_WITHIN_M = 160.0

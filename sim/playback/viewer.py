@@ -31,7 +31,7 @@ START_TIMEOUT_S = 15.0
 
 
 class LiveViewer:
-    """A viewer that follows a sortie while it flies (sortie.sim.sortie.Observer).
+    """A viewer that follows a sortie while it flies (sortie.sim.engine.sortie.Observer).
 
     Args:
         sink: where the recording goes; left out, a viewer is started for it when the sortie begins.

@@ -13,7 +13,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
 
 JAMMED = "events=[{kind: jam, at_s: 0, position_m: [0, 0, 2000], power_dbm: 0}]"
 
@@ -40,7 +40,7 @@ def test_what_a_fleet_costs(benchmark: BenchmarkFixture, drones: int, extra: tup
 
 
 @pytest.mark.benchmark(group="starting Python")
-@pytest.mark.parametrize("what", ["numpy", "sortie.sim.sortie"])
+@pytest.mark.parametrize("what", ["numpy", "sortie.sim.engine.sortie"])
 def test_importing(benchmark: BenchmarkFixture, what: str) -> None:
     done = benchmark.pedantic(subprocess.run, ([sys.executable, "-c", f"import {what}"],), rounds=5, warmup_rounds=1)
     assert done.returncode == 0

@@ -17,7 +17,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Perception, Scene
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
 
 Moments = list[list[tuple[Capture, list[Share]]]]
 

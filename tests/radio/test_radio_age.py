@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from radio_flights import Hover, trace
 from scipy import stats
 
-from sortie.radio.age import Chain, mean_age_s, mean_peak_age_s, share_older
+from age import Chain, mean_age_s, mean_peak_age_s, share_older
 from sortie.scenarios.schema import Bursts, Radio
 
 PERIOD_S = 0.1

@@ -9,7 +9,7 @@ import pytest
 import sortie.fleet.agent
 from sortie.fleet.agent import Agent
 from sortie.scenarios.reading.load import load
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
 
 SETS = ["perception.detector=none", "duration_s=3", "mission.phases=[{at_s: 0, phase: search}]"]
 

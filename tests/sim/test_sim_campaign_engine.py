@@ -21,7 +21,7 @@ from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import Store
 from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
-from sortie.sim.console import user_errors
+from sortie.sim.cli.console import user_errors
 from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")

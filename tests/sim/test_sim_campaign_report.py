@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sortie.scenarios.schema.campaign import Sample
-from sortie.sim.campaign.contexts import contexts, rule, winner
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
 from sortie.sim.campaign.rows import Rows, figures, find_row, judged, read_rows, sign
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.statistics import Mean, estimate, paired, t_interval
+from sortie.sim.campaign.winners import contexts, rule, winner
 from sortie.sim.campaign.work import Result
 from sortie.sim.folders import RunError
 

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pytest
 from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
 
-from sortie.sim.campaign.contexts import winner
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.rows import Rows, read_rows
+from sortie.sim.campaign.winners import winner
 from sortie.sim.campaign.work import Result
 from sortie.sim.folders import RunError
 

@@ -15,13 +15,13 @@ from sim_examples import BASE, example
 from typer.testing import CliRunner
 
 from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
-from sortie.sim import rundir
+from sortie.sim.check.expectations import check
 from sortie.sim.cli.app import app
-from sortie.sim.expect import check
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.outcome import outcome
-from sortie.sim.record import TABLES
-from sortie.sim.sortie import run_sortie
+from sortie.sim.results import run_folder
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import TABLES
 
 FIELDS = {  # DESIGN.md: outcome.json holds at least these
     "scenario", "policy", "seed", "version", "fingerprint", "ap50", "bytes", "context_share", "deadline_miss_rate",
@@ -49,14 +49,14 @@ def sortie(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedP
 
 def test_a_run_is_kept_whole_and_reads_back(tmp_path: Path) -> None:
     record = run_sortie(example())
-    result = rundir.save(record, tmp_path / "run")
+    result = run_folder.save(record, tmp_path / "run")
     assert set(result) >= FIELDS
     assert json.loads((tmp_path / "run" / "outcome.json").read_text()) == result
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
         "outcome.json", "scenario.yaml", "record.json", *(f"{t}.parquet" for t in TABLES),
     }  # fmt: skip
     assert pq.read_table(tmp_path / "run" / "states.parquet").num_rows == 300
-    back = rundir.load(tmp_path / "run")
+    back = run_folder.load(tmp_path / "run")
     assert back.fingerprint == record.fingerprint
     assert outcome(back) == result
 
@@ -76,11 +76,11 @@ def test_a_run_that_dies_while_saving_leaves_no_half_run(tmp_path: Path) -> None
         raise OSError(28, "No space left on device")
 
     with pytest.raises(RunError, match="run: cannot be written: No space left on device"):
-        rundir.save(record, path, dies)
+        run_folder.save(record, path, dies)
     assert list(tmp_path.iterdir()) == []
-    first = rundir.save(record, path)
+    first = run_folder.save(record, path)
     with pytest.raises(RunError):
-        rundir.save(record, path, dies)
+        run_folder.save(record, path, dies)
     assert json.loads((path / "outcome.json").read_text()) == first, "the older run is still whole"
 
 
@@ -88,10 +88,10 @@ def test_a_folder_that_is_no_run_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
     with pytest.raises(RunError, match=r"holds files but no outcome\.json"):
-        rundir.ensure_writable(tmp_path / "thesis")
+        run_folder.ensure_writable(tmp_path / "thesis")
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="is a file, a run needs a folder"):
-        rundir.ensure_writable(tmp_path / "file")
+        run_folder.ensure_writable(tmp_path / "file")
 
 
 @pytest.mark.parametrize(
@@ -107,12 +107,12 @@ def test_a_folder_that_is_no_run_is_not_replaced(tmp_path: Path) -> None:
 )
 def test_what_no_run_wrote_is_not_replaced_with_the_run(theirs: list[str], named: str, tmp_path: Path) -> None:
     record, path = run_sortie(example("duration_s=0.1")), tmp_path / "run"
-    rundir.save(record, path)
+    run_folder.save(record, path)
     for name in theirs:
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_text("a day's work")
     what = f"{path}: holds {named}, which no run wrote; choose another folder or move it"
-    for refuse in (lambda: rundir.ensure_writable(path), lambda: rundir.save(record, path)):
+    for refuse in (lambda: run_folder.ensure_writable(path), lambda: run_folder.save(record, path)):
         with pytest.raises(RunError, match=f"^{re.escape(what)}$"):
             refuse()
     assert [(path / name).read_text() for name in theirs] == ["a day's work"] * len(theirs)
@@ -124,7 +124,7 @@ def test_what_was_made_of_a_run_goes_with_it(tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     pytest.importorskip("pymavlink")
     path = tmp_path / "run"
-    rundir.save(run_sortie(example("duration_s=1")), path, lambda folder: (folder / "sortie.rrd").write_text(""))
+    run_folder.save(run_sortie(example("duration_s=1")), path, lambda folder: (folder / "sortie.rrd").write_text(""))
     alone = {p.name for p in path.iterdir()}
     for made in (["report"], ["export", "--mcap"], ["export", "--tlog"]):
         done = CliRunner().invoke(app, [made[0], str(path), *made[1:]])
@@ -132,20 +132,20 @@ def test_what_was_made_of_a_run_goes_with_it(tmp_path: Path) -> None:
     (path / ".DS_Store").write_text("")
     assert {p.name for p in path.iterdir()} - alone == {"report.html", "bag", "sortie.tlog", ".DS_Store"}
     page = (path / "report.html").read_text()
-    rundir.save(run_sortie(example("duration_s=0.5")), path)
+    run_folder.save(run_sortie(example("duration_s=0.5")), path)
     assert {p.name for p in path.iterdir()} == alone - {"sortie.rrd"}
     (path / "report.html").write_text(page)
     with pytest.raises(
         RunError, match=r"run: holds report\.html, which is not of the run there; choose another folder"
     ):
-        rundir.ensure_writable(path)
+        run_folder.ensure_writable(path)
 
 
 def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
     scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "run"
-    rundir.save(run_sortie(example("duration_s=0.1")), path)
+    run_folder.save(run_sortie(example("duration_s=0.1")), path)
     (path / "mynotes.txt").write_text("a day's work")
 
     def flown(*_: object, **__: object) -> None:
@@ -161,28 +161,28 @@ def test_a_link_to_a_folder_stays_one(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     (tmp_path / "run").symlink_to(tmp_path / "disk")
     for _ in range(2):
-        rundir.save(record, tmp_path / "run")
+        run_folder.save(record, tmp_path / "run")
         assert (tmp_path / "run").is_symlink()
-        assert rundir.load(tmp_path / "disk").fingerprint == record.fingerprint
+        assert run_folder.load(tmp_path / "disk").fingerprint == record.fingerprint
     assert {p.name for p in tmp_path.iterdir()} == {"disk", "run"}
 
 
 def test_a_damaged_run_says_so(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"no run there \(outcome\.json is missing\)"):
-        rundir.load(tmp_path)
-    rundir.save(run_sortie(example()), tmp_path / "run")
+        run_folder.load(tmp_path)
+    run_folder.save(run_sortie(example()), tmp_path / "run")
     (tmp_path / "run" / "states.parquet").write_bytes(b"PAR1 not really")
     with pytest.raises(RunError, match="the run is damaged"):
-        rundir.load(tmp_path / "run")
+        run_folder.load(tmp_path / "run")
 
 
 def test_a_run_of_another_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    rundir.save(run_sortie(example("duration_s=0.1")), path)
+    run_folder.save(run_sortie(example("duration_s=0.1")), path)
     table = pq.read_table(path / "transmissions.parquet").drop_columns(["hops"])
     pq.write_table(table, path / "transmissions.parquet")
     with pytest.raises(RunError, match=r"run: the run is damaged: transmissions\.parquet has no column hops; another"):
-        rundir.load(path)
+        run_folder.load(path)
 
 
 # --- commands ------------------------------------------------------------------------------------
@@ -345,10 +345,10 @@ def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: P
     asked = ("fly", str(scenario), "--set", "duration_s=1", "--no-recording", "--out", str(tmp_path / "run"))
     other = CliRunner().invoke(app, [*asked, "--policy", "boxes"])
     assert "boxes flies to the end: the changes and commands of example are its own policy's" in other.stderr
-    assert rundir.load(tmp_path / "run").totals["policy_changes"] == 0
+    assert run_folder.load(tmp_path / "run").totals["policy_changes"] == 0
     own = CliRunner().invoke(app, [*asked, "--policy", "worked"])
     assert "flies to the end" not in own.stderr
-    assert rundir.load(tmp_path / "run").totals["policy_changes"] == 5
+    assert run_folder.load(tmp_path / "run").totals["policy_changes"] == 5
 
 
 def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from sim_examples import example
 
-from sortie.sim import minimal_context
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+import minimal_context
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 SEARCH = "mission.phases=[{at_s: 0, phase: search}]"
 

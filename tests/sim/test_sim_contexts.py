@@ -20,13 +20,13 @@ from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import ScenarioError, context_sets, library, load_contexts
 from sortie.scenarios.schema import Perception
 from sortie.scenarios.schema.conditions import Contexts
-from sortie.sim import learn
-from sortie.sim.cli import contexts as commands
+from sortie.sim.cli import conditions as commands
 from sortie.sim.cli.app import main
-from sortie.sim.contexts import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
 from sortie.sim.folders import RunError
-from sortie.sim.in_flight import torch_answers
-from sortie.sim.learn import Lesson, draw_context, fit, save
+from sortie.sim.studies import learn
+from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
+from sortie.sim.studies.in_flight import torch_answers
+from sortie.sim.studies.learn import Lesson, draw_context, fit, save
 
 SMALL = """
 base: track_target

@@ -14,9 +14,9 @@ import pytest
 from sim_examples import example
 
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation
-from sortie.sim.outcome import describe, outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import describe, outcome
+from sortie.sim.results.record import SortieRecord
 
 PLAIN = Directive(0, 1, Representation.FEATURES, rho=0.05, rate_hz=10.0, reason="plain")
 NO_PHASES = "mission.phases=[{at_s: 0, phase: search}]"

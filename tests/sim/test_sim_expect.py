@@ -8,9 +8,9 @@ import pytest
 from sim_examples import example
 
 from sortie.scenarios.schema import Expectation
-from sortie.sim.expect import check
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.check.expectations import check
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 
 @pytest.mark.parametrize(

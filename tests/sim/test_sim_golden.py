@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 GOLDEN = Path(__file__).parent / "golden"
 LEFT_OUT = {"fingerprint", "version", "wall_s", "realtime_factor", "policy_eval_us"}

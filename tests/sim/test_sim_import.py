@@ -17,8 +17,8 @@ from sortie.fleet.logs.logtrace import context_trace
 from sortie.fleet.traces import COLUMNS, read_traces
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.sortie import run_sortie
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")

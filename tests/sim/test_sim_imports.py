@@ -14,13 +14,13 @@ HEAVY = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.interpolate", "
 @pytest.mark.parametrize("detector", ["none", "surrogate"])
 def test_flying_without_the_network_loads_nothing_heavy(detector: str) -> None:
     fly = (
-        "import sys; from sortie.scenarios.reading.load import load; from sortie.sim.sortie import run_sortie\n"
+        "import sys; from sortie.scenarios.reading.load import load; from sortie.sim.engine.sortie import run_sortie\n"
         f"run_sortie(load('track_target', ['perception.detector={detector}', 'duration_s=2', "
         "'mission.phases=[{at_s: 0, phase: search}]']))\n"
         "print(*sys.modules, sep='\\n')"
     )
     loaded = subprocess.run([sys.executable, "-c", fly], capture_output=True, text=True, check=True).stdout
-    assert "sortie.sim.sortie" in loaded.split()
+    assert "sortie.sim.engine.sortie" in loaded.split()
     assert HEAVY & set(loaded.split()) == set()
 
 

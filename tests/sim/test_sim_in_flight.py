@@ -14,10 +14,10 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.model import SHIPPED
 from sortie.scenarios.reading.load import load, load_contexts
 from sortie.scenarios.schema import Scenario
-from sortie.sim.in_flight import Level, flights, means, torch_answers
-from sortie.sim.outcome import accuracy, both_matched
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import accuracy, both_matched
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.studies.in_flight import Level, flights, means, torch_answers
 
 
 def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[Level]:
@@ -79,7 +79,7 @@ def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytes
         flown.append((scenario.policy.name, scenario.policy.params.get("rho"), seed))
         return run_sortie(scenario.model_copy(update={"duration_s": 1.0}), policy, seed)
 
-    monkeypatch.setattr("sortie.sim.in_flight.run_sortie", fly)
+    monkeypatch.setattr("sortie.sim.studies.in_flight.run_sortie", fly)
     told: list[tuple[str, int, int]] = []
     found = list(flights("contexts", SHIPPED, None, 2.0, ["silence", "all-4"], lambda *at: told.append(at)))
     contexts = load_contexts("contexts")
@@ -101,7 +101,7 @@ def test_a_context_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.
         records.append(run_sortie(scenario, policy, seed))
         return records[-1]
 
-    monkeypatch.setattr("sortie.sim.in_flight.run_sortie", fly)
+    monkeypatch.setattr("sortie.sim.studies.in_flight.run_sortie", fly)
     told: list[tuple[str, int, int]] = []
     found = list(flights(str(path), SHIPPED, None, 0.5, ["silence", "all-4"], lambda *at: told.append(at), towns=3))
     scenario = load(path)

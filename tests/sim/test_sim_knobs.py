@@ -19,7 +19,7 @@ from sim_examples import example
 from sortie.policies.contract import Descriptor, FleetView, TaskPhase
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
 
 NOT_KNOBS = ("name", "description", "expect", "expect_decisions")
 """Words for people, and what is asserted about the outcome."""

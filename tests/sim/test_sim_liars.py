@@ -10,10 +10,10 @@ import pytest
 from sim_examples import example
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.named import policy_overrides
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.policy_text import policy_overrides
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 SEARCH = "mission.phases=[{at_s: 0, phase: search}]"
 

@@ -9,10 +9,10 @@ import pytest
 from sim_examples import example
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.expect import check
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.check.expectations import check
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 LOSSY = ("policy.name=all-4", "policy.params={rho: 0.1}", "radio.retry_limit=0", "radio.bursts.loss_good=0.05")
 

@@ -22,6 +22,7 @@ from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_d
 from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.sim.cli.app import app
+from sortie.sim.export.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
 from sortie.sim.folders import RunError
 from sortie.sim.live import messages
 from sortie.sim.live.bus import LOOPBACK, Bus
@@ -29,9 +30,8 @@ from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
 from sortie.sim.live.node import opened
 from sortie.sim.live.result import LiveResult, overhead_rows
+from sortie.sim.live.sentences import changes_in_words
 from sortie.sim.live.session import MAX_DRONES, fly_live
-from sortie.sim.live.words import changes_in_words
-from sortie.sim.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
 
 ROOT = Path(__file__).resolve().parents[2]
 DOMAIN = os.getpid() % 200 + 20

@@ -10,9 +10,9 @@ import pytest
 from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 SEEING = ("perception.detector=surrogate", "perception.sample_rate_hz=1")
 FAST = (*SEEING, "fleet.route={waypoints_m: [[-60, 0], [160, 0]], speed_mps: 15}")

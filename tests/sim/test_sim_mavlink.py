@@ -22,12 +22,12 @@ from sim_examples import BASE, example
 from typer.testing import CliRunner
 
 from sortie.fleet.logs.mavlink import KEY_BYTES, Listener, Transmitter, answers
-from sortie.sim import rundir
 from sortie.sim.cli.app import app
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.export.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
 from sortie.sim.folders import RunError
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
-from sortie.sim.telemetry import ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
+from sortie.sim.results import run_folder
+from sortie.sim.results.record import SortieRecord
 
 BEGIN_US = 1_767_225_600_000_000
 
@@ -104,7 +104,7 @@ def test_a_lost_drone_is_disarmed(log: Path) -> None:
 
 def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    rundir.save(record, run)
+    run_folder.save(record, run)
     arguments = ["export", str(run), "--tlog", "--begin", "2026-11-21T09:00:00.25", "--origin", "52.5,13.4,30"]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 0, said.output
@@ -118,7 +118,7 @@ def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path
 
 def test_a_log_is_signed_from_2015_on(record: SortieRecord, tmp_path: Path) -> None:
     run, key = tmp_path / "run", tmp_path / "key"
-    rundir.save(record, run)
+    run_folder.save(record, run)
     key.write_text("ab" * 32)
     command = ["export", str(run), "--tlog", "--key", str(key), "--begin"]
     said = CliRunner().invoke(app, [*command, "2014-12-31"])
@@ -311,7 +311,7 @@ def signed_parser(key: bytes) -> mavlink2.MAVLink:
 
 
 def test_a_log_is_signed_by_the_command(record: SortieRecord, tmp_path: Path) -> None:
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     key = bytes(range(KEY_BYTES))
     (tmp_path / "key").write_text(key.hex() + "\n")
     told = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--tlog", "--key", str(tmp_path / "key")])

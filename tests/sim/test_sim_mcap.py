@@ -18,13 +18,13 @@ from typer.testing import CliRunner
 import sortie.fleet.agent
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive
 from sortie.policies.contract import Descriptor
-from sortie.sim import rundir
-from sortie.sim.bag import descriptors, write_bag
 from sortie.sim.cli.app import app
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
-from sortie.sim.words import decision_in_words
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.export.bag import descriptors, write_bag
+from sortie.sim.results import run_folder
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.sentences import decision_in_words
 
 BEGIN_NS = 1_767_225_600_000_000_000
 Bag = dict[str, list[tuple[int, Any]]]
@@ -167,7 +167,7 @@ def test_the_messages_build_as_a_ros_2_package() -> None:
 
 def test_the_command_writes_the_bag_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    rundir.save(record, run)
+    run_folder.save(record, run)
     for _ in range(2):  # a second one replaces the first
         said = CliRunner().invoke(app, ["export", str(run), "--mcap", "--begin", "2026-11-21T09:00:00+01:00"])
         assert said.exit_code == 0, said.output
@@ -178,7 +178,7 @@ def test_the_command_writes_the_bag_into_the_run(record: SortieRecord, tmp_path:
 
 
 def test_a_bag_begins_at_a_fraction_of_a_second_too(record: SortieRecord, tmp_path: Path) -> None:
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     arguments = ["export", str(tmp_path / "run"), "--mcap", "--begin", "2026-11-21T08:00:00.25"]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     with (tmp_path / "run" / "bag" / "bag.mcap").open("rb") as file:
@@ -189,7 +189,7 @@ def test_a_bag_begins_at_a_fraction_of_a_second_too(record: SortieRecord, tmp_pa
 def test_a_bag_may_be_the_folder_one_stands_in(
     record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -199,7 +199,7 @@ def test_a_bag_may_be_the_folder_one_stands_in(
 
 
 def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_path: Path) -> None:
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     mine = tmp_path / "mine"  # a bag of somebody else's, with a note
     mine.mkdir()
     for name in ("metadata.yaml", "mine_0.mcap", "notes.txt"):
@@ -227,7 +227,7 @@ def test_what_a_user_gets_wrong_is_named(
     arguments: list[str], message: str, record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     said = CliRunner().invoke(app, ["export", "run", *arguments])
     assert re.search(message, str(said.exception))
     assert CliRunner().invoke(app, ["export", "run"]).exit_code == 2  # no format named

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from sortie.policies.catalogue.prior import METHODS
 from sortie.sim.cli.app import app
-from sortie.sim.compare import compare
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.studies.compare import compare
 
 
 def test_every_method_flies_in_a_comparison() -> None:

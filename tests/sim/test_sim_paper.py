@@ -21,10 +21,11 @@ from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.types import Boxes
 from sortie.policies.registry import resolve
-from sortie.sim import paper, plane
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback.frame import SHADES, save_frame
-from sortie.sim.sortie import run_sortie
+from sortie.sim.studies import paper
+from sortie.sim.studies import plane_cost as plane
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from sortie.perception.study import report as study
 from sortie.perception.study.figures import CAPTIONS
 from sortie.perception.study.measure import from_table
 from sortie.perception.study.plan import read_plan
-from sortie.sim import paper
+from sortie.sim.studies import paper
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -6,10 +6,10 @@ import pytest
 
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.sim.compare import compare
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.studies.compare import compare
 
 SHORT = ("duration_s=16", "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]", "policy.dwell_s=0.2")
 pytestmark = pytest.mark.slow

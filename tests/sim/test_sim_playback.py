@@ -19,16 +19,16 @@ from sim_examples import example
 
 from sortie.perception.budget import CELL_M
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.outcome import accuracy, matched, outcome, transitions
 from sortie.sim.playback import recording
 from sortie.sim.playback.canvas import goodput_colours
 from sortie.sim.playback.received import hatch
 from sortie.sim.playback.recording import save_rrd, scene_of
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
-from sortie.sim.record import TABLES, SortieRecord
-from sortie.sim.sortie import run_sortie
-from sortie.sim.words import decision_in_words
+from sortie.sim.results.outcome import accuracy, matched, outcome, transitions
+from sortie.sim.results.record import TABLES, SortieRecord
+from sortie.sim.results.sentences import decision_in_words
 
 DURATION_S = 8.0
 Rows = dict[str, dict[str, list[tuple[float, int, Any]]]]

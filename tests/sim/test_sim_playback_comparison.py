@@ -9,10 +9,10 @@ import pytest
 from rerun.chunk import RrdReader
 from sim_examples import example
 
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.playback.comparison import roots
 from sortie.sim.playback.recording import save_comparison, save_rrd
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.results.record import SortieRecord
 
 
 @pytest.fixture(scope="module")

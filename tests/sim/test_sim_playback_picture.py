@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from sim_examples import example
 
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback import picture
 from sortie.sim.playback.picture import take_picture
 from sortie.sim.playback.recording import save_comparison, save_rrd
-from sortie.sim.sortie import run_sortie
 
 DRIVERS = list(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
 needs_vulkan = pytest.mark.skipif(not DRIVERS, reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")

@@ -16,14 +16,14 @@ from sim_examples import BASE, example
 from typer.testing import CliRunner
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.checking import check_scenario
+from sortie.sim.check.checking import check_scenario
+from sortie.sim.check.expectations import check, limit
+from sortie.sim.check.golden import golden_path, moved, write_golden
+from sortie.sim.check.plugin import _is_scenario
 from sortie.sim.cli.app import app
-from sortie.sim.expect import check, limit
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.golden import golden_path, moved, write_golden
-from sortie.sim.outcome import outcome
-from sortie.sim.pytest_plugin import _is_scenario
-from sortie.sim.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 SHORT = BASE.replace("duration_s: 6", "duration_s: 1").replace("at_s: 3", "at_s: 0.5")
 EXPECT = """

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.scenarios.reading.load import loads
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 BASE = """
 name: random

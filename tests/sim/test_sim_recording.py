@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from sortie.perception.recordings.recording import RecordingError
 from sortie.sim.cli.app import app
-from sortie.sim.compare import compare
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.studies.compare import compare
 
 RECORDED = "perception.detector=recorded"
 SHORT = ("duration_s=2", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.2")

@@ -11,12 +11,12 @@ import pytest
 from sim_examples import example
 
 from sortie import radio
-from sortie.sim import reference
-from sortie.sim.golden import figures
-from sortie.sim.outcome import outcome
-from sortie.sim.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
-from sortie.sim.record import ABOUT, TABLES
-from sortie.sim.sortie import run_sortie
+from sortie.sim.check.golden import figures
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import reference
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
+from sortie.sim.results.record import ABOUT, TABLES
 
 
 class Leaf(TypedDict):
@@ -114,7 +114,7 @@ def test_a_field_of_another_name_or_kind_is_found(change: dict[str, Any], fault:
 
 
 def test_the_page_is_current() -> None:
-    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sortie.sim.reference"
+    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sortie.sim.results.reference"
 
 
 def test_every_table_is_told() -> None:

@@ -16,15 +16,16 @@ from matplotlib.figure import Figure
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.sim import report_figures, rundir
 from sortie.sim.cli.app import app
+from sortie.sim.cli.tables import size
+from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.report_page import page, save_page
-from sortie.sim.sortie import run_sortie
-from sortie.sim.tables import size
-from sortie.sim.words import decision_in_words
+from sortie.sim.results import report_figures
+from sortie.sim.results import run_folder
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.report import page, save_page
+from sortie.sim.results.sentences import decision_in_words
 
 VOID = {"meta", "br", "link", "img"}
 
@@ -187,11 +188,11 @@ def test_a_lane_says_nothing_of_a_drone_that_is_down() -> None:
 
 
 def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
-    rundir.save(record, tmp_path / "run")
+    run_folder.save(record, tmp_path / "run")
     said = CliRunner().invoke(app, ["report", str(tmp_path / "run")])
     assert said.exit_code == 0, said.output
     assert (tmp_path / "run" / "report.html").read_text("utf-8") == page(record)
-    rundir.save(record, tmp_path / "run")  # a run with a report is a run still
+    run_folder.save(record, tmp_path / "run")  # a run with a report is a run still
     save_page(record, tmp_path / "new" / "page.html")
     assert (tmp_path / "new" / "page.html").read_text("utf-8") == page(record)
     with pytest.raises(RunError, match=r"page\.html/again\.html: cannot be written"):

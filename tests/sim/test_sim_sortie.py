@@ -14,9 +14,9 @@ from sim_examples import example
 from sortie.policies.contract import Directive, PolicyError
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_another_process_gives_the_same_fingerprint_whatever_matrix_kernels_its_
     """OpenBLAS adds in another order by processor."""
     here = run_sortie(example(*extra)) if extra else base
     code = (
-        "import sys; from sim_examples import example; from sortie.sim.sortie import run_sortie; "
+        "import sys; from sim_examples import example; from sortie.sim.engine.sortie import run_sortie; "
         "print(run_sortie(example(*sys.argv[1:])).fingerprint)"
     )
     for hash_seed in ("1", "2"):
@@ -371,5 +371,5 @@ def test_a_detector_that_works_ahead_leaves_the_same_record(monkeypatch: pytest.
     scenario = example("perception.detector=torch", "perception.sample_rate_hz=5", "duration_s=2.5")
     ahead = run_sortie(scenario)
     assert ahead.tables["fusions"].num_rows == 5 * 13
-    monkeypatch.setattr("sortie.sim.scoring.DetectsAhead", type("Nobody", (), {}))
+    monkeypatch.setattr("sortie.sim.engine.scoring.DetectsAhead", type("Nobody", (), {}))
     assert run_sortie(scenario).fingerprint == ahead.fingerprint

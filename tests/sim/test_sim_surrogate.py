@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from sortie.scenarios.reading.load import load as read
 from sortie.scenarios.schema import Scenario
-from sortie.sim import rundir
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import run_folder
+from sortie.sim.results.outcome import outcome
 
 
 def short(*overrides: str) -> Scenario:
@@ -45,11 +45,11 @@ def test_a_watched_sortie_is_the_same_and_is_scored_as_it_flies() -> None:
 
 def test_the_outcome_says_what_scored_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     record = run_sortie(short())
-    result = rundir.save(record, tmp_path / "run")
+    result = run_folder.save(record, tmp_path / "run")
     assert result["ap50"]["detector"] == "surrogate"
     assert result["ap50"]["calibration"].startswith("disconet-")
     assert 0.05 < result["ap50"]["full_scene"] < 0.9
-    again = rundir.load(tmp_path / "run")
+    again = run_folder.load(tmp_path / "run")
     assert again.calibration == record.calibration
     assert again.fingerprint == record.fingerprint
     assert outcome(run_sortie(short("perception.detector=none")))["ap50"]["calibration"] is None
@@ -65,7 +65,7 @@ def test_sharing_pays_and_replications_differ() -> None:
 
 def test_it_flies_without_torch() -> None:
     code = (
-        "import sys\nfrom sortie.scenarios.reading.load import load\nfrom sortie.sim.sortie import run_sortie\n"
+        "import sys\nfrom sortie.scenarios.reading.load import load\nfrom sortie.sim.engine.sortie import run_sortie\n"
         "run_sortie(load('track_target', ['duration_s=1', 'perception.detector=surrogate']))\n"
         "print('torch' in sys.modules)"
     )

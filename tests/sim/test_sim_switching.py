@@ -10,10 +10,10 @@ from sim_examples import example
 
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.load import ScenarioError
-from sortie.sim.named import policy_overrides
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.policy_text import policy_overrides
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 SLOW = "rate_hz <= 5"
 

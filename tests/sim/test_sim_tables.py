@@ -10,10 +10,10 @@ from rich.table import Table
 from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.sim.expect import Verdict
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
-from sortie.sim.tables import points, transitions_table, verdict_table
+from sortie.sim.check.expectations import Verdict
+from sortie.sim.cli.tables import points, transitions_table, verdict_table
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 REASON = "as in [roi] and [/roi]"
 """Which the terminal's markup would swallow, or stumble over."""

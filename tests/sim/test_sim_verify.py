@@ -11,8 +11,8 @@ from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import RULES
 from sortie.policies.verification.views import draw_views, from_json, to_json
-from sortie.sim import console
-from sortie.sim.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
+from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
+from sortie.sim.cli import console
 
 FAULTY = '''
 from sortie.policies.contract import Directive, Representation

@@ -25,9 +25,9 @@ from sortie.policies.contract import (
     Reposition,
     looks_from,
 )
-from sortie.sim.outcome import outcome
-from sortie.sim.record import SortieRecord
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 
 ASIDE = "mission.target.waypoints_m=[[-60, 60], [200, 60]]"
 LONG = (

@@ -7,9 +7,9 @@ import dataclasses
 import pyarrow as pa
 from sim_examples import example
 
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
-from sortie.sim.why import why
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.explain import why
+from sortie.sim.results.outcome import outcome
 
 
 def test_a_reason_keeps_its_figures() -> None:

@@ -21,11 +21,11 @@ import pyarrow.compute as pc
 import simpy
 
 from sortie.radio import Air, Status
-from sortie.radio.age import Chain, mean_age_s, share_older
+from age import Chain, mean_age_s, share_older
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Radio, Scenario
-from sortie.sim.outcome import outcome
-from sortie.sim.sortie import run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs/validation"

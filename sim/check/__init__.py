@@ -1,0 +1,1 @@
+"""Scenarios against their own expectations: verdicts, golden outcomes, the pytest plugin."""

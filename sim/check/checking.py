@@ -1,0 +1,125 @@
+"""Fly a scenario as often as its expectations ask for, and hold what comes out against them. For command line and pytest."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sortie.scenarios.reading.files import named_files
+from sortie.scenarios.reading.load import library, load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.check.expectations import Verdict, check
+from sortie.sim.check.golden import golden_path, moved, named_from, write_golden
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError
+from sortie.sim.results.explain import why
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+
+SHOWN = 4
+"""Moved golden figures that a verdict names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A scenario's verdicts, golden outcome included, each failed one with its reason from the record."""
+
+    scenario: Scenario
+    verdicts: tuple[Verdict, ...]
+    command: tuple[str, ...]
+    """Which flies it."""
+    written: str = ""
+    """Which golden outcome was written, in words; empty if none was."""
+
+    @property
+    def failed(self) -> list[Verdict]:
+        return [v for v in self.verdicts if not v.holds]
+
+    def replay(self, verdict: Verdict) -> str:
+        """The command that shows the sortie that a verdict is best seen in."""
+        again = ["--replication", str(verdict.replication)] if verdict.replication else []
+        return shlex.join([*self.command, *again, "--view"])
+
+
+def check_scenario(
+    path_or_name: str,
+    overrides: Sequence[str] = (),
+    *,
+    update: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Checked:
+    """Fly a scenario and its replications, and check them.
+
+    Args:
+        path_or_name: a file, or a library scenario's name.
+        update: write the golden outcome anew instead of comparing; not with overrides.
+        progress: called with simulated seconds over all replications.
+
+    Raises:
+        ScenarioError, PolicyError, RunError: what is wrong with the scenario, its policy or its golden outcome.
+    """
+    ensure_own(overrides, update=update)
+    scenario = load(path_or_name, overrides)
+    record = run_sortie(scenario, progress=progress)
+    result = outcome(record)
+    results = [result, *_more(scenario, progress)]
+    verdicts = [_explained(v, scenario, record, results) for v in check(scenario, record, result, results)]
+    golden = golden_path(library().get(path_or_name, Path(path_or_name)))
+    portable = named_from(golden.parent, result, named_files(scenario.model_dump(mode="json")))
+    written = write_golden(golden, portable) if update else ""
+    if golden.is_file() and not overrides and not update:
+        verdicts.append(_golden(golden, portable))
+    command = ("sortie", "fly", path_or_name, *(x for o in overrides for x in ("--set", o)))
+    return Checked(scenario, tuple(verdicts), command, written)
+
+
+def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
+    """Refuse to write the outcome of another sortie than the scenario's own as its golden one.
+
+    Raises:
+        RunError: the first override.
+    """
+    if update and overrides:
+        raise RunError(f"{overrides[0]}: a golden outcome is written of the scenario as its file has it, set nothing")
+
+
+def flights(scenario: Scenario) -> int:
+    """Sorties that its expectations ask for."""
+    return max([1, *(e.replications for e in scenario.expect if e.replications is not None)])
+
+
+def _more(scenario: Scenario, progress: Callable[[float], None] | None) -> list[dict[str, Any]]:
+    found = []
+    for replication in range(1, flights(scenario)):
+        begin_s = replication * scenario.duration_s
+        watch = None if progress is None else (lambda t_s, b=begin_s: progress(b + t_s))
+        found.append(outcome(run_sortie(scenario, replication=replication, progress=watch)))
+    return found
+
+
+def _explained(
+    verdict: Verdict, scenario: Scenario, record: SortieRecord, results: Sequence[dict[str, Any]]
+) -> Verdict:
+    """With the reason from the record of its replication, which is flown again where it is not the first: kept are
+    outcomes alone."""
+    if verdict.holds or not verdict.metric:
+        return verdict
+    k = verdict.replication
+    shown = record if k == 0 else run_sortie(scenario, replication=k)
+    return replace(verdict, why=why(verdict.metric, shown, results[k]))
+
+
+def _golden(path: Path, result: dict[str, Any]) -> Verdict:
+    found = moved(path, result)
+    shown = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(found.items())[:SHOWN])
+    more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    got = f"{len(found)} moved: {shown}{more}" if found else "the same"
+    renew = "renew it with --update (pytest: --sortie-update) where it was meant to move"
+    return Verdict(f"the outcome in {path.name}", got, not found, renew)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,121 @@
+"""A view on which a policy fails, kept as JSON and as a scenario that shows it to the policy in flight."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
+from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.proof import View
+from sortie.policies.verification.views import to_json
+from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.sortie import run_sortie
+
+SHOWN_AT_PERIODS = 5
+"""By then every drone has heard every other."""
+
+
+def replay_scenario(
+    rule: str,
+    complaint: str,
+    policy: str,
+    params: Mapping[str, Any],
+    view: FleetView,
+    *,
+    invariant: str = "",
+    raised_age_s: Mapping[int, float] | None = None,
+) -> Scenario:
+    """A short sortie in which the view's ego decides once on the view (then on the older one), and must not fail.
+
+    Args:
+        rule: what is broken, in words.
+        complaint: how.
+        policy: the policy's name or `file.py:function`.
+        params: its parameters.
+        view: the counterexample.
+        invariant: the line that it breaks, if that is what it breaks.
+        raised_age_s: the ages of a second, older view, where the two together break the rule.
+
+    Returns:
+        The scenario; its one expectation fails, or the flight stops with the contract's error, until the policy is
+        mended.
+    """
+    period_s, ego = view.period_s, view.ego
+    views = [view] if raised_age_s is None else [view, view._replace(age_s=dict(raised_age_s))]
+    me = view.me
+    phase = "search" if me is None else TaskPhase(me.task_phase).name.lower()
+    return Scenario.model_validate(
+        {
+            "name": slug(rule),
+            "description": f"{rule}: {complaint}"[:2000],
+            "duration_s": period_s * (SHOWN_AT_PERIODS + 5),
+            "fleet": {"drones": max([ego, *view.descriptors]) + 1, "formation": {"shape": "grid"}},
+            "mission": {
+                "phases": [{"phase": phase if phase in ("transit", "search", "track", "return") else "search"}]
+            },
+            "context": {"rate_hz": 1 / period_s},
+            "perception": {"detector": "none"},
+            "policy": {
+                "name": policy,
+                "params": dict(params),
+                "dwell_s": 0,
+                "invariants": invariant,
+                "replays": [
+                    {"at_s": period_s * (SHOWN_AT_PERIODS + k), "drone": ego, "view": to_json(v)}
+                    for k, v in enumerate(views)
+                ],
+            },
+            "expect": [{"metric": "policies.invariant_violations", "equals": 0, "because": rule}],
+        }
+    )
+
+
+def slug(rule: str) -> str:
+    """A rule as a name of files and scenarios."""
+    return re.sub(r"[^a-z0-9]+", "_", rule.lower()).strip("_")[:60].rstrip("_") or "rule"
+
+
+def unused(folder: Path, stem: str) -> Path:
+    """A path in the folder (made if it is missing) whose `.json` and `.yaml` are free."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [stem, *(f"{stem}_{k}" for k in range(2, 1000))]
+    return next(folder / name for name in names if not (folder / f"{name}.json").exists())
+
+
+def raised_ages(policy: Policy, view: FleetView) -> dict[int, float] | None:
+    """Ages above the view's at which the policy decides more than on the view, or gives no directives at all.
+
+    None where the few tried show none, and where the policy gives no directives on the view itself.
+    """
+    try:
+        before = _decided(policy, view)
+    except Exception:  # the view alone shows the fault
+        return None
+    for older in View(plain=view).older():
+        try:
+            raised = raised_part(before, _decided(policy, older))
+        except Exception as error:
+            raised = f"raises {type(error).__name__}"
+        if raised is not None:
+            return dict(older.age_s)
+    return None
+
+
+def _decided(policy: Policy, view: FleetView) -> list[Directive]:
+    directives = list(policy(view))
+    check_directives(directives, view)
+    return directives
+
+
+def shows_in_flight(scenario: Scenario) -> bool:
+    """Whether the scenario's flight stops with the contract's error or breaks an invariant."""
+    try:
+        record = run_sortie(scenario)
+    except PolicyError:
+        return True
+    except Exception:  # what is no directive trips the audit before the contract names it: kept as a view alone
+        return False
+    return record.totals["invariant_violations"] > 0

@@ -1,0 +1,184 @@
+"""A scenario's own expectations, held against its outcome."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
+from sortie.sim.results.outcome import describe
+from sortie.sim.results.record import SortieRecord
+
+TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One expectation, what was got, and whether it holds."""
+
+    expected: str
+    got: str
+    holds: bool
+    because: str
+    metric: str = ""
+    """The metric that it is about; empty for decisions and golden outcomes."""
+    why: str = ""
+    """What the record says about it, where it does not hold."""
+    replication: int = 0
+    """Which one shows it best."""
+
+
+def metric(result: dict[str, Any], dotted: str) -> Any:
+    """A field of an outcome by its dotted name; list items by number.
+
+    Raises:
+        KeyError: no such field, naming the fields that there are.
+    """
+    value: Any = result
+    for depth, part in enumerate(dotted.split(".")):
+        if isinstance(value, list) and part.isdigit() and int(part) < len(value):
+            value = value[int(part)]
+        elif isinstance(value, dict) and part in value:
+            value = value[part]
+        else:
+            known = (
+                ", ".join(value)
+                if isinstance(value, dict)
+                else f"0 … {len(value) - 1}"
+                if isinstance(value, list)
+                else "nothing"
+            )
+            where = ".".join(dotted.split(".")[:depth]) or "the outcome"
+            raise KeyError(f"{dotted}: {where} has no {part!r}, it has {known}")
+    return value
+
+
+def check(
+    scenario: Scenario, record: SortieRecord, result: dict[str, Any], replications: Sequence[dict[str, Any]] = ()
+) -> list[Verdict]:
+    """Every expectation of the scenario, in its order.
+
+    Args:
+        record, result: of the sortie.
+        replications: outcomes of replications 0, 1, …, as many as the expectations ask for.
+    """
+    return [
+        *(
+            _check_metric(e, result) if e.replications is None else _check_mean(e, replications)
+            for e in scenario.expect
+        ),
+        *(_check_decision(e, record) for e in scenario.expect_decisions),
+    ]
+
+
+def in_words(e: Expectation) -> str:
+    """`ap50.mission ≥ 0.6 with 95 % over 20`."""
+    bounds = []
+    if e.equals is not None:
+        bounds.append(f"= {e.equals}")
+    if e.at_least is not None:
+        bounds.append(f"≥ {e.at_least:g}")
+    if e.at_most is not None:
+        bounds.append(f"≤ {e.at_most:g}")
+    off = f" (± {e.tolerance:g})" if e.tolerance else ""
+    sure = "" if e.confidence is None else f" with {100 * e.confidence:g} % over {e.replications}"
+    return f"{e.metric} {' and '.join(bounds)}{off}{sure}"
+
+
+def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
+    name, slack = expectation.metric, expectation.tolerance
+    expected = in_words(expectation)
+    try:
+        got = metric(result, name)
+    except KeyError as error:
+        return Verdict(expected, error.args[0], False, expectation.because, name)
+    holds = True
+    if expectation.equals is not None:
+        truths = [isinstance(x, bool) for x in (got, expectation.equals)]  # which are numbers to Python, and not here
+        holds = got == expectation.equals and truths[0] == truths[1]
+        if not any(truths) and isinstance(got, int | float) and isinstance(expectation.equals, int | float):
+            holds = abs(got - expectation.equals) <= max(TOLERANCE, slack)
+    if expectation.at_least is not None or expectation.at_most is not None:
+        number = isinstance(got, int | float) and not isinstance(got, bool)
+        holds = (
+            holds
+            and number
+            and (expectation.at_least is None or got >= expectation.at_least - slack)
+            and (expectation.at_most is None or got <= expectation.at_most + slack)
+        )
+    shown = f"{got:.6g}" if isinstance(got, float) else str(got)
+    return Verdict(expected, shown, holds, expectation.because, name)
+
+
+def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
+    """The mean over replications lies within each bound with the confidence asked for: Student's one-sided limit.
+
+    An expectation holds where the replications show it; one that they leave open fails, and more of them may settle it.
+    """
+    assert e.replications is not None and e.confidence is not None  # noqa: S101, PT018
+    expected, values = in_words(e), []
+    for i, result in enumerate(results[: e.replications]):
+        try:
+            value = metric(result, e.metric)
+        except KeyError as error:
+            return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric, replication=i)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric, replication=i)
+        values.append(float(value))
+    if len(values) < e.replications:
+        return Verdict(expected, f"{len(values)} replications flown", False, e.because, e.metric)
+    mean, off = limit(values, e.confidence)
+    low = e.at_least is not None and mean - off < e.at_least - e.tolerance
+    high = e.at_most is not None and mean + off > e.at_most + e.tolerance
+    got = f"{mean:.6g} ± {off:.2g} over {len(values)}"
+    if not low and not high:
+        return Verdict(expected, got, True, e.because, e.metric)
+    worst = values.index(min(values) if low else max(values))
+    got = f"{got}, {values[worst]:.6g} in replication {worst}"
+    return Verdict(expected, got, False, e.because, e.metric, replication=worst)
+
+
+def limit(values: Sequence[float], confidence: float) -> tuple[float, float]:
+    """The mean of n ≥ 2 values, and how far its one-sided confidence limit is from it: t(n − 1) s / √n."""
+    from scipy.special import stdtrit
+
+    n, mean = len(values), math.fsum(values) / len(values)
+    s = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1))
+    return mean, float(stdtrit(n - 1, confidence)) * s / math.sqrt(n)
+
+
+def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:
+    """Between from_s and until_s some link of the drone is given what is expected, for the reason expected."""
+    whom = f"drone {e.drone}" + ("" if e.peer is None else f" → {e.peer}")
+    what = " ".join(
+        [
+            e.representation or "anything",
+            *([f"at ≤ {e.rate_at_most_hz:g} Hz"] if e.rate_at_most_hz is not None else []),
+            *([f"{'with' if e.roi else 'without'} ROI"] if e.roi is not None else []),
+            *([f"because of {e.reason!r}"] if e.reason else []),
+        ]
+    )
+    expected = f"{whom}: {what} decided in [{e.from_s:g}, {e.until_s:g}] s"
+    rows = [
+        r
+        for r in record.tables["directives"].to_pylist()
+        if e.from_s - TOLERANCE <= r["t_s"] <= e.until_s + TOLERANCE
+        and r["drone"] == e.drone
+        and (e.peer is None or r["peer"] == e.peer)
+    ]
+    for r in rows:
+        if (
+            (e.representation is None or r["representation"] == e.representation)
+            and (e.rate_at_most_hz is None or r["rate_hz"] <= e.rate_at_most_hz)
+            and (e.roi is None or (r["roi_radius_m"] == r["roi_radius_m"]) == e.roi)  # NaN is no ROI
+            and e.reason in r["reason"]
+        ):
+            return Verdict(expected, _row_in_words(r), True, e.because)
+    got = "; ".join(_row_in_words(r) for r in rows[:3]) or "no decision"
+    return Verdict(expected, got, False, e.because)
+
+
+def _row_in_words(row: dict[str, Any]) -> str:
+    return f"{row['t_s']:.2f} s: {row['drone']} → {row['peer']} {describe(row)} ({row['reason']})"

@@ -1,0 +1,170 @@
+"""`pytest my_scenarios/`: every expectation of every scenario file is a test.
+
+A YAML file is a scenario with something to check where it has, on top, a `name` and `expect` or `expect_decisions`, or
+a golden outcome beside it, whether in block or in flow style; other YAML files are left alone. A file's sorties are flown
+once, when its first test runs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from sortie.sim.check.checking import Checked
+    from sortie.sim.check.expectations import Verdict
+
+MAX_BYTES = 1_000_000
+WRITTEN = pytest.StashKey[list[str]]()
+_NAME = re.compile(r"""^(["']?)name\1\s*:""", re.MULTILINE)
+_EXPECTS = re.compile(r"""^(["']?)expect(_decisions)?\1\s*:""", re.MULTILINE)
+_FLOW = re.compile(r"(\s|#[^\n]*\n|---(?=\s))*\{")
+"""How a file begins that is one section in braces."""
+_FLOW_NAMED = re.compile(_FLOW.pattern + r"""\s*(["']?)name\2\s*:""")
+_FLOW_EXPECTS = re.compile(r"""[{,]\s*(["']?)expect(_decisions)?\1\s*:""")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--sortie-update` and `--sortie-set`."""
+    group = parser.getgroup("sortie")
+    group.addoption("--sortie-update", action="store_true", help="Write golden outcomes of scenarios anew.")
+    group.addoption(
+        "--sortie-set", action="append", default=[], metavar="KEY=VALUE", help="Override a field of every scenario."
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Both options at once would write the outcome of another sortie than the scenario's."""
+    if config.getoption("sortie_update") and config.getoption("sortie_set"):
+        from sortie.sim.check.checking import ensure_own
+        from sortie.sim.folders import RunError
+
+        try:
+            ensure_own(config.getoption("sortie_set"), update=True)
+        except RunError as error:
+            raise pytest.UsageError(str(error)) from None
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Which golden outcomes were written."""
+    for line in config.stash.get(WRITTEN, []):
+        terminalreporter.write_line(line)
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
+    """A scenario file with expectations."""
+    if file_path.suffix in (".yaml", ".yml") and _is_scenario(file_path):
+        return ScenarioFile.from_parent(parent, path=file_path)
+    return None
+
+
+def _is_scenario(path: Path) -> bool:
+    from sortie.sim.check.golden import golden_path
+
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES).decode("utf-8", "replace")
+    except OSError:
+        return False
+    text = text.removeprefix("\ufeff")
+    golden = golden_path(path).is_file()
+    if _FLOW.match(text):
+        return (golden or bool(_FLOW_EXPECTS.search(text))) and _is_flow_scenario(text, golden=golden)
+    return bool(_NAME.search(text) and (golden or _EXPECTS.search(text)))
+
+
+def _is_flow_scenario(text: str, *, golden: bool) -> bool:
+    """Which keys stand on top only the reader can tell; a file that it cannot read is a scenario's if it begins as one."""
+    from sortie.scenarios.reading.load import ScenarioError, tree
+    from sortie.scenarios.reading.nodes import child
+
+    try:
+        root = tree(text, "")
+    except ScenarioError:
+        return bool(_FLOW_NAMED.match(text))
+    expects = golden or any(child(root, key) is not None for key in ("expect", "expect_decisions"))
+    return expects and child(root, "name") is not None
+
+
+class ScenarioFile(pytest.File):
+    """One scenario, flown when its first test runs."""
+
+    _checked: Checked | None = None
+
+    def collect(self) -> Iterator[ScenarioItem]:
+        """One test an expectation, and one for the golden outcome."""
+        from sortie.scenarios.reading.load import ScenarioError, load
+        from sortie.sim.check.expectations import in_words
+        from sortie.sim.check.golden import golden_path
+
+        try:
+            scenario = load(self.path, self.config.getoption("sortie_set"))
+        except ScenarioError as error:
+            raise self.CollectError(str(error)) from None
+        names = [in_words(e) for e in scenario.expect]
+        names += [f"decision {i}" for i in range(len(scenario.expect_decisions))]
+        if golden_path(self.path).is_file() or self.config.getoption("sortie_update"):
+            names.append("golden outcome")
+        for i, name in enumerate(names):
+            yield ScenarioItem.from_parent(self, name=name, number=i)
+
+    def checked(self) -> Checked:
+        """The verdicts, in the order of the tests."""
+        from sortie.sim.check.checking import check_scenario
+
+        if self._checked is None:
+            update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))
+            self._checked = check_scenario(str(self.path), overrides, update=update)
+            if self._checked.written:
+                self.config.stash.setdefault(WRITTEN, []).append(self._checked.written)
+        return self._checked
+
+
+class ScenarioItem(pytest.Item):
+    """One expectation."""
+
+    def __init__(self, *, number: int, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.number = number
+
+    def runtest(self) -> None:
+        """Fly if nobody has, and look at the verdict."""
+        assert isinstance(self.parent, ScenarioFile)  # noqa: S101
+        checked = self.parent.checked()
+        if self.number >= len(checked.verdicts):  # the golden outcome
+            if not checked.written:
+                pytest.skip("not compared under --sortie-set")
+            return
+        verdict = checked.verdicts[self.number]
+        if not verdict.holds:
+            raise ExpectationFailed(verdict, checked.replay(verdict))
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        """An expectation in its own words; what a user can mend in one line."""
+        if isinstance(excinfo.value, ExpectationFailed):
+            return excinfo.value.in_words()
+        if isinstance(excinfo.value, ValueError):  # scenarios, policies and files tell what is wrong in one line
+            return f"{type(excinfo.value).__name__}: {excinfo.value}"
+        return super().repr_failure(excinfo, style)
+
+    def reportinfo(self) -> tuple[Path, int | None, str]:
+        """Where the test stands."""
+        return self.path, None, f"{self.path.name}: {self.name}"
+
+
+class ExpectationFailed(AssertionError):
+    """An expectation that does not hold."""
+
+    def __init__(self, verdict: Verdict, replay: str) -> None:
+        super().__init__(f"{verdict.expected}, got {verdict.got}")
+        self.verdict, self.replay = verdict, replay
+
+    def in_words(self) -> str:
+        """Expected, got, why, and how to see it."""
+        v = self.verdict
+        lines = {"expected": v.expected, "got": v.got, "because": v.because, "the record": v.why, "see it": self.replay}
+        return "\n".join(f"{name:>10}  {text}" for name, text in lines.items() if text)

@@ -1,0 +1,156 @@
+"""Scenario events: what goes wrong, when, put on the clock."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Generator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import simpy
+
+from sortie.fleet.lies import falsified
+from sortie.fleet.messages.auth import TRAILER_BYTES, Sealer
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.scenarios.schema import (
+    BatteryFault,
+    CellFailure,
+    ClockSkew,
+    DroneLost,
+    Event,
+    Jam,
+    Lie,
+    LinkDrop,
+    Scenario,
+    Spoof,
+)
+from sortie.scenarios.streams import stream
+from sortie.sim.engine.transport import Ether
+from sortie.sim.engine.world import World, at, with_frame
+
+OVERSIZED_BYTES = 2000
+
+
+def group_key(seed: int) -> bytes:
+    """The fleet's 32-byte group key of a sortie: secret inside the simulation, derived so that runs repeat."""
+    return hashlib.sha256(b"sortie group key" + struct.pack("<Q", seed)).digest()
+
+
+def schedule(scenario: Scenario, world: World, ether: Ether, *, seed: int, replication: int) -> None:
+    """Put every event of the scenario on the clock; call once, before anything else is scheduled.
+
+    Events come before the frame that begins at the same instant, and so do their ends: from now, the clock says all of
+    their times to the last digit.
+    """
+    begins = [_Begin(scenario, world, ether, e, index, seed, replication) for index, e in enumerate(scenario.events)]
+    for begin in begins:
+        at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
+    for begin in begins:
+        event = begin.event
+        if isinstance(event, LinkDrop | Jam | Lie) and event.until_s is not None:
+            at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
+
+
+class _Begin:
+    """An event's begin; a callable, so that each keeps its own event."""
+
+    def __init__(
+        self, scenario: Scenario, world: World, ether: Ether, event: Event, index: int, seed: int, replication: int
+    ) -> None:
+        self.scenario, self.world, self.ether, self.event = scenario, world, ether, event
+        self.index, self.seed, self.replication = index, seed, replication
+
+    def __call__(self) -> None:
+        world, event = self.world, self.event
+        env = world.env
+        match event:
+            case LinkDrop():
+                world.note(event.drone, "link_drop", f"links of {_ends(event)} lose {event.loss_db:g} dB")
+                world.add_loss(event.drone, event.peer, event.loss_db)
+            case Jam():
+                world.note(-1, "jam", f"a jammer of {event.power_dbm:g} dBm at {event.position_m}")
+                world.jammers[self.index] = (event.position_m, event.power_dbm)
+            case DroneLost():
+                world.drain()  # what it has spent up to now
+                if world.agents[event.drone].airborne:
+                    world.remove(event.drone, "drone_lost", "fell silent")
+            case BatteryFault():
+                world.drain()
+                if world.agents[event.drone].airborne:  # who left the air spends nothing any more
+                    lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
+                    world.note(event.drone, "battery_fault", lost)
+                    world.batteries.fault(event.drone, event.lost_fraction)
+                    world.ground_landed()
+            case CellFailure():
+                world.drain()
+                if world.agents[event.drone].airborne:
+                    world.batteries.drop_cell(event.drone)
+                    world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
+                    world.ground_landed()
+            case ClockSkew():
+                world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
+                world.agents[event.drone].clock_skew_s = event.skew_s
+            case Spoof():
+                world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
+                env.process(self._spoof(env, event))
+            case Lie():
+                world.note(event.drone, "lie", f"claims {event.claim} {event.about}")
+                lie = partial(falsified, about=event.about, claim=event.claim)
+                world.agents[event.drone].lies[self.index] = lie
+
+    def end(self) -> None:
+        """What lasts is over."""
+        world, event = self.world, self.event
+        match event:
+            case LinkDrop():
+                world.add_loss(event.drone, event.peer, -event.loss_db)
+                world.note(event.drone, "link_back", f"links of {_ends(event)} are back")
+            case Jam():
+                del world.jammers[self.index]
+                world.note(-1, "jam_over", "the jammer is off")
+            case Lie():
+                del world.agents[event.drone].lies[self.index]
+                world.note(event.drone, "lie_over", "tells the truth again")
+
+    def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
+        """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""
+        rng = stream(self.seed, self.replication, (event.drone, self.index), "spoof")
+        sealer = Sealer(rng.bytes(32), key_id=1)
+        captured = b""
+        end_s = self.scenario.duration_s if event.until_s is None else event.until_s
+        listeners = [i for i in range(self.scenario.fleet.drones) if i != event.drone]
+        while env.now < end_s:
+            genuine = self.ether.last_datagram.get(event.drone, b"")
+            captured = captured or genuine
+            if genuine:
+                self.ether.inject(self._datagram(event, genuine, captured, sealer, rng), listeners)
+            yield env.timeout(1.0 / event.rate_hz)
+
+    def _datagram(
+        self, event: Spoof, genuine: bytes, captured: bytes, sealer: Sealer, rng: np.random.Generator
+    ) -> bytes:
+        authentic = self.scenario.context.authentication
+        match event.attack:
+            case "forged":
+                # A false descriptor: the drone claims an empty battery and no links.
+                body = genuine[:-TRAILER_BYTES] if authentic else genuine
+                lie = _empty_handed(body)
+                return sealer.seal(lie) if authentic else lie
+            case "replayed":
+                return captured
+            case "malformed":
+                return rng.bytes(len(genuine))
+            case "oversized":
+                return genuine + bytes(OVERSIZED_BYTES)
+
+
+def _ends(drop: LinkDrop) -> str:
+    return f"{drop.drone}" if drop.peer is None else f"{drop.drone}–{drop.peer}"
+
+
+def _empty_handed(descriptor_bytes: bytes) -> bytes:
+    descriptor = decode_descriptor(descriptor_bytes)
+    goodput = tuple(0.0 for _ in descriptor.peer_goodput_mbps)
+    return encode_descriptor(descriptor._replace(battery_soc=0.0, peer_goodput_mbps=goodput))

@@ -1,0 +1,263 @@
+"""Who decides on a drone right now: its policy, as the mission, the clock and the ground change it; and the audit.
+
+A pilot stands where the agent's policy stands. It takes over another policy between two decisions; what a link
+carries, its dwell time and when it last sent are the agent's and stay. It shows the policy a kept view where the
+scenario says so, counts the directives that break an invariant, and with a shield puts right what it can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import simpy
+
+from sortie.fleet.agent import Agent
+from sortie.policies.contract import (
+    Directive,
+    FleetView,
+    Policy,
+    PolicyError,
+    Reposition,
+    TaskPhase,
+    check_directives,
+    check_reposition,
+)
+from sortie.policies.registry import handshake_bytes, resolve, told, viewpoint_of
+from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
+from sortie.policies.verification.shield import MARK, checked, enforce
+from sortie.policies.verification.views import ViewError, from_json
+from sortie.scenarios.schema import Policy as PolicySection
+from sortie.scenarios.schema import PolicyChange
+from sortie.sim.engine.world import at, with_frame
+from sortie.sim.results.record import DECISIONS_OF, Recorder
+
+_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
+
+
+class Named(NamedTuple):
+    """A policy and what the audit calls it."""
+
+    name: str
+    decide: Policy
+    handshake_bytes: int = 0
+    """What it puts on every link and frame before payloads."""
+
+
+class Plan(NamedTuple):
+    """What a scenario says of the policies, resolved and checked before anything flies."""
+
+    first: Named
+    changes: tuple[tuple[PolicyChange, Named], ...] = ()
+    commands: tuple[tuple[float, str, tuple[int, ...]], ...] = ()
+    rules: tuple[Invariant, ...] = ()
+    shielded: bool = False
+    replays: tuple[tuple[float, int, FleetView], ...] = ()
+
+    @property
+    def looks(self) -> bool:
+        """Whether any of its policies chooses viewpoints."""
+        policies = (self.first, *(policy for _, policy in self.changes))
+        return any(viewpoint_of(policy.decide) is not None for policy in policies)
+
+
+def plan_of(section: PolicySection, first: Named | None = None) -> Plan:
+    """A scenario's policies; `first` flies instead of them all, with the scenario's invariants and shield.
+
+    Raises:
+        PolicyError: an unknown policy or parameter, an invariant that is none, a view that cannot be read.
+    """
+    changes = () if first is not None else tuple((c, named(c.name, c.params)) for c in section.changes)
+    commands = () if first is not None else tuple((c.at_s, c.command, c.drones) for c in section.commands)
+    try:
+        rules = parse(section.invariants)
+        replays = tuple((r.at_s, r.drone, from_json(r.view)) for r in section.replays)
+        if section.shield:
+            checked(rules)
+    except InvariantError as error:
+        raise PolicyError(f"policy.invariants: {error}") from error
+    except ViewError as error:
+        raise PolicyError(f"policy.replays: {error}") from error
+    for k, (_, drone, view) in enumerate(replays):
+        if view.ego != drone:
+            raise PolicyError(f"policy.replays.{k}.view: its ego is {view.ego}, must be drone {drone}")
+    return Plan(first or named(section.name, section.params), changes, commands, rules, section.shield, replays)
+
+
+def named(name: str, params: Mapping[str, object]) -> Named:
+    inside = ", ".join(f"{k}={v}" for k, v in params.items())
+    return Named(f"{name}({inside})" if inside else name, resolve(name, params), handshake_bytes(name, params))
+
+
+class Audit:
+    """Writes down which policy took over when and why, and where a directive broke an invariant."""
+
+    def __init__(self, env: simpy.Environment, recorder: Recorder) -> None:
+        self._env, self._rows = env, recorder.rows
+        self.counts = {"policy_changes": 0, "shield_interventions": 0, "invariant_violations": 0}
+        self.decisions: dict[str, int] = {}
+        """By policy."""
+
+    def totals(self) -> dict[str, float]:
+        """Counts, and decisions by policy as `decisions_of NAME`."""
+        return {**self.counts, **{f"{DECISIONS_OF}{name}": n for name, n in self.decisions.items()}}
+
+    def took_over(self, drone: int, before: str, after: str, why: str) -> None:
+        """A drone's policy changed."""
+        self.counts["policy_changes"] += 1
+        self._rows["events"].append((self._env.now, drone, "policy", f"{before} → {after}: {why}"))
+
+    def stepped_in(self, policy: str, directive: Directive) -> None:
+        """The shield replaced a directive, or could not keep an invariant."""
+        self.counts["shield_interventions"] += 1
+        self._write(directive.source, directive.destination, policy, "shield", directive.reason.removeprefix(MARK))
+
+    def broke(self, drone: int, peer: int, policy: str, what: str) -> None:
+        """A directive that goes to the gate breaks an invariant; peer −1: they all together."""
+        self.counts["invariant_violations"] += 1
+        self._write(drone, peer, policy, "broken", what)
+
+    def _write(self, drone: int, peer: int, policy: str, kind: str, what: str) -> None:
+        self._rows["interventions"].append((self._env.now, drone, peer, policy, kind, what))
+
+
+class Pilot:
+    """One drone's policy in flight."""
+
+    def __init__(
+        self, drone: int, plan: Plan, audit: Audit, wish: Callable[[int, Reposition | None], None] | None = None
+    ) -> None:
+        """Args: `wish` takes where the drone asks to look from; None where no policy of the plan does."""
+        self.drone, self.policy, self._wish = drone, plan.first, wish
+        self._look = viewpoint_of(plan.first.decide)
+        self.agent: Agent | None = None
+        changes = enumerate(plan.changes)
+        self._by_phase = {_PHASES[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
+        self._place = -1  # in the list of changes, of the last one since the last decision
+        self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
+        self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
+        self._phase: TaskPhase | None = None
+        self._shown: FleetView | None = None
+        self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
+
+    def take_over(self, policy: Named, why: str, place: int) -> None:
+        """From the next decision on, `policy` decides; `place` is the change's in the scenario's list."""
+        self._place = place
+        if policy.name != self.policy.name:
+            self._audit.took_over(self.drone, self.policy.name, policy.name, why)
+            self.policy, self._look = policy, viewpoint_of(policy.decide)
+            if self._look is None and self._wish is not None:
+                self._wish(self.drone, None)
+            if self.agent is not None:
+                self.agent.handshake_bytes = policy.handshake_bytes
+
+    def show(self, view: FleetView) -> None:
+        """The next decision is made on this view."""
+        self._shown = view
+
+    def __call__(self, view: FleetView) -> Sequence[Directive]:
+        """The agent's policy: the present policy's directives, put right where there is a shield."""
+        if self._by_phase:
+            self._follow_phase(view)
+        self._place = -1
+        decisions = self._audit.decisions
+        decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
+        if self._look is not None and self._wish is not None:
+            self._wish(self.drone, self._looked(view if self._shown is None else self._shown))
+        if not self._rules and self._shown is None:
+            return self._ask(view)
+        shown, self._shown = self._shown, None
+        directives = self._kept(view if shown is None else shown)
+        if shown is not None:
+            self._judge_shown(shown, directives)
+        return directives
+
+    def _follow_phase(self, view: FleetView) -> None:
+        me = view.me
+        if me is not None and me.task_phase != self._phase:
+            self._phase = me.task_phase
+            place, policy = self._by_phase.get(me.task_phase, (-1, self.policy))
+            if place > self._place:  # else a later one of the list came with the phase
+                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}", place)
+
+    def _looked(self, view: FleetView) -> Reposition | None:
+        """Where the policy asks to look from."""
+        assert self._look is not None  # noqa: S101
+        try:
+            asked = self._look(view)
+        except Exception as error:
+            what = f"its viewpoint raises {told(error)}"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
+        check_reposition(asked, view)
+        return asked
+
+    def _ask(self, view: FleetView) -> Sequence[Directive]:
+        try:
+            answer = self.policy.decide(view)
+        except PolicyError:
+            raise
+        except Exception as error:
+            what = f"raises {told(error)}"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
+        if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
+            what = f"returns {type(answer).__name__}, must be a sequence of directives"
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
+        return answer
+
+    def _kept(self, view: FleetView) -> Sequence[Directive]:
+        name, audit = self.policy.name, self._audit
+        directives = self._ask(view)
+        check_directives(directives, view)  # before the rules read them
+        fresh = self._ask(just_heard(view)) if self._asks_fresh else ()
+        if self._shielded:
+            directives = enforce(self._rules, view, directives, fresh)
+            for d in directives:
+                if d.reason.startswith(MARK):
+                    audit.stepped_in(name, d)
+        for rule in self._rules:
+            for broken in violations(rule, view, directives, fresh):
+                if broken is None:
+                    audit.broke(self.drone, -1, name, f"{rule.text}: {spelt(directives)}")
+                else:
+                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {spelt([broken])}")
+        return directives
+
+    def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:
+        """One directive a link; and where ages alone rose since the last view shown, no directive may have risen."""
+        for peer in set(shown.peers) - {d.destination for d in directives}:
+            self._audit.broke(self.drone, peer, self.policy.name, "one directive a link: none for this one")
+        before, self._last_shown = self._last_shown, (shown, directives)
+        if before is None or before[0].descriptors != shown.descriptors:
+            return
+        if all(shown.age_s[i] >= age_s for i, age_s in before[0].age_s.items()):
+            raised = raised_part(before[1], directives)
+            if raised is not None:
+                self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
+
+
+def schedule_policies(
+    env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
+) -> None:
+    """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
+    two changes at one instant the later in the list comes last."""
+    for pilot, agent in zip(pilots, agents, strict=True):
+        pilot.agent = agent
+    due: list[tuple[float, int, Callable[[], None]]] = []
+    for place, (change, policy) in enumerate(plan.changes):
+        if change.at_s is not None:
+            due.append((change.at_s, place, partial(_take_over, pilots, policy, f"time {change.at_s:g} s", place)))
+        for at_s, word, drones in plan.commands:
+            if change.command == word:
+                told = [p for p in pilots if not drones or p.drone in drones]
+                due.append((at_s, place, partial(_take_over, told, policy, f"command {word!r}", place)))
+    for at_s, _, act in sorted(due, key=lambda entry: entry[:2]):
+        at(env, with_frame(at_s, frame_s), act)
+    for at_s, drone, view in plan.replays:
+        at(env, at_s, partial(pilots[drone].show, view))
+
+
+def _take_over(pilots: Sequence[Pilot], policy: Named, why: str, place: int) -> None:
+    for pilot in pilots:
+        pilot.take_over(policy, why, place)

@@ -1,0 +1,162 @@
+"""Fusion and scoring: at each scored frame every receiver fuses what it holds, and its boxes are written down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import simpy
+
+from sortie.fleet.agent import Agent, Received
+from sortie.perception.detectors import DetectsAhead, DetectsMany
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Scenario
+from sortie.sim.results.record import REPRESENTATIONS, Recorder
+
+
+class Detector(Protocol):
+    """What a sortie needs of a detector."""
+
+    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]: ...
+    def truth(self, t_s: float, ego: Capture) -> Boxes: ...
+
+
+def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
+    """Whether a frame is scored, so that `sample_rate_hz` of them are in the mean; the first one is."""
+    share = min(1.0, sample_rate_hz / rate_hz)
+    return math.floor(frame * share + 1e-9) > math.floor((frame - 1) * share + 1e-9)
+
+
+def as_share(received: Received, trust: float = 1.0) -> Share:
+    """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
+    payload, roi = received.payload, received.payload.roi
+    disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
+    name, weight = REPRESENTATIONS[payload.representation], payload.fusion_weight * trust
+    return Share(received.capture, name, payload.rho, disc, weight, received.missing)
+
+
+Job = tuple[Capture, list[Share]]
+"""An ego's look, and what it holds of its peers."""
+
+
+class Ego(NamedTuple):
+    """One drone at one moment that is scored."""
+
+    here: Capture
+    """Where it is."""
+    job: Job | None
+    """What it fuses; None where its own look is too old for that, so that it sees nothing."""
+
+
+Moment = tuple[float, list[Ego]]
+"""When, and every ego."""
+
+
+def jobs_of(moment: Moment) -> list[Job]:
+    """What the detector is asked of a moment."""
+    return [ego.job for ego in moment[1] if ego.job is not None]
+
+
+class Scorer:
+    """Runs the detector over the fleet at the scored frames' fusion times.
+
+    A detector that takes many moments together is asked when `flush` is called, any other at the moment itself; one that
+    works in the background may take until the next moment.
+    """
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        scenario: Scenario,
+        detector: Detector,
+        agents: Sequence[Agent],
+        recorder: Recorder,
+    ) -> None:
+        self._env, self._scenario, self._detector = env, scenario, detector
+        # asked once: what a protocol asks of a class takes longer to find out than a fusion takes
+        self._many = detector if isinstance(detector, DetectsMany) else None
+        self._ahead = detector if isinstance(detector, DetectsAhead) else None
+        self._agents, self._recorder = agents, recorder
+        self._waiting: list[Moment] = []
+        self._begun: list[Callable[[], list[Boxes]]] = []
+        recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
+
+    def start(self) -> None:
+        """Begin the process; call once."""
+        self._env.process(self._run())
+
+    def _run(self) -> Generator[simpy.Event, Any, None]:
+        env, scenario = self._env, self._scenario
+        delay_s = scenario.perception.fusion_delay_s
+        for frame in range(scenario.frames):
+            if scored(frame, scenario.context.rate_hz, scenario.perception.sample_rate_hz):
+                yield env.timeout(max(0.0, frame * scenario.frame_s + delay_s - env.now))
+                self._score()
+
+    def _score(self) -> None:
+        now_s = self._env.now
+        moment: Moment = now_s, []
+        for agent in self._agents:
+            if agent.airborne and agent.here is not None and agent.latest is not None:
+                moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
+        self._waiting.append(moment)
+        if self._ahead is not None:
+            self._begun.append(self._ahead.begin(jobs_of(moment)))
+            self.flush(but=1)
+        elif self._many is None:
+            self.flush()
+
+    def flush(self, but: int = 0) -> None:
+        """Write down what the moments since the last call come to, but the latest so many."""
+        n = len(self._waiting) - but
+        waiting, self._waiting = self._waiting[:n], self._waiting[n:]
+        begun, self._begun = self._begun[:n], self._begun[n:]
+        asked = [(t_s, ego) for t_s, egos in waiting for ego in egos]
+        if not asked:
+            return
+        rows, detector = self._recorder.rows, self._detector
+        found: Iterable[Boxes]
+        truths: Iterable[Boxes]
+        if self._many is not None:
+            found = self._many.detect_many([jobs_of(moment) for moment in waiting])
+            truths = self._many.truth_many([t_s for t_s, _ in asked], [ego.here for _, ego in asked])
+        else:
+            ready = begun or [partial(detector.detect, jobs_of(moment)) for moment in waiting]
+            found = (boxes for wait in ready for boxes in wait())
+            truths = (detector.truth(t_s, ego.here) for t_s, ego in asked)
+        each = iter(found)
+        for (now_s, ego), truth in zip(asked, truths, strict=True):
+            boxes, shares = (Boxes.empty(), []) if ego.job is None else (next(each), ego.job[1])
+            drone = ego.here.drone
+            rows["detections"].append((now_s, drone, boxes))
+            rows["truths"].append((now_s, drone, truth))
+            rows["fusions"].append(
+                (
+                    now_s, drone, [s.capture.drone for s in shares], [s.representation for s in shares],
+                    [now_s - s.capture.t_s for s in shares], [s.weight for s in shares], len(boxes), len(truth),
+                )
+            )  # fmt: skip
+
+    def _job(self, agent: Agent, look: Capture, now_s: float) -> Job | None:
+        """The agent's look and what it holds, by ascending peer, of what is young enough; None where it rested too long."""
+        config = self._scenario.perception
+        limit_s = config.max_age_s + 1e-9
+        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # what a look takes anyhow
+            return None
+        held = [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
+        return look, [as_share(r, agent.trust_in(r.capture.drone)) for r in held]
+
+
+def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    """A fusion's boxes stand in one row."""
+    t_s, drones, several = zip(*rows, strict=True)
+    boxes, counts = Boxes.join(several), [len(b) for b in several]
+    values = boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad, boxes.score
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), *(v.astype(np.float64) for v in values)]
+
+
+def _unfold_truths(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    return _unfold_detections(rows)[:-1]

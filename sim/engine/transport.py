@@ -1,0 +1,127 @@
+"""Between the agents and the air: who hears which bytes, and what became of each payload.
+
+The radio knows bytes and positions only. This is where a datagram that was heard is opened and handed to its
+receivers, and where a transmission number is joined again with the payload it stands for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from sortie.fleet.agent import Agent, Received
+from sortie.fleet.gate import Payload
+from sortie.fleet.messages.auth import Dropped, Opened, open_datagram
+from sortie.fleet.tiles import cells_of
+from sortie.perception.types import Capture
+from sortie.policies.contract import Representation
+from sortie.radio import Air, Transmission
+from sortie.sim.results.record import HANDSHAKE, REPRESENTATIONS, Recorder
+
+
+class Ether:
+    """Joins every agent's modem to the one air."""
+
+    def __init__(
+        self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None, rates_mbps: Sequence[float]
+    ) -> None:
+        """Args: `keys` by key id, None where descriptors go unauthenticated; `rates_mbps` of the channel by MCS, none where
+        links are traced: then what a frame's rate is told is not what it came at."""
+        self._rates_mbps = rates_mbps
+        self.agents: Sequence[Agent] = ()
+        self.air = air
+        self.last_datagram: dict[int, bytes] = {}
+        """The latest genuine datagram of each drone, for whoever listens."""
+        self._recorder = recorder
+        self._keys = keys
+        self._pending: dict[int, tuple[Payload, Capture]] = {}
+        recorder.unfold["transmissions"] = _unfold_transmissions
+
+    def modem(self, drone: int) -> _Modem:
+        """The drone's end of the air."""
+        return _Modem(self, drone)
+
+    def publish(self, drone: int, datagram: bytes) -> None:
+        """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
+        self.last_datagram[drone] = datagram
+        opened = open_datagram(datagram, self._keys)
+        self.air.broadcast(drone, len(datagram), partial(self.hand_over, opened))
+
+    def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
+        """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""
+        self.hand_over(open_datagram(datagram, self._keys), listeners)
+
+    def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
+        """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
+        for receiver in heard:
+            agent = self.agents[receiver]
+            if agent.airborne:
+                refused = agent.hear(opened)
+                if refused is not None:
+                    self._recorder.rows["drops"].append((agent.env.now, receiver, refused.value))
+
+    def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
+        """Hand a payload to the radio."""
+        number = self.air.send(
+            drone,
+            peer,
+            payload.size_bytes,
+            kind=REPRESENTATIONS[payload.representation],
+            reliable=payload.reliable,
+            deadline_s=deadline_s,
+            on_done=self._done,
+            piece_bytes=payload.tile_bytes,
+        )
+        self._pending[number] = (payload, capture)
+
+    def handshake(self, drone: int, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
+        """Hand a method's request or answer to the radio; it takes airtime, and nothing waits for it."""
+        number = self.air.send(
+            drone, peer, size_bytes, kind=HANDSHAKE, reliable=False, deadline_s=deadline_s, on_done=self._done
+        )  # fmt: skip
+        self._pending[number] = (Payload(Representation.NONE, 0.0, None, 0.0, 0, 0, 0, size_bytes), capture)
+
+    def finish(self) -> None:
+        """Write down what is still in flight."""
+        for transmission in self.air.finish():
+            self._write(transmission, *self._pending.pop(transmission.number))
+
+    def _done(self, transmission: Transmission) -> None:
+        payload, capture = self._pending.pop(transmission.number)
+        self._write(transmission, payload, capture)
+        if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
+            missing, mcs, rates_mbps = transmission.missing, transmission.mcs, self._rates_mbps
+            if missing:
+                missing = cells_of(missing, payload.cells, payload.tile_cells)
+            phy_mbps = rates_mbps[mcs] if 0 <= mcs < len(rates_mbps) else math.inf
+            self.agents[transmission.receiver].receive(
+                Received(capture, payload, transmission.t_done_s, missing, phy_mbps)
+            )
+
+    def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:
+        self._recorder.rows["transmissions"].append((transmission, payload, capture.t_s))
+
+
+def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+    """What the radio, the gate and the sensors each know of a transmission, side by side."""
+    transmissions, payloads, captured_s = zip(*rows, strict=True)
+    t = dict(zip(Transmission._fields, zip(*transmissions, strict=True), strict=True))
+    p = dict(zip(Payload._fields, zip(*payloads, strict=True), strict=True))
+    return [
+        t["t_sent_s"], t["sender"], t["receiver"], t["kind"], captured_s, p["rho"], p["cells"], p["boxes"],
+        p["index_bytes"], t["payload_bytes"], t["wire_bytes"], t["deadline_s"], t["t_start_s"], t["t_done_s"],
+        t["status"], t["reason"], t["fragments"], t["fragments_lost"], t["repairs"], t["mcs"], t["snr_db"],
+        t["airtime_s"], t["hops"], t["arrived_bytes"],
+    ]  # fmt: skip
+
+
+class _Modem:
+    """One drone's end of the air (sortie.fleet.agent.Modem)."""
+
+    def __init__(self, ether: Ether, drone: int) -> None:
+        self.broadcast = partial(ether.publish, drone)
+        self.send = partial(ether.send, drone)
+        self.handshake = partial(ether.handshake, drone)
+        self.goodput_mbps = partial(ether.air.goodput_mbps, drone)

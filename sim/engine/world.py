@@ -1,0 +1,268 @@
+"""The physical side of a sortie: once a frame, drones have moved and drained, and the links are new.
+
+Also where scenario events act on the physics: extra loss, jammers, battery faults, lost drones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import simpy
+
+from sortie.fleet.agent import Agent, Platform, Task
+from sortie.fleet.coverage import RANGE_M
+from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.frames import up_vector
+from sortie.fleet.flight.motion import Motion
+from sortie.fleet.flight.rotor import fleet_power_w
+from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Capture
+from sortie.policies.contract import Disc
+from sortie.radio import Air
+from sortie.radio.topology import connectivity, linked_drones
+from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.results.record import Recorder
+
+NAN = float("nan")
+_NO_DISC, _NOWHERE = (NAN, NAN, NAN), (NAN, NAN)
+SECOND_S = 1.0
+USABLE_SNR_DB = 0.0
+"""Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
+
+LEAST_MBPS = 1e-6
+"""A link that carries anything at all."""
+
+INSTANT_S = 1e-9
+"""Times so little apart are one, and differ by rounding."""
+
+
+def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
+    """Call `act` at simulated time `t_s`."""
+    event = env.timeout(max(0.0, t_s - env.now))
+    event.callbacks.append(lambda _event: act())
+
+
+def with_frame(t_s: float, frame_s: float) -> float:
+    """When what happens at `t_s` is due, so that it is no later than a frame that begins then: at 7.5 Hz the clock of
+    14.8 s says a last digit less."""
+    frame_at_s = round(t_s / frame_s) * frame_s
+    return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
+
+
+class World:
+    """Positions, batteries, links and mission, stepped once a frame."""
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        scenario: Scenario,
+        motion: Motion,
+        batteries: FleetBatteries,
+        air: Air,
+        scene: SceneModel,
+        plan: MissionPlan,
+        recorder: Recorder,
+    ) -> None:
+        self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
+            env, motion, batteries, air, scene, plan,
+        )  # fmt: skip
+        self.agents: Sequence[Agent] = ()
+        n = scenario.fleet.drones
+        self.extra_loss_db: np.ndarray | None = None
+        """[N, N] what scenario events add to the path loss; None until one does."""
+        self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
+        self.on_second: Callable[[float], None] | None = None
+        """Called once a simulated second; must not change anything."""
+        self.before_frame: Callable[[int], None] | None = None
+        """Called at each frame's begin, before the links are new: where the fleet may take another way."""
+        self._scenario, self._recorder = scenario, recorder
+        # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
+        self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
+        self._flight = FlightSenses(motion, scenario.frame_s)
+        recorder.unfold["states"] = self._unfold_states
+        self.busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
+        """Share of a frame in which a drone's computer runs perception, when it senses: its compute delay."""
+        self._airtime_s = [0.0] * n
+        self._stepped_to_s = 0.0
+        self._busy_at_s = (0.0, 0.0)
+        self._frame = 0
+        self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
+        self.airtime_share = [0.0] * n
+        self.now = plan.at(0.0)
+        """The mission in this frame: the ground station's cue comes with the frame."""
+
+    def start(self) -> None:
+        """Begin the world's process; call once, before the agents start."""
+        self.env.process(self._run())
+
+    def _run(self) -> Generator[simpy.Event, Any, None]:
+        env, scenario = self.env, self._scenario
+        frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
+        for frame in range(scenario.frames):
+            yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
+            self.drain()
+            self._frame = frame
+            self.now = self.plan.at(env.now)
+            if self.before_frame is not None:
+                self.before_frame(frame)
+            self.air.advance(self.extra_loss_db, list(self.jammers.values()))
+            self._write(frame)
+            if frame % frames_a_second == 0:
+                self._write_medium()
+                if self.on_second is not None:
+                    self.on_second(env.now)
+
+    def reroute(self, motion: Motion) -> None:
+        """From the frame that begins on the fleet flies another way; what was flown before must be the same."""
+        self.motion = motion
+        self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
+        self._flight = FlightSenses(motion, self._scenario.frame_s)
+        self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
+
+    def drain(self) -> None:
+        """Drain the batteries for the time since the last call, and land who has to."""
+        dt_s = self.env.now - self._stepped_to_s
+        if dt_s <= INSTANT_S:  # no time to tell shares of
+            return
+        self._stepped_to_s = self.env.now
+        airtime_s = list(self.air.airtime_s)
+        self.airtime_share = [min(1.0, (a - b) / dt_s) for a, b in zip(airtime_s, self._airtime_s, strict=True)]
+        self._airtime_s = airtime_s
+        self.batteries.step(
+            dt_s,
+            self._rotor_w[self._frame],
+            [self.busy_sensing if a.sensed else 0.0 for a in self.agents],
+            self.airtime_share,
+        )
+        self.ground_landed()
+
+    def ground_landed(self) -> None:
+        """Take drones whose battery gave out off the plane and the air."""
+        for agent, landed in zip(self.agents, self.batteries.landed, strict=True):
+            if landed and agent.airborne:
+                self.remove(agent.drone, "landed", self.batteries.why_landed[agent.drone])
+
+    def remove(self, drone: int, kind: str, text: str) -> None:
+        """A drone leaves the sortie: it is silent from now on, draws nothing, and stays where it is."""
+        self._down_since.setdefault(drone, int(self.env.now / self._scenario.frame_s + 1e-6))
+        self.agents[drone].stop()
+        self.air.silence(drone)
+        self.batteries.land(drone)
+        self.note(drone, kind, text)
+
+    def add_loss(self, drone: int, peer: int | None, loss_db: float) -> None:
+        """Add loss to both directions of a link, or of every link of a drone."""
+        n = len(self.agents)
+        loss = np.zeros((n, n)) if self.extra_loss_db is None else self.extra_loss_db.copy()
+        others = slice(None) if peer is None else peer
+        loss[drone, others] += loss_db
+        loss[others, drone] += loss_db
+        self.extra_loss_db = loss if loss.any() else None
+
+    def note(self, drone: int, kind: str, text: str) -> None:
+        """Write an event down; drone −1 is the whole fleet."""
+        self._recorder.rows["events"].append((self.env.now, drone, kind, text))
+
+    def _write_medium(self) -> None:
+        """How busy the channel has been since the last row, and how many drones have a usable link."""
+        busy_s = self.air.utilisation * self.env.now
+        since_s = self.env.now - self._busy_at_s[0]
+        busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
+        self._busy_at_s = (self.env.now, busy_s)
+        flying = [a.drone for a in self.agents if a.airborne]
+        usable = self.air.usable(USABLE_SNR_DB)
+        linked = linked_drones(usable if len(flying) == len(usable) else usable[np.ix_(flying, flying)], threshold=1.0)
+        self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
+        if self._scenario.radio.relay_max_hops > 1:
+            self._write_topology(flying)
+
+    def _write_topology(self, flying: Sequence[int]) -> None:
+        """How the fleet hangs together: whether all reach all, who is cut off, and the link that limits the worst-off pair."""
+        whole = connectivity(self.air.link_mbps()[np.ix_(flying, flying)], LEAST_MBPS)
+        i, j, mbps = whole.bottleneck or (None, None, NAN)
+        ends = (-1, -1) if i is None or j is None else (flying[i], flying[j])
+        cut = [flying[k] for k in whole.cut]
+        self._recorder.rows["topology"].append((self.env.now, whole.connected, cut, *ends, mbps))
+
+    def _write(self, frame: int) -> None:
+        rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
+        airborne = [agent.airborne for agent in self.agents]
+        rows["states"].append(
+            (now_s, frame, batteries.soc.copy(), batteries.voltage_v.copy(), batteries.current_a.copy(), airborne)
+        )
+        phase, region, target = self.now
+        rows["mission"].append((now_s, phase, *(region or _NO_DISC), *(target or _NOWHERE)))
+
+    def _unfold_states(self, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
+        now_s, frames, *changing = zip(*rows, strict=True)
+        n, m = len(self.agents), self.motion
+        at = np.tile(np.array(frames)[:, None], n)
+        for drone, since in self._down_since.items():
+            at[:, drone] = np.minimum(at[:, drone], since)
+        of, still = np.arange(n), (at < np.array(frames)[:, None])[..., None]
+        pose = (m.position_m[at, of], m.orientation_xyzw[at, of])
+        moving = [np.where(still, 0.0, states[at, of]) for states in (m.velocity_mps, m.body_rates_radps)]
+        flown = np.concatenate([*pose, *moving], axis=-1).reshape(len(rows) * n, -1)
+        return [
+            np.repeat(now_s, n),
+            np.tile(range(n), len(rows)),
+            *flown.T,
+            *(list(chain.from_iterable(c)) for c in changing),
+        ]
+
+    # --- what one drone knows of itself ----------------------------------------------------------
+
+    def senses(self, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> _OwnSenses:
+        """The drone's own sensors (sortie.fleet.agent.Senses); without a detector, boxes are the cars in range."""
+        return _OwnSenses(self, drone, count_boxes)
+
+
+class _OwnSenses:
+    """One drone's view of itself; the rest of the world stays behind it."""
+
+    def __init__(self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> None:
+        self._world, self._drone, self._count_boxes = world, drone, count_boxes
+        self._sensed = world._flight.at(0)[drone]
+
+    def sense(self, frame: int) -> Sensed:
+        self._sensed = sensed = self._world._flight.at(frame)[self._drone]
+        return sensed
+
+    def platform(self) -> Platform:
+        """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
+        world, i = self._world, self._drone
+        sensing = world.busy_sensing if world.agents[i].sensed else 0.0
+        return Platform(world.batteries.soc[i], 1.0 - world.airtime_share[i], 1.0 - sensing)
+
+    def task(self) -> Task:
+        sensed = self._sensed
+        return self._world.now.task(sensed.capture.position_m, sensed.footprint_radius_m)
+
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        if self._count_boxes is not None:
+            return self._count_boxes(capture, roi)
+        return cars_in_reach(self._world.scene, capture, roi)
+
+
+def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
+    """How many cars a drone could report: within its range, or within a disc."""
+    x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
+    if roi is not None:
+        x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
+    return scene.cars_near(capture.t_s, x_m, y_m, radius_m)
+
+
+def route_bounds(motion: Motion) -> tuple[float, float, float, float]:
+    """x_min, y_min, x_max, y_max of everything flown, ENU."""
+    low = motion.position_m.min(axis=(0, 1))
+    high = motion.position_m.max(axis=(0, 1))
+    if not all(math.isfinite(v) for v in (*low, *high)):
+        raise ValueError("the motion is not finite")
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -1,0 +1,1 @@
+"""What a sortie leaves behind: the record, the outcome, the run's folder, tables and pages."""

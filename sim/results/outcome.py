@@ -1,0 +1,303 @@
+"""The outcome of a sortie: what the record comes to, as the plain values of outcome.json.
+
+Everything here is computed from the record's tables; the README of this room lists every field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from sortie.perception.metrics.ap import Matched, average_precision, judge
+from sortie.perception.types import Boxes
+from sortie.radio.transmission import Status
+from sortie.sim.results.outcome_fields import REASONS
+from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
+
+DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
+
+
+def outcome(record: SortieRecord) -> dict[str, Any]:
+    """All figures of one sortie, JSON-ready; ratios of nothing are null."""
+    tables, totals = record.tables, record.totals
+    sent = tables["transmissions"]
+    data_sent = _sum(sent["payload_bytes"])
+    by_status = {s: _sum(sent.filter(pc.equal(sent["status"], s))["payload_bytes"]) for s in DATA_STATUSES}
+    partial = sent.filter(pc.equal(sent["status"], "partial"))
+    by_status["delivered"] += _sum(partial["arrived_bytes"])
+    rest = pc.subtract(partial["payload_bytes"], partial["arrived_bytes"])
+    for status in (Status.LOST, Status.EXPIRED):  # the rest of them came to what their reasons are of
+        by_status[status] += _sum(rest.filter(pc.is_in(partial["reason"], pa.array(REASONS[status]))))
+    context_bytes = totals["context_descriptor_bytes"] + totals["context_directive_bytes"]
+    scenario = record.scenario
+    minutes = scenario.duration_s / 60.0
+    links = scenario.fleet.drones * (scenario.fleet.drones - 1)
+    changes = list(transitions(tables["directives"], {}))
+    drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
+    both = both_matched(record)
+    return {
+        "scenario": scenario.name,
+        "policy": record.policy,
+        "seed": record.seed,
+        "replication": record.replication,
+        "version": record.version,
+        "fingerprint": record.fingerprint,
+        "duration_s": scenario.duration_s,
+        "frame_s": scenario.frame_s,
+        "ap50": {
+            **_accuracy(both),
+            "detector": scenario.perception.detector,
+            "calibration": record.calibration,
+            "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
+            "scored_fusions": tables["fusions"].num_rows,
+        },
+        "bytes": {
+            "context_sent": int(context_bytes),
+            "context_descriptors": int(totals["context_descriptor_bytes"]),
+            "context_directives": int(totals["context_directive_bytes"]),
+            "data_sent": data_sent,
+            "handshakes_sent": _sum(sent.filter(pc.equal(sent["representation"], HANDSHAKE))["payload_bytes"]),
+            **{f"data_{status}": count for status, count in by_status.items()},
+        },
+        "context_share": _ratio(context_bytes, context_bytes + data_sent),
+        "data_rate_mbps": data_sent * 8e-6 / scenario.duration_s,
+        "deadline_miss_rate": _miss_rate(sent),
+        "payload_fates": {
+            f"{row['status']}{'/' + row['reason'] if row['reason'] else ''}": row["count_all"]
+            for row in sent.group_by(["status", "reason"]).aggregate([([], "count_all")]).sort_by("status").to_pylist()
+        },
+        "medium_busy_fraction": totals["medium_busy_fraction"],
+        "age_s": _percentiles(tables["ages"]["age_s"]),
+        "data_age_s": _percentiles(pc.list_flatten(tables["fusions"]["ages_s"])),
+        "descriptor_drops": _counts(tables["drops"]["reason"]),
+        "battery": {d: v["soc"] for d, v in drones.items()},
+        "drones": drones,
+        "energy_j": _energy(tables["energy"]),
+        "policies": {
+            "decisions": {k.removeprefix(DECISIONS_OF): v for k, v in totals.items() if k.startswith(DECISIONS_OF)},
+            "changes": totals["policy_changes"],
+            "shield_interventions": totals["shield_interventions"],
+            "invariant_violations": totals["invariant_violations"],
+        },
+        "switches": sum(len(c["peers"]) for c in changes) / (links * minutes) if links else None,
+        "transitions": changes,
+        "phases": [_phase(record, both, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
+        "distrusted_by": _distrusted_by(tables["trust"]),
+        "events": tables["events"].to_pylist(),
+        "policy_eval_us": {
+            "p50": record.wall.get("policy_eval_us_p50"),
+            "p99": record.wall.get("policy_eval_us_p99"),
+        },
+        "wall_s": record.wall.get("wall_s"),
+        "realtime_factor": _ratio(scenario.duration_s, record.wall.get("wall_s", 0.0)),
+    }
+
+
+# --- accuracy ------------------------------------------------------------------------------------
+
+
+def matched(
+    record: SortieRecord, *, mission: bool, begin_s: float = 0.0, end_s: float = float("inf")
+) -> dict[tuple[float, int], Matched]:
+    """Every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
+
+    Args:
+        mission: count the mission disc alone, and only fusions made while there is one.
+    """
+    judged = _Fusions(record, begin_s, end_s)
+    return judged.in_mission() if mission else judged.in_full()
+
+
+def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
+    """AP@0.5 in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
+    return _accuracy(both_matched(record), begin_s, end_s)
+
+
+Both = dict[str, dict[tuple[float, int], Matched]]
+"""Matched fusions, `full_scene` and `mission`."""
+
+
+def both_matched(record: SortieRecord) -> Both:
+    """Every scored fusion matched in the full scene and in the mission disc."""
+    judged = _Fusions(record, 0.0, float("inf"))
+    return {"full_scene": judged.in_full(), "mission": judged.in_mission()}
+
+
+class _Fusions:
+    """The scored fusions of a record from `begin_s` to `end_s`; overlaps are worked out once, whatever is asked then."""
+
+    def __init__(self, record: SortieRecord, begin_s: float, end_s: float) -> None:
+        tables = record.tables
+        t_s, drone = tables["fusions"]["t_s"].to_numpy(), tables["fusions"]["drone"].to_numpy()
+        asked = (begin_s <= t_s) & (t_s < end_s)
+        self._t_s = t_s[asked]
+        self._keys = list(zip(self._t_s.tolist(), drone[asked].tolist(), strict=True))
+        found, at = _boxes_of(self._keys, tables["detections"])
+        self._truth, cars = _boxes_of(self._keys, tables["truths"])
+        self._judged = judge(found, at, self._truth, cars, len(self._keys))
+        self._found = found.take(self._judged.order)
+        self._missions = tables["mission"]
+
+    def in_full(self) -> dict[tuple[float, int], Matched]:
+        """By (time, ego), the full scene."""
+        return dict(zip(self._keys, self._judged.matched(), strict=True))
+
+    def in_mission(self) -> dict[tuple[float, int], Matched]:
+        """By (time, ego), the mission disc, where there is one."""
+        discs = np.column_stack([self._missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
+        disc = discs[np.searchsorted(self._missions["t_s"].to_numpy(), self._t_s, side="right") - 1]
+        found, cars = self._judged.image, self._judged.cars
+        inside = self._judged.matched(_within(self._found, disc[found]), _within(self._truth, disc[cars]))
+        there = ~np.isnan(disc[:, 2])
+        return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
+
+
+def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each box's centre is in its disc [n, 3], as `Boxes.inside` says; in none that is NaN."""
+    dx, dy = boxes.xy_m[:, 0] - disc[:, 0], boxes.xy_m[:, 1] - disc[:, 1]
+    return np.asarray(dx * dx + dy * dy <= disc[:, 2] ** 2)
+
+
+def _accuracy(both: Both, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
+    found = {}
+    for name, fusions in both.items():
+        frames = [m for (t_s, _), m in fusions.items() if begin_s <= t_s < end_s]
+        ap = average_precision(frames) if frames else float("nan")
+        found[name] = None if np.isnan(ap) else ap
+    return found
+
+
+def _boxes_of(keys: Sequence[tuple[float, int]], table: pa.Table) -> tuple[Boxes, NDArray[np.int64]]:
+    """A box table's boxes of some fusions (time, ego), and which of them each is of; both in order of time."""
+    column = {c: table[c].to_numpy() for c in table.column_names}
+    t_s, drone = column["t_s"], column["drone"]
+    # rows of one fusion stand together
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(t_s) != 0) | (np.diff(drone) != 0)])[: len(t_s)])
+    number = {key: k for k, key in enumerate(keys)}
+    of = [number.get(key, -1) for key in zip(t_s[first].tolist(), drone[first].tolist(), strict=True)]
+    at = np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
+    score = column.get("score", np.ones(len(t_s)))
+    xy = np.column_stack([column["x_m"], column["y_m"]])
+    boxes = Boxes(xy, np.column_stack([column["length_m"], column["width_m"]]), column["yaw_rad"], score)
+    return (boxes, at) if len(at) == 0 or at.min() >= 0 else (boxes.take(at >= 0), at[at >= 0])
+
+
+# --- traffic, decisions, energy ------------------------------------------------------------------
+
+
+def _sum(column: pa.ChunkedArray) -> int:
+    return int(pc.sum(pc.cast(column, pa.int64())).as_py() or 0)
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return part / whole if whole else None
+
+
+def _percentiles(column: Any) -> dict[str, float | None]:
+    values = column.to_numpy()
+    if len(values) == 0:
+        return {"p50": None, "p99": None}
+    p50, p99 = np.percentile(values, [50, 99])
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def _counts(column: pa.ChunkedArray) -> dict[str, int]:
+    return {str(v["values"]): int(v["counts"]) for v in pc.value_counts(column).to_pylist()}
+
+
+def _distrusted_by(trust: pa.Table) -> dict[str, int]:
+    """How many drones came to doubt each drone that anyone did."""
+    pairs = {(r["peer"], r["drone"]) for r in trust.to_pylist() if r["trust"] < 1.0}
+    return {str(peer): sum(p == peer for p, _ in pairs) for peer in sorted({p for p, _ in pairs})}
+
+
+def _miss_rate(sent: pa.Table) -> float | None:
+    """Payloads that missed their deadline or were replaced before it, over those whose fate is known.
+
+    One of tiles that was cut short is one, whatever of it had come: it is `partial`, with the reason of an expired one.
+    """
+    known = sent.num_rows - _counts(sent["status"]).get(Status.IN_FLIGHT, 0)
+    reasons = _counts(sent["reason"])
+    return _ratio(sum(reasons.get(reason, 0) for reason in REASONS[Status.EXPIRED]), known)
+
+
+def _drones(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, dict[str, Any]]:
+    """Each drone at the end, and the energy it spent."""
+    last = states.slice(max(0, states.num_rows - drones))
+    spent = np.zeros(drones)
+    np.add.at(spent, energy["drone"].to_numpy(), energy["energy_j"].to_numpy())
+    return {
+        str(row["drone"]): {
+            **{name: row[name] for name in ("soc", "voltage_v", "airborne")},
+            "energy_j": float(spent[row["drone"]]),
+        }
+        for row in last.to_pylist()
+    }
+
+
+def _energy(energy: pa.Table) -> dict[str, float]:
+    by_cause = energy.group_by("cause", use_threads=False).aggregate([("energy_j", "sum")])
+    return {
+        **{row["cause"]: row["energy_j_sum"] for row in by_cause.to_pylist()},
+        "total": float(pc.sum(energy["energy_j"]).as_py() or 0.0),
+    }
+
+
+def describe(row: dict[str, Any]) -> str:
+    """A directive in words: `features ρ=0.25 at 10 Hz in 32 m`."""
+    if row["representation"] == "none" or row["rate_hz"] <= 0:
+        return "nothing"
+    budget = f" ρ={row['rho']:.3g}" if row["representation"] == "features" else ""
+    roi = "" if np.isnan(row["roi_radius_m"]) else f" in {row['roi_radius_m']:.0f} m"
+    return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
+
+
+def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
+    """Changes of what a link carries (a disc that moves is none); links of a drone that change alike in one entry.
+
+    The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
+    brought up to date. Each entry comes before the next one's changes are in `carried`.
+    """
+    entry: dict[str, Any] | None = None
+    for row in directives.to_pylist():
+        link, level = (row["drone"], row["peer"]), describe(row)
+        before = carried.get(link, "nothing")
+        if level == before:
+            continue
+        change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
+        if entry is not None and all(entry[k] == v for k, v in change.items()):
+            entry["peers"].append(row["peer"])
+        else:
+            if entry is not None:
+                yield entry
+            entry = {**change, "peers": [row["peer"]]}
+        carried[link] = level
+    if entry is not None:
+        yield entry
+
+
+def _phases(record: SortieRecord) -> Iterator[tuple[float, float, str]]:
+    phases, end_s = record.scenario.mission.phases, record.scenario.duration_s
+    for phase, following in zip(phases, [*phases[1:], None], strict=True):
+        if phase.at_s < end_s:
+            yield phase.at_s, min(end_s, following.at_s) if following else end_s, phase.phase
+
+
+def _phase(record: SortieRecord, both: Both, begin_s: float, end_s: float, name: str) -> dict[str, Any]:
+    sent = record.tables["transmissions"]
+    sent = sent.filter(pc.and_(pc.greater_equal(sent["captured_s"], begin_s), pc.less(sent["captured_s"], end_s)))
+    features = sent.filter(pc.equal(sent["representation"], "features"))
+    return {
+        "phase": name,
+        "begin_s": begin_s,
+        "end_s": end_s,
+        "ap50": _accuracy(both, begin_s, end_s),
+        "data_rate_mbps": _sum(sent["payload_bytes"]) * 8e-6 / (end_s - begin_s),
+        "feature_payload_bytes": _percentiles(pc.cast(features["payload_bytes"], pa.float64()))["p50"],
+        "deadline_miss_rate": _miss_rate(sent),
+    }

@@ -1,0 +1,230 @@
+"""The fields of `outcome.json` and what they mean: the reference in `outcome.md` is made of this.
+
+A test holds `sortie.sim.results.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from types import UnionType
+from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
+
+from sortie.fleet.energy.battery import CAUSES, RECORDED
+from sortie.fleet.messages.auth import DropReason
+from sortie.radio.transmission import Status
+from sortie.scenarios.reading.nodes import nearest
+
+
+class Percentiles(TypedDict):
+    p50: Annotated[float | None, "Median."]
+    p99: Annotated[float | None, "99th percentile."]
+
+
+class Accuracy(TypedDict):
+    full_scene: Annotated[
+        float | None, "AP@0.5 over all cars within range, rotated BEV IoU, pooled over egos and scored fusions."
+    ]
+    mission: Annotated[
+        float | None, "The same of detections and cars whose centres lie in the mission disc, while there is one."
+    ]
+
+
+class Ap50(Accuracy):
+    detector: Annotated[str, "`perception.detector`."]
+    calibration: Annotated[str | None, "Which fit a surrogate detector is of."]
+    sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
+    scored_fusions: Annotated[int, "How many fusions were scored."]
+
+
+class Bytes(TypedDict):
+    context_sent: Annotated[int, "Descriptors and directives."]
+    context_descriptors: Annotated[int, "Descriptors as sent, 28 B of authentication included."]
+    context_directives: Annotated[int, "Directives at 36 B, counted when they change."]
+    data_sent: Annotated[int, "Payloads handed to the radio: delivered + lost + expired + in flight."]
+    handshakes_sent: Annotated[
+        int, "What a method put on its links before payloads (`sortie.policies.catalogue.prior`), part of `data_sent`."
+    ]
+    data_delivered: Annotated[int, "Arrived; of payloads that came in part, that part."]
+    data_lost: Annotated[int, "Lost on the air."]
+    data_expired: Annotated[int, "Past their deadline, or replaced by a newer one before they were through."]
+    data_in_flight: Annotated[int, "On the way at the end."]
+
+
+class Drone(TypedDict):
+    soc: Annotated[float, "State of charge, 0 … 1."]
+    voltage_v: Annotated[float, "At the pack's terminals."]
+    airborne: Annotated[bool, "Whether it still flew."]
+    energy_j: Annotated[float, "Spent to the very end, all causes."]
+
+
+class Policies(TypedDict):
+    decisions: Annotated[dict[str, int], "By policy."]
+    changes: Annotated[int, "How often a drone's policy was replaced in flight."]
+    shield_interventions: Annotated[int, "Directives that the shield replaced, or could not put right."]
+    invariant_violations: Annotated[int, "Directives that broke an invariant all the same."]
+
+
+Transition = TypedDict(
+    "Transition",
+    {
+        "t_s": Annotated[float, "When."],
+        "drone": Annotated[int, "Whose links."],
+        "peers": Annotated[list[int], "To whom; links that change alike share an entry."],
+        "from": Annotated[str, "What they carried, in words."],
+        "to": Annotated[str, "What they carry now."],
+        "reason": Annotated[str, "The reason that decided it."],
+    },
+)
+
+
+class Phase(TypedDict):
+    phase: Annotated[str, "The mission's phase."]
+    begin_s: Annotated[float, "From when."]
+    end_s: Annotated[float, "Until when, exclusive."]
+    ap50: Annotated[Accuracy, "Accuracy within it."]
+    data_rate_mbps: Annotated[float, "Payload bytes captured in it, as Mb/s."]
+    feature_payload_bytes: Annotated[float | None, "Median size of a feature payload."]
+    deadline_miss_rate: Annotated[float | None, "As for the whole sortie."]
+
+
+class Event(TypedDict):
+    t_s: Annotated[float, "When."]
+    drone: Annotated[int, "Whose; −1 is the fleet's."]
+    kind: Annotated[str, "What kind."]
+    text: Annotated[str, "In words."]
+
+
+class Outcome(TypedDict):
+    """All of `outcome.json`; what is a ratio of nothing is null."""
+
+    scenario: Annotated[str, "Its name."]
+    policy: Annotated[str, "The policy flown."]
+    seed: Annotated[int, "Of every random draw."]
+    replication: Annotated[int, "Which draw of a campaign."]
+    version: Annotated[str, "Of this project."]
+    fingerprint: Annotated[str, "SHA-256 over the record's values; equal inputs give equal fingerprints."]
+    duration_s: Annotated[float, "Length of the sortie."]
+    frame_s: Annotated[float, "From one frame to the next."]
+    ap50: Annotated[Ap50, "Accuracy."]
+    bytes: Annotated[Bytes, "What was sent."]
+    context_share: Annotated[float | None, "Context bytes over all bytes."]
+    data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
+    deadline_miss_rate: Annotated[
+        float | None,
+        "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known.",
+    ]
+    payload_fates: Annotated[dict[str, int], "Counts by status and reason."]
+    medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy."]
+    age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
+    data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
+    descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
+    battery: Annotated[dict[str, float], "State of charge as the last frame begins, by drone."]
+    drones: Annotated[dict[str, Drone], "Each as the last frame begins."]
+    energy_j: Annotated[dict[str, float], "By cause, and `total`; hover outweighs the radio about a hundredfold."]
+    policies: Annotated[Policies, "Who decided, and how often it was put right."]
+    switches: Annotated[
+        float | None, "Changes of what a link carries, per link and minute; links that change alike count each."
+    ]
+    transitions: Annotated[list[Transition], "Each change of what links carry."]
+    phases: Annotated[list[Phase], "By mission phase."]
+    distrusted_by: Annotated[
+        dict[str, int], "For each drone that anyone came to doubt (`fleet/trust.py`), how many did."
+    ]
+    events: Annotated[list[Event], "What happened to the fleet: scenario events, landings, policies that took over."]
+    policy_eval_us: Annotated[Percentiles, "Wall time of a decision; no part of the fingerprint."]
+    wall_s: Annotated[float | None, "Wall time of the flight; no part of the fingerprint."]
+    realtime_factor: Annotated[float | None, "Simulated over wall time; no part of the fingerprint."]
+
+
+# --- names of numbers ----------------------------------------------------------------------------
+
+WALL = ("wall_s", "realtime_factor", "policy_eval_us")
+REASONS = {
+    Status.DELIVERED: ("",),
+    Status.LOST: ("fragment_lost", "no_link", "receiver_gone", "sender_gone"),
+    Status.EXPIRED: ("deadline_in_service", "deadline_queued", "replaced"),
+    Status.IN_FLIGHT: ("",),
+}
+"""By fate: the reasons that the radio gives; what arrived in part has those of what was lost or expired."""
+
+
+def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bool) -> dict[str, Collection[str]]:
+    """What the objects of an outcome that are open (`*` in the reference) may be keyed by, and how many phases there are.
+
+    Args:
+        drones, phases: at most so many.
+        policies: those that may decide, as the record names them.
+        traced: whether drones may follow a trace.
+    """
+    ids = tuple(map(str, range(drones)))
+    part = {Status.PARTIAL: (*REASONS[Status.LOST], *REASONS[Status.EXPIRED])}
+    return {
+        "payload_fates": tuple(f"{s}/{r}" if r else str(s) for s, reasons in (REASONS | part).items() for r in reasons),
+        "descriptor_drops": tuple(map(str, DropReason)),
+        "battery": ids,
+        "drones": ids,
+        "distrusted_by": ids,
+        "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
+        "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
+        "phases": tuple(map(str, range(phases))),
+    }
+
+
+def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
+    """Hold a dotted name against the reference: some run's outcome may have a number there.
+
+    Args:
+        keys: as `open_keys` gives them; a list that is not among them may be of any length.
+
+    Raises:
+        ValueError: it never has one: no such field, wall clock, or no number; with what could have been meant.
+    """
+    kind: Any = Outcome
+    parts = name.split(".")
+    if parts[0] in WALL:
+        raise ValueError(f"{name}: is wall clock, a metric must follow from the run alone")
+    for depth, part in enumerate(parts):
+        above = ".".join(parts[:depth])
+        below = _below(kind, part, keys.get(above))
+        if below is None:
+            raise ValueError(
+                f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, keys.get(above))}"
+            )
+        kind = below
+    if what := _no_number(kind):
+        raise ValueError(f"{name}: is {what}, a metric must be a number")
+
+
+def _below(kind: Any, part: str, keys: Collection[str] | None) -> Any:
+    """The kind of what stands under a key or number; None where nothing can."""
+    if is_typeddict(kind):
+        return get_type_hints(kind).get(part)
+    if get_origin(kind) is dict:
+        return get_args(kind)[1] if part in (keys or ()) else None
+    if get_origin(kind) is list and part.isdecimal() and part.isascii():
+        return get_args(kind)[0] if keys is None or part in keys else None
+    return None
+
+
+def _instead(kind: Any, part: str, keys: Collection[str] | None) -> str:
+    """What could have been meant by a key that is not there, or what there is."""
+    what = _no_number(kind)
+    if what in ("", "text"):
+        return f"it is {what or 'a number'}"
+    if what == "a list" and keys is None:
+        return "it has entries by number"
+    known = list(get_type_hints(kind) if is_typeddict(kind) else keys or ())
+    if all(key.isdecimal() for key in known):
+        return f"it has {known[0]} … {known[-1]}" if known else "it has none that can be named"
+    near = nearest(part, known)
+    return f"did you mean {near}?" if near else f"it has {', '.join(known)}"
+
+
+def _no_number(kind: Any) -> str:
+    """What a field is that is no number, in words; empty where it is one."""
+    if is_typeddict(kind) or get_origin(kind) is dict:
+        return "a section"
+    if get_origin(kind) is list:
+        return "a list"
+    members = get_args(kind) if get_origin(kind) is UnionType else (kind,)
+    return "text" if str in members else ""

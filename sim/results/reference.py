@@ -1,0 +1,109 @@
+"""The outcome and the record for people: `outcome.md`, made of `sortie.sim.results.outcome_fields` and `sortie.sim.results.record`.
+
+`python -m sortie.sim.results.reference` writes it anew; a test holds it to the code, and the code to what a sortie gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
+
+import pyarrow as pa
+
+from sortie.sim.folders import write_text
+from sortie.sim.results.outcome_fields import Outcome
+from sortie.sim.results.record import ABOUT, TABLES
+
+PAGE = Path(__file__).parent / "outcome.md"
+_NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "null"}
+_COLUMNS = {
+    pa.float64(): "",
+    pa.int32(): "int",
+    pa.int64(): "int",
+    pa.string(): "text",
+    pa.bool_(): "bool",
+    pa.binary(): "bytes",
+}
+
+
+def page() -> str:
+    """The page as it should stand."""
+    lines = [
+        "# What a run leaves behind",
+        "",
+        "Made by `python -m sortie.sim.results.reference`; do not edit.",
+        "",
+        "A run's folder holds `outcome.json`, the record's tables as Parquet, `scenario.yaml` (what was flown, every default "
+        "written out), `record.json` (totals and wall clock) and `sortie.rrd` (the recording for Rerun; `sortie view` makes "
+        "one where there is none).",
+        "",
+        "## outcome.json",
+        "",
+        "A dot leads into an object, `*` stands for each of its keys, `[]` for each entry of a list. Bounds of `expect:` in "
+        "a scenario name a field in the same way: `bytes.context_sent`, `battery.1`.",
+        "",
+        "| field | value | meaning |",
+        "|---|---|---|",
+        *(f"| `{path}` | {value} | {meaning} |" for path, value, meaning in fields(Outcome)),
+        "",
+        "## The record's tables",
+        "",
+        "One Parquet file a table, rows in order of time. Units stand in the names: `_m`, `_s`, `_mps`, `_j`, `_db`. "
+        "Columns are numbers where nothing else is said.",
+        "",
+        "| table | a row is | columns |",
+        "|---|---|---|",
+        *(f"| `{name}` | {ABOUT[name]} | {_columns(columns)} |" for name, columns in TABLES.items()),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def fields(section: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
+    """Path, value and meaning of every field of a typed dictionary, those inside it after it."""
+    for name, hint in get_type_hints(section, include_extras=True).items():
+        kind, meaning = get_args(hint)
+        inner, mark = _inner(kind)
+        yield f"{path}{name}", _value(kind), meaning
+        if inner is not None:
+            yield from fields(inner, f"{path}{name}{mark}.")
+
+
+def _inner(kind: Any) -> tuple[Any, str]:
+    """The typed dictionary that a field holds, and the mark by which a path goes there."""
+    if is_typeddict(kind):
+        return kind, ""
+    of = get_args(kind)
+    if of and is_typeddict(of[-1]):
+        return of[-1], ".*" if get_origin(kind) is dict else "[]"
+    return None, ""
+
+
+def _value(kind: Any) -> str:
+    origin, of = get_origin(kind), get_args(kind)
+    if is_typeddict(kind):
+        return "object"
+    if origin is dict:
+        return "object" if is_typeddict(of[1]) else f"object of {_NAMES[of[1]]}s"
+    if origin is list:
+        return "list" if is_typeddict(of[0]) else f"list of {_NAMES[of[0]]}s"
+    if origin is UnionType:
+        return ", ".join(_NAMES[member] for member in of)
+    return _NAMES[kind]
+
+
+def _columns(columns: dict[str, pa.DataType]) -> str:
+    return ", ".join(f"`{name}`{_kind(type_)}" for name, type_ in columns.items())
+
+
+def _kind(type_: pa.DataType) -> str:
+    if pa.types.is_list(type_):
+        return f" (list{_kind(type_.value_type)})"
+    name = _COLUMNS[type_]
+    return f" {name}" if name else ""
+
+
+if __name__ == "__main__":
+    write_text(PAGE, page())

@@ -1,0 +1,134 @@
+"""A run as one HTML page that needs nothing else: what was flown, what came out, figures, and who decided what, and why."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from sortie.scenarios.reading.load import dump
+from sortie.sim.cli.tables import number, percent, size
+from sortie.sim.folders import write_text
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.report_figures import colour, figures
+from sortie.sim.results.sentences import decision_in_words, event_in_words
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 15px/1.55 system-ui, sans-serif; color: #1c2128; background: #f4f5f7; margin: 0; }
+main { max-width: 60rem; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
+h1 { font-size: 1.7rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.4rem 0 .6rem; }
+.of { color: #5a6472; margin: .2rem 0 1.2rem; } p { max-width: 46rem; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .7rem; margin: 1.4rem 0; }
+.tile, figure, table, details { background: #fff; border-radius: 8px; box-shadow: 0 1px 2px #0002; }
+.tile { padding: .8rem 1rem; } .tile b { display: block; font-size: 1.45rem; font-weight: 600; }
+.tile span { color: #5a6472; font-size: .85rem; }
+figure { margin: 0 0 1rem; padding: .8rem 1rem .4rem; } figcaption { font-weight: 600; margin-bottom: .3rem; }
+svg { width: 100%; height: auto; }
+table { border-collapse: collapse; width: 100%; overflow: hidden; } th { text-align: left; }
+td, th { padding: .35rem .8rem; border-top: 1px solid #eceef1; vertical-align: top; }
+td.t { text-align: right; font-variant-numeric: tabular-nums; width: 5rem; color: #5a6472; }
+.event td { background: #fdf6df; } i { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .5em; }
+details { padding: .6rem 1rem; margin-top: .7rem; } pre { overflow-x: auto; font-size: .8rem; }
+footer { color: #5a6472; font-size: .85rem; margin-top: 2rem; }
+"""
+
+
+def save_page(record: SortieRecord, path: Path) -> None:
+    """Write a run's page; it is there whole or not at all.
+
+    Raises:
+        RunError: the file cannot be written, or matplotlib is not installed.
+    """
+    write_text(path, page(record))
+
+
+def page(record: SortieRecord) -> str:
+    """A run's page as HTML: no script, and nothing fetched from anywhere."""
+    result, scenario = outcome(record), record.scenario
+    title = f"{scenario.name} under {record.policy}"
+    of = f"{scenario.fleet.drones} drones, {scenario.duration_s:g} s, seed {record.seed}, Sortie {record.version}"
+    drawn = "".join(
+        f"<figure><figcaption>{escape(caption)}</figcaption>{svg}</figure>" for caption, svg in figures(record).items()
+    )
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(title)}</title>
+<style>{STYLE}</style>
+</head>
+<body><main>
+<h1>{escape(title)}</h1>
+<p class="of">{escape(of)}</p>
+<p>{escape(scenario.description)}</p>
+<div class="tiles">{"".join(_tile(*tile) for tile in _tiles(result))}</div>
+<h2>What happened</h2>
+<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet.</p>
+{drawn}
+<h2>Who decided what, and why</h2>
+{_decisions(result)}
+<h2>In numbers</h2>
+{_numbers(result)}
+<details><summary>The scenario as it was flown</summary><pre>{escape(dump(scenario))}</pre></details>
+<footer>Fingerprint {result["fingerprint"]}: the same scenario, policy, seed and version give the same one.</footer>
+</main></body>
+</html>
+"""
+
+
+def _tile(name: str, value: str, note: str) -> str:
+    return f'<div class="tile"><span>{escape(name)}</span><b>{escape(value)}</b><span>{escape(note)}</span></div>'
+
+
+def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The few figures that a reader takes home: name, value, what it is of."""
+    ap, data = result["ap50"], result["bytes"]
+    tiles = []
+    if ap["detector"] != "none":
+        by = f"the surrogate {ap['calibration']}" if ap["calibration"] else f"the {ap['detector']} detector"
+        tiles.append(("Accuracy, mission disc", number(ap["mission"]), f"AP@0.5, {by}"))
+        tiles.append(("Accuracy, full scene", number(ap["full_scene"]), f"{ap['scored_fusions']} fusions scored"))
+    least = min(result["battery"].values(), default=None)
+    return [
+        *tiles,
+        ("Data delivered", size(data["data_delivered"]), f"of {size(data['data_sent'])} sent"),
+        ("Deadlines missed", percent(result["deadline_miss_rate"]), f"channel busy {percent(result['medium_busy_fraction'])}"),
+        ("Context plane", size(data["context_sent"]), f"{percent(result['context_share'])} of all bytes"),
+        ("Energy", f"{result['energy_j']['total'] / 1e3:.1f} kJ", f"least charge left {percent(least)}"),
+    ]  # fmt: skip
+
+
+def _decisions(result: dict[str, Any]) -> str:
+    """Decisions and events in one list, in order of time."""
+    rows = [
+        (t["t_s"], "", f'<i style="background:{colour(t["drone"])}"></i>{escape(decision_in_words(t))}')
+        for t in result["transitions"]
+    ]
+    rows += [(e["t_s"], ' class="event"', escape(event_in_words(e))) for e in result["events"]]
+    if not rows:
+        return "<p>Nobody ever sent anything, and nothing happened to the fleet.</p>"
+    body = "".join(
+        f'<tr{kind}><td class="t">{t_s:.2f} s</td><td>{text}</td></tr>'
+        for t_s, kind, text in sorted(rows, key=lambda r: r[0])
+    )
+    return f"<table>{body}</table>"  # fmt: skip
+
+
+def _numbers(result: dict[str, Any]) -> str:
+    """Phases, then drones."""
+    head = "<tr><th>phase</th><th>AP full scene</th><th>AP mission</th><th>data</th><th>deadlines missed</th></tr>"
+    phases = "".join(
+        f"<tr><td>{escape(p['phase'])}, {p['begin_s']:g}–{p['end_s']:g} s</td><td>{number(p['ap50']['full_scene'])}</td>"
+        f"<td>{number(p['ap50']['mission'])}</td><td>{p['data_rate_mbps']:.1f} Mb/s</td><td>{percent(p['deadline_miss_rate'])}</td></tr>"
+        for p in result["phases"]
+    )
+    drones = "".join(
+        f"<tr><td>drone {escape(i)}</td><td>{percent(d['soc'])}</td><td>{d['energy_j'] / 1e3:.1f} kJ</td>"
+        f"<td>{d['voltage_v']:.2f} V</td><td>{'flying' if d['airborne'] else 'down'}</td></tr>"
+        for i, d in result["drones"].items()
+    )
+    other = "<tr><th>drone</th><th>charge left</th><th>energy</th><th>voltage</th><th>at the end</th></tr>"
+    return f"<table>{head}{phases}</table><br><table>{other}{drones}</table>"

@@ -1,0 +1,1 @@
+"""Many sorties for one question: comparisons, conditions, learning, the paper's table."""

@@ -1,0 +1,172 @@
+"""The surrogate against the torch detector on what drones ask in flight: formations, ages and discs as sorties have them.
+
+A sortie is flown by the surrogate, and again with the same traffic and the torch detector's answers at every scored moment.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sortie.perception.detectors import Constructor, Detector
+from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.reading.load import load, load_contexts
+from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.schema.conditions import Context, Contexts
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import both_matched
+from sortie.sim.studies.conditions import paired_interval, scenario_of
+
+POLICIES = ("silence", "all-4", "boxes")
+TOWNS_APART = 1000
+"""Between the seeds of one context's towns: sets number their contexts' towns on from one another."""
+REGIONS = {"full_scene": "everywhere", "mission": "in the mission's disc"}
+
+
+class Asked:
+    """The torch detector's boxes and the surrogate's guess of how many a drone would send, so that traffic is the surrogate's."""
+
+    def __init__(self, torch: Detector, surrogate: Detector) -> None:
+        self.detect, self.truth = torch.detect, torch.truth
+        self.count_boxes, self.camera_views = surrogate.count_boxes, torch.camera_views
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """AP@0.5 of one policy in one region of one context, by both."""
+
+    policy: str
+    context: str
+    region: str
+    torch: float
+    surrogate: float
+
+
+def flights(
+    name: str,
+    calibration: Path,
+    weights: Path | None,
+    rate_hz: float,
+    policies: Sequence[str] = POLICIES,
+    progress: Callable[[str, int, int], None] | None = None,
+    towns: int = 1,
+) -> Iterator[Level]:
+    """Fly a scenario, or every context of a set with its first seed, under some policies.
+
+    Args:
+        towns: each is flown in so many: its own, and others of its kind, whose seeds, and the sortie's, count on from
+            its own. A context's AP is that of all their fusions together: a mission's disc holds a handful of cars, and
+            twenty discs say little.
+
+    Raises:
+        ScenarioError, PolicyError: what cannot be flown, before anything is.
+    """
+    contexts = load_contexts(name)
+    if contexts is None:
+        contexts = Contexts(base=name, seeds=(load(name).seed,), contexts=(Context(name="sortie", rho=1.0),))
+        planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
+    else:
+        planned = [[(p, scenario_of(contexts, c, p)) for p in policies] for c in contexts.contexts]
+    both = torch_answers(calibration, weights), _surrogate(calibration)
+    count, flown = len(planned) * len(policies) * towns, 0
+    for context, todo in zip(contexts.contexts, planned, strict=True):
+        matched: dict[tuple[str, str], tuple[list[Matched], list[Matched]]] = {}
+        for town, (policy, scenario) in itertools.product(range(towns), todo):
+            if progress is not None:
+                progress(f"{name} by both detectors", flown, count)
+            there = _in_town(scenario, town, rate_hz)
+            found = [both_matched(run_sortie(there, None, contexts.seeds[0] + town, detector_of=make)) for make in both]
+            flown += 1
+            for region in REGIONS:
+                theirs, ours = matched.setdefault((policy, region), ([], []))
+                theirs += found[0][region].values()
+                ours += found[1][region].values()
+        for (policy, region), (theirs, ours) in matched.items():
+            torch = average_precision(theirs)
+            if not np.isnan(torch):  # there is such a region, and there are cars in it
+                yield Level(policy, context.name, region, torch, average_precision(ours))
+    if progress is not None:
+        progress(f"{name} by both detectors", count, count)
+
+
+def _in_town(scenario: Scenario, town: int, rate_hz: float) -> Scenario:
+    """The scenario scored at a rate, in the town of its kind whose seed lies so far on."""
+    scene = scenario.perception.scene.model_copy(update={"seed": scenario.perception.scene.seed + TOWNS_APART * town})
+    perception = scenario.perception.model_copy(
+        update={"detector": "surrogate", "sample_rate_hz": rate_hz, "scene": scene}
+    )
+    return scenario.model_copy(update={"perception": perception})
+
+
+def torch_answers(calibration: Path | None = None, weights: Path | None = None) -> Constructor:
+    """What makes a sortie's detector so that its traffic is the surrogate's and its boxes are the torch detector's, which is
+    asked at scored moments alone. None takes what is shipped.
+
+    Sorties that are made one after the other in one scene, under several policies, share the torch detector, its scenery
+    and what it has encoded.
+    """
+    from sortie.perception.network.detector import TorchDetector  # here: torch takes a second to import
+
+    ours = _surrogate(calibration)
+    last: list[tuple[object, Detector]] = []
+
+    def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+        asked = scene.made_of, config, seed, replication
+        if not last or last[0][0] != asked:
+            last[:] = [(asked, TorchDetector(scene, config, seed, weights, replication))]
+        return Asked(last[0][1], ours(scene, config, seed, replication))
+
+    return make
+
+
+def _surrogate(calibration: Path | None) -> Constructor:
+    from sortie.perception.surrogate.detector import SurrogateDetector
+
+    def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+        return SurrogateDetector(scene, config, seed, calibration, replication)
+
+    return make
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """The mean over contexts of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, contexts
+    resampled in pairs, of the torch detector's and of the difference; NaN for a single one."""
+
+    what: str
+    region: str
+    torch: tuple[float, float, float]
+    surrogate: float
+    error: tuple[float, float, float]
+
+
+def means(levels: Sequence[Level]) -> Iterator[Mean]:
+    """Of every policy, then of every policy against every earlier one."""
+    policies = list(dict.fromkeys(v.policy for v in levels))
+    for region in REGIONS:
+        ap = {p: {v.context: v for v in levels if (v.policy, v.region) == (p, region)} for p in policies}
+        for p in policies:
+            if ap[p]:
+                yield _mean(p, region, _table(ap[p].values()))
+        for k, p in enumerate(policies):
+            for earlier in policies[:k]:
+                # drones that look from elsewhere may find none to look for
+                both = [c for c in ap[p] if c in ap[earlier]]
+                if both:
+                    its, theirs = (_table([ap[name][c] for c in both]) for name in (p, earlier))
+                    yield _mean(f"{p} − {earlier}", region, its - theirs)
+
+
+def _table(levels: Iterable[Level]) -> np.ndarray:
+    return np.array([(v.torch, v.surrogate) for v in levels])
+
+
+def _mean(what: str, region: str, both: np.ndarray) -> Mean:
+    error = both[:, 1] - both[:, 0]
+    torch, off = ((float(v.mean()), *paired_interval(v)) for v in (both[:, 0], error))
+    return Mean(what, region, torch, float(both[:, 1].mean()), off)

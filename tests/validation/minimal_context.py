@@ -1,0 +1,121 @@
+"""How small the descriptor can be: AP against context bytes, one knob at a time and together: `python tests/validation/minimal_context.py`.
+
+Policies that read the context (`deputies`, `where2comm`, `who2com`) fly the same sorties with descriptors of several
+forms. Bytes are those that went on the air, authentication included; AP is by the surrogate detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.scenarios.reading.load import load
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.studies.compare import pair_up
+
+SCENARIO = "track_target"
+POLICIES = ("deputies", "who2com")
+FORMS: dict[str, tuple[str, ...]] = {
+    "the paper's": (),
+    "grid 8 × 8": ("context.grid_cells=8",),
+    "grid 4 × 4": ("context.grid_cells=4",),
+    "no grid": ("context.grid_cells=0",),
+    "1 bit a cell": ("context.grid_bits=1",),
+    "16 bits a number": ("context.number_bits=16",),
+    "12 bits a number": ("context.number_bits=12",),
+    "8 bits a number": ("context.number_bits=8",),
+    "5 Hz": ("context.publish_every=2",),
+    "2 Hz": ("context.publish_every=5",),
+    "1 Hz": ("context.publish_every=10",),
+    "8 × 8, 1 bit, 16 bits, 2 Hz": (
+        "context.grid_cells=8", "context.grid_bits=1", "context.number_bits=16", "context.publish_every=5",
+    ),
+}  # fmt: skip
+"""By name, and what it sets."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContextRow:
+    """One policy under one form."""
+
+    policy: str
+    form: str
+    context_bytes_per_s: float
+    """Descriptors of the whole fleet."""
+    data_bytes_per_s: float
+    difference: Difference
+    """AP@0.5 under the paper's form (a) and this one (b), paired, by whole instants."""
+
+
+def measure(
+    seeds: Sequence[int], duration_s: float, policies: Sequence[str] = POLICIES, forms: Sequence[str] = tuple(FORMS)
+) -> Iterator[ContextRow]:
+    """One row a policy and form; the paper's form is flown first for each policy."""
+    for policy in policies:
+        first = [_flown(policy, seed, duration_s, ()) for seed in seeds]
+        for form in forms:
+            records = [_flown(policy, seed, duration_s, FORMS[form]) for seed in seeds] if FORMS[form] else first
+            figures = [outcome(r)["bytes"] for r in records]
+            over_s = duration_s * len(seeds)
+            yield ContextRow(
+                policy,
+                form,
+                sum(f["context_descriptors"] for f in figures) / over_s,
+                sum(f["data_sent"] for f in figures) / over_s,
+                compare(*pair_up(first, records, mission=False)),
+            )
+
+
+def _flown(policy: str, seed: int, duration_s: float, settings: Sequence[str]) -> SortieRecord:
+    fixed = [f"duration_s={duration_s:g}", "perception.detector=surrogate", "expect=[]", "expect_decisions=[]"]
+    return run_sortie(load(SCENARIO, [*fixed, *settings]), policy, seed)
+
+
+def table(rows: Sequence[ContextRow]) -> str:
+    """Markdown; differences in AP points with 95 % intervals."""
+    lines = ["| policy | descriptor | context | data | AP@0.5 | against the paper's |", "|---|---|---|---|---|---|"]
+    for r in rows:
+        d = r.difference
+        lines.append(
+            f"| {r.policy} | {r.form} | {r.context_bytes_per_s / 1e3:.2f} kB/s | {r.data_bytes_per_s / 1e6:.1f} MB/s "
+            f"| {d.ap_b:.3f} | {100 * d.delta:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}] |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def draw(rows: Sequence[ContextRow], path: Path) -> None:
+    """AP against context bytes, a series a policy; needs matplotlib (the extra `report`)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for policy in dict.fromkeys(r.policy for r in rows):
+        mine = [r for r in rows if r.policy == policy]
+        x = [r.context_bytes_per_s / 1e3 for r in mine]
+        axes.plot(x, [r.difference.ap_b for r in mine], "o", label=policy)
+        for r, at in zip(mine, x, strict=True):
+            axes.annotate(r.form, (at, r.difference.ap_b), fontsize=6, xytext=(3, 3), textcoords="offset points")
+    axes.set(xscale="log", xlabel="descriptors on the air, kB/s, whole fleet", ylabel="AP@0.5 (surrogate)")
+    axes.legend()
+    part = path.with_name(path.name + ".part")
+    figure.savefig(part, format=path.suffix.lstrip(".") or "png")
+    part.replace(path)
+
+
+if __name__ == "__main__":
+    import argparse
+    import sys
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--duration-s", type=float, default=40.0)
+    parser.add_argument("--figure", type=Path, help="Draw AP against context bytes here (.png, .svg, .pdf).")
+    args = parser.parse_args()
+    found = list(measure(range(1, args.seeds + 1), args.duration_s))
+    sys.stdout.write(table(found))
+    if args.figure:
+        draw(found, args.figure)

@@ -1,0 +1,185 @@
+"""What choosing viewpoints gains and costs, measured: `python tests/validation/repositions.py`.
+
+`vantage` flies against `all-4`, which shares the very same and holds its slots: same seeds, same town, same draws. The
+mission is given by where its target drives; AP is by the surrogate detector, energy by the rotor model that charges
+accelerations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sortie.fleet.coverage import footprint_radius_m
+from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.scenarios.reading.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.choreography import EVENT
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.studies.compare import pair_up
+from sortie.sim.studies.conditions import paired_interval
+
+SCENARIO, RHO, RADIUS_M = "track_target", 0.1, 32.0
+STAYS, MOVES = "all-4", "vantage"
+TRACKING_FROM_S = 5.0
+MISSIONS: dict[str, tuple[str, ...]] = {
+    "the target drives below the fleet": ("mission.target.waypoints_m=[[-150, -1.75], [400, -1.75]]",),
+    "the target drives one street beside it, 80 m": ("mission.target.waypoints_m=[[-150, 81.75], [400, 81.75]]",),
+    "the same, and the fleet may come 50 m near": (
+        "mission.target.waypoints_m=[[-150, 81.75], [400, 81.75]]", "fleet.viewpoints.reach_m=50",
+    ),
+    "the target fell 60 m behind": ("mission.target.waypoints_m=[[-210, -1.75], [400, -1.75]]",),
+}  # fmt: skip
+"""By name, and what it sets."""
+
+Interval = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RepositionRow:
+    """One mission: slots held (a) against viewpoints chosen (b)."""
+
+    mission: str
+    mission_ap: Difference
+    """AP@0.5 in the mission disc; sorties resampled in pairs."""
+    full_ap: Difference
+    covered: tuple[float, float]
+    """Mean share of the mission disc within some drone's footprint, a and b."""
+    covered_gain: Interval
+    energy_j: tuple[float, float]
+    """Fleet and sortie, a and b."""
+    energy_gain_j: Interval
+    nearest_m: float
+    """The closest that two drones came, in b."""
+    moves: float
+    """A sortie."""
+
+
+def measure(
+    seeds: Sequence[int], duration_s: float, missions: Sequence[str] = tuple(MISSIONS)
+) -> Iterator[RepositionRow]:
+    """One row a mission. Every seed has a town of its own."""
+    for mission in missions:
+        stays, moves = ([_flown(policy, seed, duration_s, mission) for seed in seeds] for policy in (STAYS, MOVES))
+        covered = np.array([[covered_share(r) for r in arm] for arm in (stays, moves)])
+        energy_j = np.array([[outcome(r)["energy_j"]["total"] for r in arm] for arm in (stays, moves)])
+        yield RepositionRow(
+            mission,
+            _difference(stays, moves, mission=True),
+            _difference(stays, moves, mission=False),
+            (float(covered[0].mean()), float(covered[1].mean())),
+            _gain(covered),
+            (float(energy_j[0].mean()), float(energy_j[1].mean())),
+            _gain(energy_j),
+            min(nearest_m(r) for r in moves),
+            float(np.mean([_moves(r) for r in moves])),
+        )
+
+
+def covered_share(record: SortieRecord) -> float:
+    """Mean over the tracking frames of the share of the mission disc that lies within some drone's footprint."""
+    position = positions_m(record)
+    mission = record.tables["mission"]
+    centre = np.stack([mission["region_x_m"].to_numpy(), mission["region_y_m"].to_numpy()], axis=-1)
+    radius_m = mission["region_radius_m"].to_numpy()
+    side = (np.arange(20) + 0.5) / 10 - 1
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    grid = grid[np.hypot(*grid.T) <= 1]
+    shares = []
+    for frame in np.flatnonzero(np.isfinite(radius_m)):
+        points = centre[frame] + radius_m[frame] * grid
+        away = np.linalg.norm(points[:, None] - position[frame, None, :, :2], axis=-1)
+        shares.append((away <= footprint_radius_m(position[frame, :, 2])).any(axis=1).mean())
+    return float(np.mean(shares))
+
+
+def nearest_m(record: SortieRecord) -> float:
+    """The least distance of any two drones in any frame."""
+    position = positions_m(record)
+    first, second = np.triu_indices(position.shape[1], k=1)
+    return float(np.linalg.norm(position[:, first] - position[:, second], axis=-1).min())
+
+
+def positions_m(record: SortieRecord) -> np.ndarray:
+    """[T, N, 3] true positions, ENU."""
+    states = record.tables["states"]
+    xyz = np.stack([states[name].to_numpy() for name in ("x_m", "y_m", "z_m")], axis=-1)
+    return xyz.reshape(-1, record.scenario.fleet.drones, 3)
+
+
+def scenario_of(policy: str, seed: int, duration_s: float, mission: str) -> Scenario:
+    """The sortie of one arm."""
+    half_m = 2.5 * duration_s
+    return load(
+        SCENARIO,
+        [
+            "expect=[]", "expect_decisions=[]", "perception.detector=surrogate", f"duration_s={duration_s:g}",
+            "fleet.airframe.power_model=momentum", f"perception.scene.seed={1000 + seed}",
+            f"fleet.route.waypoints_m=[[-150, 0], [{2 * half_m - 150:g}, 0]]",
+            f"mission.phases=[{{at_s: 0, phase: search}}, {{at_s: {TRACKING_FROM_S:g}, phase: track, region: {{radius_m: {RADIUS_M:g}}}}}]",
+            f"policy.name={policy}", f"policy.params={{rho: {RHO}}}", *MISSIONS[mission],
+        ],
+    )  # fmt: skip
+
+
+def _flown(policy: str, seed: int, duration_s: float, mission: str) -> SortieRecord:
+    return run_sortie(scenario_of(policy, seed, duration_s, mission), None, seed)
+
+
+def _moves(record: SortieRecord) -> int:
+    return sum(e["kind"] == EVENT and e["text"].startswith("moves") for e in record.tables["events"].to_pylist())
+
+
+def _gain(arms: np.ndarray) -> Interval:
+    """Mean of b less a over [2, sorties], with its 95 % interval."""
+    gain = arms[1] - arms[0]
+    return (float(gain.mean()), *paired_interval(gain))
+
+
+def _difference(a: Sequence[SortieRecord], b: Sequence[SortieRecord], *, mission: bool) -> Difference:
+    """AP while tracking; whole sorties are resampled."""
+    return compare(*pair_up(a, b, mission=mission, begin_s=TRACKING_FROM_S, whole_sorties=True))
+
+
+def table(rows: Sequence[RepositionRow]) -> str:
+    """Markdown; AP points, percent of the disc, and kJ of the fleet, with 95 % intervals."""
+
+    def spelt(gain: Interval, factor: float) -> str:
+        mean, low, high = (factor * g for g in gain)
+        return f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+    def points(d: Difference) -> str:
+        return f"{d.ap_a:.3f}, {spelt((d.delta, d.low, d.high), 100)}"
+
+    lines = [
+        "| mission | mission AP, gained | full AP, gained | disc covered, gained (%) | energy, more (kJ) | nearest pair | moves |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {r.mission} | {points(r.mission_ap)} | {points(r.full_ap)} "
+        f"| {100 * r.covered[0]:.0f}, {spelt(r.covered_gain, 100)} "
+        f"| {r.energy_j[0] / 1e3:.1f}, {spelt(r.energy_gain_j, 1e-3)} | {r.nearest_m:.1f} m | {r.moves:.1f} |"
+        for r in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    import argparse
+    import sys
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--duration-s", type=float, default=60.0)
+    args = parser.parse_args()
+    if args.seeds < 2:  # intervals are over sorties
+        parser.error(f"argument --seeds: {args.seeds}, must be at least 2")
+    if not args.duration_s > TRACKING_FROM_S:
+        parser.error(
+            f"argument --duration-s: {args.duration_s:g}, must be above {TRACKING_FROM_S:g}, when tracking begins"
+        )
+    sys.stdout.write(table(list(measure(range(1, args.seeds + 1), args.duration_s))))
