@@ -22,6 +22,7 @@ from sortie.sim.cli import (
     campaign,
     check,
     compare,
+    conditions,
     export,
     fly,
     import_log,
@@ -34,9 +35,6 @@ from sortie.sim.cli import (
     train,
     verify,
     view,
-)
-from sortie.sim.cli import (
-    conditions as contexts,
 )
 from sortie.sim.cli.console import err, out
 from sortie.sim.engine.sortie import VERSION

@@ -13,8 +13,8 @@ from rich.table import Table
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load, load_contexts
 from sortie.sim.cli.console import out, stages, user_errors
-from sortie.sim.cli.tables import points
 from sortie.sim.folders import ensure_files
+from sortie.sim.results.numbers import points
 from sortie.sim.studies.in_flight import REGIONS, Level, flights, means
 
 if TYPE_CHECKING:

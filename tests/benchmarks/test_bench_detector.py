@@ -5,14 +5,10 @@ A sortie scored at 10 Hz keeps real time where a fleet-frame costs less than 0.1
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
 from sortie.perception.network.bev import lift

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import shapely
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "perception"))
 from perception_examples import cross
 
 from sortie.perception.budget import cells_sent

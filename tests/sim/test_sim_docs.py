@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import typer
+from places import ROOT
 from typer.testing import CliRunner
 
 from sortie.perception.detectors import DETECTORS
@@ -17,7 +18,6 @@ from sortie.policies.verification.conformance import conform
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 
-ROOT = Path(__file__).resolve().parents[2]
 GUIDE = sorted((ROOT / "docs" / "guide").glob("*.md"))
 PAGES = [
     *sorted(p for p in ROOT.glob("[!.]*/**/*.md") if "runs" not in p.parts),

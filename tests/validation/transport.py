@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import simpy
+from age import Chain, mean_age_s, share_older
 
 from sortie.radio import Air, Status
-from age import Chain, mean_age_s, share_older
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Radio, Scenario
 from sortie.sim.engine.sortie import run_sortie

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from perception_examples import capture, only_target
+from places import ROOT
 from recording_examples import small
 
 from sortie.perception.detectors import DETECTORS, make_detector
@@ -248,7 +249,7 @@ assert "torch" not in sys.modules
 
 def test_the_readmes_example_runs(tmp_path: Path) -> None:
     """As it stands there: alone each drone finds one of two cars, with sharing both find both."""
-    readme = Path(__file__).parents[2] / "perception" / "outside" / "README.md"
+    readme = ROOT / "perception" / "recordings" / "README.md"
     code = readme.read_text("utf-8").split("```python\n")[1].split("```")[0]
     done = subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, capture_output=True, text=True)
     aps = eval(done.stdout)  # noqa: S307 (our own dict)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from places import ROOT
 
 from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, load_frames, make_scene_file, make_split
@@ -118,7 +119,7 @@ def test_a_killed_run_goes_on_to_the_same_files(tmp_path: Path, made: Path) -> N
         f"if __name__ == '__main__': make_split(Benchmark(3), 'tau', Path({str(tmp_path)!r}), scenes=2, workers=1)"
     )
     (tmp_path / "run.py").write_text(script)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     run = subprocess.Popen([sys.executable, tmp_path / "run.py"], start_new_session=True, env=environment)
     folder = BENCH.folder(tmp_path)
     while not files(folder) and run.poll() is None:

@@ -19,7 +19,7 @@ from sortie.fleet.logs.mavlink import geodetic, read_tlog
 from sortie.fleet.logs.ulog import read_ulog
 from sortie.scenarios.schema import Battery
 
-LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[3] / "shared/flightlogs"))
+LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[4] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")
 WHOLE = {kind: make() for kind, make in examples.KINDS.items()}
 

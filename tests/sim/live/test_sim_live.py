@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import dds_peer
 import pytest
+from places import ROOT
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
@@ -33,7 +34,6 @@ from sortie.sim.live.result import LiveResult, overhead_rows
 from sortie.sim.live.sentences import changes_in_words
 from sortie.sim.live.session import MAX_DRONES, fly_live
 
-ROOT = Path(__file__).resolve().parents[2]
 DOMAIN = os.getpid() % 200 + 20
 """Tests that run beside one another share no bus."""
 STAMP_NS = 1_700_000_000_123_456_789

@@ -24,11 +24,7 @@ from sortie.policies.registry import resolve
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback.frame import SHADES, save_frame
-from sortie.sim.studies import paper
-from sortie.sim.studies import plane_cost as plane
-
-ROOT = Path(__file__).resolve().parents[2]
-
+from sortie.sim.studies import paper, plane_cost
 
 # --- the plane -------------------------------------------------------------------------------------
 
@@ -44,10 +40,10 @@ def test_rungs_are_met_in_their_order_and_for_the_battery() -> None:
         (35.0, 0, "features", 5.0, "battery < 60 %"),
         (90.0, 0, "detections", 2.0, "battery < 30 %, track: ROI 32 m"),
     ]
-    assert plane.rungs_met(directives(*down)) == 3
-    assert plane.rungs_met(directives(down[0], down[2])) == 1
-    assert plane.rungs_met(directives(*reversed(down))) == 1
-    assert plane.rungs_met(directives(*down[:2], (60.0, 0, "detections", 2.0, "goodput 1.0 < 5 Mb/s"))) == 2
+    assert plane_cost.rungs_met(directives(*down)) == 3
+    assert plane_cost.rungs_met(directives(down[0], down[2])) == 1
+    assert plane_cost.rungs_met(directives(*reversed(down))) == 1
+    assert plane_cost.rungs_met(directives(*down[:2], (60.0, 0, "detections", 2.0, "goodput 1.0 < 5 Mb/s"))) == 2
 
 
 def test_the_link_drop_counts_until_the_last_link_has_no_features() -> None:
@@ -58,14 +54,14 @@ def test_the_link_drop_counts_until_the_last_link_has_no_features() -> None:
         (60.3, 1, "none", 0.0, ""),
         (70.0, 1, "features", 10.0, ""),
     ]
-    assert plane.without_features_s(directives(*steps), 60.0) == pytest.approx(0.3)
-    assert np.isnan(plane.without_features_s(directives(*steps[:3]), 60.0))
-    assert plane.without_features_s(directives((1.0, 0, "detections", 2.0, "")), 60.0) == 0.0
+    assert plane_cost.without_features_s(directives(*steps), 60.0) == pytest.approx(0.3)
+    assert np.isnan(plane_cost.without_features_s(directives(*steps[:3]), 60.0))
+    assert plane_cost.without_features_s(directives((1.0, 0, "detections", 2.0, "")), 60.0) == 0.0
 
 
 def test_rates_are_those_of_the_record() -> None:
     record = run_sortie(example())
-    got = plane.rates(record)
+    got = plane_cost.rates(record)
     assert got["descriptor_bytes"].value == 180
     assert got["counted_kb_per_s"].value == pytest.approx((4 * 180 * 10 + 80 * 36) / 1e3)
     sent = sum(record.tables["transmissions"]["payload_bytes"].to_pylist())
@@ -81,30 +77,30 @@ def test_a_live_flight_answers_what_takes_real_processes(tmp_path: Path, monkeyp
         '{"drones": 4, "policy": "worked", "flown_s": 120.0, "machine": "a computer", "drones_cpu_percent": 11.4, '
         '"bench_cpu_percent": 4.6, "data_bytes_per_s": 18002300.0}'
     )
-    monkeypatch.setattr(plane.platform, "machine", lambda: "x86_64")
-    found = plane.measured_live(told)
+    monkeypatch.setattr(plane_cost.platform, "machine", lambda: "x86_64")
+    found = plane_cost.measured_live(told)
     assert (found["ros2_core_percent"].value, found["x86_container_mb_per_s"].value) == (11.4, 18.0023)
     assert found["ros2_core_percent"].note == (
         "4 processes on Cyclone DDS, worked, 120 s, a computer; the bench took 5 %"
     )
     names = {c.measure.name for c in OVERHEAD if isinstance(c.measure, Elsewhere)}
     assert set(found) <= names
-    monkeypatch.setattr(plane.platform, "machine", lambda: "aarch64")
-    assert set(plane.measured_live(told)) == {"ros2_core_percent"}
+    monkeypatch.setattr(plane_cost.platform, "machine", lambda: "aarch64")
+    assert set(plane_cost.measured_live(told)) == {"ros2_core_percent"}
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"drones": 4}'])
 def test_a_file_that_no_live_flight_wrote_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "live.json").write_text(text)
     with pytest.raises(ValueError, match=r"live\.json: not what sortie live --out writes$"):
-        plane.measured_live(tmp_path / "live.json")
+        plane_cost.measured_live(tmp_path / "live.json")
     with pytest.raises(ValueError, match=r"gone\.json: No such file or directory$"):
-        plane.measured_live(tmp_path / "gone.json")
+        plane_cost.measured_live(tmp_path / "gone.json")
 
 
 @pytest.mark.parametrize(("machine", "answers"), [("x86_64", True), ("AMD64", True), ("aarch64", False)])
 def test_latency_is_of_a_tick_of_the_whole_fleet(machine: str, answers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plane.platform, "machine", lambda: machine)
+    monkeypatch.setattr(plane_cost.platform, "machine", lambda: machine)
     scenario, views = example(), []
 
     def watched(view):  # type: ignore[no-untyped-def]
@@ -112,7 +108,7 @@ def test_latency_is_of_a_tick_of_the_whole_fleet(machine: str, answers: bool, mo
         return []
 
     run_sortie(scenario, watched)
-    got = plane.latency(resolve("worked", {}), views, scenario)
+    got = plane_cost.latency(resolve("worked", {}), views, scenario)
     assert 0 < got["policy_ms_p50"].value <= got["policy_ms_p99"].value
     assert f"{len(views) // 5} ticks" in got["policy_ms_p50"].note
     assert got["deadline_over_p50"].value == pytest.approx(100 / got["policy_ms_p50"].value)
@@ -309,7 +305,7 @@ def test_two_frames_from_nothing_to_a_report_and_a_recording(
         "\n", " "
     )
     again, _ = rows.read(Path("again/paper.parquet"))
-    timed = {"plane.median", "plane.p99", "plane.deadline", "plane.x86.median"}
+    timed = {"plane_cost.median", "plane_cost.p99", "plane_cost.deadline", "plane_cost.x86.median"}
     assert [r for r in again if r.id not in timed] == [r for r in first if r.id not in timed]
     assert command("paper", "--frame", "1", "--work", "work", "--out", "out") == 0
     assert Path("work/frames/seed0_frame1_ego0.rrd").stat().st_size > 10_000

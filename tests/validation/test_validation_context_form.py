@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import minimal_context
 import pytest
 from sim_examples import example
 
-import minimal_context
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 

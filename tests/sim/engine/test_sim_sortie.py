@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+from places import HELPERS
 from sim_examples import example
 
 from sortie.policies.contract import Directive, PolicyError
@@ -56,7 +57,7 @@ def test_another_process_gives_the_same_fingerprint_whatever_matrix_kernels_its_
     for hash_seed in ("1", "2"):
         printed = subprocess.run(
             [sys.executable, "-c", code, *extra],
-            capture_output=True, text=True, check=True, cwd=__file__.rsplit("/", 1)[0],
+            capture_output=True, text=True, check=True, cwd=HELPERS,
             env={"PYTHONHASHSEED": hash_seed, "PYTHONPATH": ":".join(p for p in sys.path if p)}
             | ({"OPENBLAS_CORETYPE": kernels} if kernels else {}),
         )  # fmt: skip

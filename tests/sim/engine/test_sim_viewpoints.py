@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import VALIDATION
 from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
@@ -35,6 +36,8 @@ LONG = (
     ASIDE,
     "mission.phases=[{at_s: 0, phase: search}, {at_s: 2, phase: track, region: {radius_m: 32}}]",
 )
+
+SCRIPT = VALIDATION / "repositions.py"
 
 
 def share(view: FleetView) -> list[Directive]:
@@ -188,6 +191,6 @@ def test_nearer_the_region_more_is_found_in_it() -> None:
 )
 def test_gains_that_cannot_be_measured_are_refused(arguments: list[str], message: str) -> None:
     """One sortie has no interval, and one that ends before it tracks has no accuracy: it was NaN."""
-    ran = subprocess.run([sys.executable, "-m", "sortie.sim.repositions", *arguments], capture_output=True, text=True)
+    ran = subprocess.run([sys.executable, str(SCRIPT), *arguments], capture_output=True, text=True)
     assert ran.returncode == 2
     assert ran.stderr.endswith(f"error: {message}\n")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pyarrow.parquet as pq
+from places import ROOT
 
 from sortie.perception.evaluation import report, rows
 from sortie.perception.evaluation.sensitivity import Varied
@@ -13,8 +12,6 @@ from sortie.perception.study.figures import CAPTIONS
 from sortie.perception.study.measure import from_table
 from sortie.perception.study.plan import read_plan
 from sortie.sim.studies import paper
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_repositorys_readme_is_what_its_committed_table_renders_to() -> None:

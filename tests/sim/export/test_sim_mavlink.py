@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import HELPERS
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink2
 from sim_examples import BASE, example
@@ -134,7 +135,7 @@ def test_a_ground_station_by_mavsdk_reads_position_attitude_battery_and_mode() -
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    script = Path(__file__).with_name("mavsdk_client.py")
+    script = HELPERS / "mavsdk_client.py"
     client = subprocess.Popen(
         [sys.executable, "-W", "ignore", str(script), str(port), "5"], stdout=subprocess.PIPE, text=True
     )

@@ -51,15 +51,15 @@ def test_what_alarms_have_in_common_is_found_from_how_many_have_them(part: float
     assert in_common(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
 
 
-def test_where_nobody_shares_an_alarm_there_are_no_mirages() -> None:
+def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> None:
     assert in_common([0, 0, 0], 4) == (0.0, 1.0)
     assert in_common([], 4) == (0.0, 1.0)
     assert in_common([4, 4], 4) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
-def test_a_fleet_of_known_mirages_is_measured_as_such(part: float, chance: float) -> None:
-    planted = replace(load(SHIPPED), mirages=np.array([part, chance, 0.4, 0.1], np.float32))
+def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
+    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
     found = seen_by_several(asked(planted, 40), planted.floor, 0)
     # how often another has it too: some stand so near a car that was missed that they are taken for it
     assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
@@ -72,7 +72,7 @@ def test_a_fleet_of_known_mirages_is_measured_as_such(part: float, chance: float
 def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
     base, towns, seen = load(SHIPPED), range(30), dict[float, float]()
     for part in (0.0, 0.9):
-        planted = replace(base, mirages=np.array([part, 0.5, 0.5, 0.1], np.float32))
+        planted = replace(base, shared_false_positives=np.array([part, 0.5, 0.5, 0.1], np.float32))
         count = 0
         for town in towns:
             model = scene_model(0, "fit", town)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from age import Chain, mean_age_s, mean_peak_age_s, share_older
 from hypothesis import given
 from hypothesis import strategies as st
 from radio_flights import Hover, trace
 from scipy import stats
 
-from age import Chain, mean_age_s, mean_peak_age_s, share_older
 from sortie.scenarios.schema import Bursts, Radio
 
 PERIOD_S = 0.1

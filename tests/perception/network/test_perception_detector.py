@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from perception_examples import capture, cross
+from places import HELPERS
 
 from sortie.perception.detectors import make_detector
 from sortie.perception.joining import told
@@ -78,9 +79,8 @@ sys.stdout.write(digest)
 
 
 def test_boxes_are_equal_across_processes() -> None:
-    from pathlib import Path
 
-    program = PROGRAM.format(tests=str(Path(__file__).parent))
+    program = PROGRAM.format(tests=str(HELPERS))
     runs = [
         subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in range(2)
     ]
