@@ -120,7 +120,7 @@ class AgentLog(Protocol):
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
 
 
-class _Link:
+class _OutgoingLink:
     """An outgoing link: what its gate enforces, and what was last asked of it while its peer was fresh."""
 
     __slots__ = ("asked", "state")
@@ -177,7 +177,7 @@ class Agent:
         self._claims: dict[int, Descriptor] = {}
         self._known: dict[int, Descriptor] = {}  # what policies read of them; by ascending id
         self._heard_at_s: dict[int, float] = {}
-        self._links: dict[int, _Link] = {}
+        self._links: dict[int, _OutgoingLink] = {}
         self._standings: dict[int, Standing] = {}
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
@@ -335,7 +335,7 @@ class Agent:
             peer_ages_s.append(age_s)
             link = links.get(peer)
             if link is None:
-                link = links[peer] = _Link(me, peer)
+                link = links[peer] = _OutgoingLink(me, peer)
                 self.gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             changed = asked is not link.asked and asked != link.asked
@@ -343,7 +343,7 @@ class Agent:
                 self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
-    def _enforce(self, link: _Link, asked: Directive, age_s: float, now_s: float) -> None:
+    def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
         rules, before = self._rules, link.state
         fidelity, link.asked, capped = _FRESH, asked, asked

@@ -1,4 +1,4 @@
-"""What every drone senses of itself, frame by frame: a flown `Motion` as the agents read it.
+"""What every drone senses of itself, frame by frame: a flown `Trajectories` as the agents read it.
 
 All of it follows from the motion alone, so it is worked out for many frames and all drones in one pass.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from sortie.fleet.coverage import footprint_radius_m, survey
-from sortie.fleet.flight.motion import Motion
+from sortie.fleet.flight.motion import Trajectories
 from sortie.perception.types import Capture
 
 COVERAGE_PERIOD_S = 1.0
@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
 class FlightSenses:
     """What all drones sense; `at(frame)[drone]`. Sensors trigger with the frame."""
 
-    def __init__(self, motion: Motion, frame_s: float) -> None:
+    def __init__(self, motion: Trajectories, frame_s: float) -> None:
         self._motion, self._frame_s = motion, frame_s
         self._first = -_BLOCK
         self._block: list[tuple[Sensed, ...]] = []

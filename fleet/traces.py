@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sortie.fleet.energy.cell import energy_fraction
 from sortie.fleet.energy.recorded import BatteryTrace
 from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.flight.motion import Motion, body_rates
+from sortie.fleet.flight.motion import Trajectories, body_rates
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
@@ -106,7 +106,7 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
     return found
 
 
-def follow(motion: Motion, traces: Mapping[int, DroneTrace], frame_s: float) -> Motion:
+def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: float) -> Trajectories:
     """The motion with every drone that has a pose trace flying it: what it believes keeps the errors of its model."""
     posed = {drone: trace.pose for drone, trace in traces.items() if trace.pose is not None}
     if not posed:

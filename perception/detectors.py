@@ -63,7 +63,7 @@ Constructor = Callable[[SceneModel, Perception, int, int], Detector]
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class DetectorKind:
     """One value of `perception.detector`."""
 
     about: str
@@ -102,14 +102,16 @@ def _surrogate(scene: SceneModel, config: Perception, seed: int, replication: in
     return SurrogateDetector(scene, config, seed, weights, replication)
 
 
-DETECTORS: dict[str, Kind] = {
-    "torch": Kind("the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch),
-    "recorded": Kind(
+DETECTORS: dict[str, DetectorKind] = {
+    "torch": DetectorKind(
+        "the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch
+    ),
+    "recorded": DetectorKind(
         "what another model saw, from perception.recording; its features may be fused by its own code", _recorded
     ),
-    "surrogate": Kind(
+    "surrogate": DetectorKind(
         "a fast model fitted to the torch detector by `sortie calibrate`; nothing is rendered", _surrogate
     ),
-    "none": Kind("traffic alone; boxes are counted from the scene", None),
+    "none": DetectorKind("traffic alone; boxes are counted from the scene", None),
 }
 """A new detector is one constructor and one line here, and one word in the schema."""

@@ -20,7 +20,7 @@ from sortie.radio.mac.airtime import (
     tries,
 )
 from sortie.radio.mac.contention import contention
-from sortie.radio.mac.jobs import Job
+from sortie.radio.mac.jobs import AirJob
 from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
 from sortie.radio.rates import STANDARDS, rate_table, rescale
@@ -34,7 +34,7 @@ _GOLDEN = 0.6180339887498949
 _MAX_DEMANDS = 20_000
 
 
-class Sample(Job):
+class Sample(AirJob):
     """A sample, its current pass through the medium, and the goodput measurement that it carries."""
 
     __slots__ = (

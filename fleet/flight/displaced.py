@@ -9,13 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, Motion, attitude, body_rates
+from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, Trajectories, attitude, body_rates
 from sortie.fleet.flight.viewpoints import Course, Plan, shifts
 
 Array = npt.NDArray[np.float64]
 
 
-def displaced(flown: Motion, base: Motion, course: Course, plans: Sequence[Plan], frame: int) -> Motion:
+def displaced(
+    flown: Trajectories, base: Trajectories, course: Course, plans: Sequence[Plan], frame: int
+) -> Trajectories:
     """The flight, from a frame on, with every drone's moves: what was flown before stays bit for bit.
 
     Place, velocity and acceleration follow from the rotating frame; attitude from the thrust that they ask for in the

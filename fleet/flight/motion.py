@@ -37,7 +37,7 @@ class MotionError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class Trajectories:
     """A flown formation. Every array is read-only."""
 
     time_s: Array  # [T]
@@ -90,7 +90,7 @@ def attitude(thrust_mps2: Array, heading_rad: Array) -> Array:
     return quaternion
 
 
-def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0) -> Motion:
+def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0) -> Trajectories:
     """Fly the formation along its route.
 
     Every random number comes from a stream of its drone, so that the first n drones fly the same whatever n is
@@ -152,7 +152,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     est_yaw = yaw + gauss_markov(
         draws("heading_error"), math.radians(config.heading_error_deg), ESTIMATE_TIME_S, frame_s
     )
-    motion = Motion(
+    motion = Trajectories(
         time_s=time_s,
         position_m=position,
         orientation_xyzw=quaternion,

@@ -13,7 +13,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from sortie.fleet.flight.motion import Motion
+from sortie.fleet.flight.motion import Trajectories
 from sortie.scenarios.schema import Airframe, Fleet
 
 Array = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ def induced_speed(forward: npt.ArrayLike, climb: npt.ArrayLike) -> Array:
     return root
 
 
-def fleet_power_w(fleet: Fleet, motion: Motion) -> Array:
+def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
     """Power at the rotors of every drone in every frame, W [T, N], by the scenario's model and payloads."""
     airframe = fleet.airframe
     payload_kg = np.full(fleet.drones, airframe.payload_kg)

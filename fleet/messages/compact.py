@@ -90,7 +90,7 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
         *d.position_m, *d.orientation_xyzw, *d.velocity_mps, d.footprint_radius_m, d.battery_soc, d.cpu_headroom,
         d.gpu_headroom, *goodput, *(region or ()),
     ]  # fmt: skip
-    bits = _Writer()
+    bits = _BitWriter()
     for value, bounds in zip(numbers, _ranges(len(goodput), region is not None), strict=True):
         bits.put(_to_int(value, bounds, form.number_bits), form.number_bits)
     for state in _coarse(d.coverage_grid, form.grid_cells, form.grid_bits):
@@ -121,7 +121,7 @@ def decode_compact(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"agent_id is {agent_id}, must be at most 254")
     if phase >= len(TaskPhase):
         raise MalformedDatagram(f"task_phase is {phase}, must be at most {len(TaskPhase) - 1}")
-    bits = _Reader(data[_HEAD.size :])
+    bits = _BitReader(data[_HEAD.size :])
     values = [_to_float(bits.take(number_bits), bounds, number_bits) for bounds in ranges]
     if not all(map(math.isfinite, values)):
         raise MalformedDatagram("a float is not finite")
@@ -201,7 +201,7 @@ def _fine(states: tuple[int, ...], cells: int, bits: int) -> bytes:
     return pack_grid(table.repeat(block, axis=0).repeat(block, axis=1))
 
 
-class _Writer:
+class _BitWriter:
     """Bits, lowest first."""
 
     def __init__(self) -> None:
@@ -215,8 +215,8 @@ class _Writer:
         return self._value.to_bytes(math.ceil(self._length / 8), "little")
 
 
-class _Reader:
-    """The inverse of `_Writer`."""
+class _BitReader:
+    """The inverse of `_BitWriter`."""
 
     def __init__(self, data: bytes) -> None:
         self._value = int.from_bytes(data, "little")

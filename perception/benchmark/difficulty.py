@@ -12,7 +12,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Cars:
+class CarRanges:
     """How many cars there are."""
 
     parked_density: Range
@@ -21,10 +21,10 @@ class Cars:
     """Moving cars per kilometre of lane."""
 
 
-DENSITIES: dict[Density, Cars] = {
-    "sparse": Cars((0.02, 0.12), (1.5, 4.0)),
-    "default": Cars((0.1, 0.3), (3.0, 8.0)),
-    "dense": Cars((0.35, 0.65), (9.0, 16.0)),
+DENSITIES: dict[Density, CarRanges] = {
+    "sparse": CarRanges((0.02, 0.12), (1.5, 4.0)),
+    "default": CarRanges((0.1, 0.3), (3.0, 8.0)),
+    "dense": CarRanges((0.35, 0.65), (9.0, 16.0)),
 }
 """About 10, 25 and 60 cars within ±102.4 m of a drone; the middle one is near what UAV3D's frames hold."""
 

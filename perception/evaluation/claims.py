@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from sortie.perception.evaluation import verdict
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.measures import (
+    ApOf,
     Contrast,
     Crossover,
     Elsewhere,
     FleetFrameBytes,
     Kept,
-    Level,
     MeanLevel,
     Measure,
     Oracle,
@@ -29,13 +29,13 @@ from sortie.perception.evaluation.measures import (
     Widest,
     WrongChoice,
 )
-from sortie.perception.evaluation.verdict import Judgement, Measured, Paper
+from sortie.perception.evaluation.verdict import Judgement, MeasuredValue, Paper
 
 CURVE = (0.01, 0.02, 0.05, 0.1, 0.25, 1.0)
 BUDGETS = (0.02, 0.05, 0.1, 0.25)
 TWO_PEERS = ("best-2", "worst-2", "random-2")
 
-Rule = Callable[[Paper, Measured | None], Judgement]
+Rule = Callable[[Paper, MeasuredValue | None], Judgement]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,17 +58,17 @@ class Claim:
     """Arithmetic on the paper's figures, not a sentence of it."""
 
 
-def all_4(rho: float) -> Condition:
+def all_4(rho: float) -> Sharing:
     """Spreading: every peer shares."""
-    return Condition(rho)
+    return Sharing(rho)
 
 
-def two(rho: float) -> tuple[Condition, ...]:
+def two(rho: float) -> tuple[Sharing, ...]:
     """Concentrating: the two-peer policies at the same bytes."""
-    return tuple(Condition(rho, peers) for peers in TWO_PEERS)
+    return tuple(Sharing(rho, peers) for peers in TWO_PEERS)
 
 
-POLICIES = tuple(tuple(Condition(rho, peers) for rho in BUDGETS) for peers in ("all-4", *TWO_PEERS))
+POLICIES = tuple(tuple(Sharing(rho, peers) for rho in BUDGETS) for peers in ("all-4", *TWO_PEERS))
 """The fixed policies that the paper's oracle switches among, by budget."""
 
 
@@ -77,11 +77,11 @@ def _against_full(rho: float, region: Region = "full") -> Contrast:
 
 
 def _pair(rho: float, a: str, b: str, region: Region = "full") -> Contrast:
-    return Contrast((Condition(rho, a),), (Condition(rho, b),), region)
+    return Contrast((Sharing(rho, a),), (Sharing(rho, b),), region)
 
 
 def _overlap_against_uniform(rho: float) -> Contrast:
-    return Contrast((Condition(rho, allocation="overlap"),), (all_4(rho),))
+    return Contrast((Sharing(rho, allocation="overlap"),), (all_4(rho),))
 
 
 POINTS, AP = "AP points", "AP"
@@ -94,8 +94,8 @@ SET_UP = (
 )  # fmt: skip
 
 GAIN = (
-    Claim("single", "gain, 1", "AP of a single drone", AP, Paper(0.185, digits=3), Level(SINGLE), verdict.level),
-    Claim("full", "gain, 2", "AP at full sharing", AP, Paper(0.371, digits=3), Level(FULL_SHARING), verdict.level),
+    Claim("single", "gain, 1", "AP of a single drone", AP, Paper(0.185, digits=3), ApOf(SINGLE), verdict.level),
+    Claim("full", "gain, 2", "AP at full sharing", AP, Paper(0.371, digits=3), ApOf(FULL_SHARING), verdict.level),
     Claim(
         "gain", "gain, 2", "Cooperation gains", POINTS,
         Paper(18.5, 16.9, 20.3), Contrast((FULL_SHARING,), (SINGLE,)), headline=True,
@@ -125,17 +125,17 @@ GAIN = (
         "curve.0.02", "budget, 2", "ρ = 0.02 against full sharing", POINTS,
         Paper(-19.1), _against_full(0.02), follows=True,
     ),
-    Claim("level.0.01", "gain, 7", "AP at ρ = 0.01", AP, Paper(0.131, digits=3), Level(all_4(0.01)), verdict.level, follows=True),
-    Claim("level.0.02", "budget, 2", "AP at ρ = 0.02", AP, Paper(0.180, digits=3), Level(all_4(0.02)), verdict.level, follows=True),
-    Claim("level.0.05", "gain, 6", "AP at ρ = 0.05", AP, Paper(0.293, digits=3), Level(all_4(0.05)), verdict.level, follows=True),
-    Claim("level.0.1", "gain, 5", "AP at ρ = 0.1", AP, Paper(0.351, digits=3), Level(all_4(0.1)), verdict.level, follows=True),
-    Claim("level.0.25", "figure, a", "AP at ρ = 0.25 (drawn, not printed)", AP, Paper(), Level(all_4(0.25)), verdict.level),
+    Claim("level.0.01", "gain, 7", "AP at ρ = 0.01", AP, Paper(0.131, digits=3), ApOf(all_4(0.01)), verdict.level, follows=True),
+    Claim("level.0.02", "budget, 2", "AP at ρ = 0.02", AP, Paper(0.180, digits=3), ApOf(all_4(0.02)), verdict.level, follows=True),
+    Claim("level.0.05", "gain, 6", "AP at ρ = 0.05", AP, Paper(0.293, digits=3), ApOf(all_4(0.05)), verdict.level, follows=True),
+    Claim("level.0.1", "gain, 5", "AP at ρ = 0.1", AP, Paper(0.351, digits=3), ApOf(all_4(0.1)), verdict.level, follows=True),
+    Claim("level.0.25", "figure, a", "AP at ρ = 0.25 (drawn, not printed)", AP, Paper(), ApOf(all_4(0.25)), verdict.level),
 )  # fmt: skip
 
 MISSION = (
-    Claim("mission.full", "mission, 2", "Mission AP at full sharing", AP, Paper(0.763, digits=3), Level(FULL_SHARING, "mission"), verdict.level),
-    Claim("mission.0.05", "mission, 2", "Mission AP at ρ = 0.05", AP, Paper(0.773, digits=3), Level(all_4(0.05), "mission"), verdict.level),
-    Claim("mission.0.1", "mission, 2", "Mission AP at ρ = 0.1", AP, Paper(0.784, digits=3), Level(all_4(0.1), "mission"), verdict.level),
+    Claim("mission.full", "mission, 2", "Mission AP at full sharing", AP, Paper(0.763, digits=3), ApOf(FULL_SHARING, "mission"), verdict.level),
+    Claim("mission.0.05", "mission, 2", "Mission AP at ρ = 0.05", AP, Paper(0.773, digits=3), ApOf(all_4(0.05), "mission"), verdict.level),
+    Claim("mission.0.1", "mission, 2", "Mission AP at ρ = 0.1", AP, Paper(0.784, digits=3), ApOf(all_4(0.1), "mission"), verdict.level),
     Claim(
         "mission.widest", "mission, 3", "Mission AP at ρ 0.05–0.1, widest from full sharing", POINTS,
         Paper(2.2, -0.5, 5.1, significant=False),
@@ -219,14 +219,14 @@ ALLOCATION = tuple(
 )  # fmt: skip
 
 COMPOSITION = (
-    Claim("compose.best", "composition, 2", "AP of best-2 at ρ = 0.02", AP, Paper(0.257, digits=3), Level(Condition(0.02, "best-2")), verdict.level),
-    Claim("compose.worst", "composition, 2", "AP of worst-2 at ρ = 0.02", AP, Paper(0.257, digits=3), Level(Condition(0.02, "worst-2")), verdict.level),
+    Claim("compose.best", "composition, 2", "AP of best-2 at ρ = 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "best-2")), verdict.level),
+    Claim("compose.worst", "composition, 2", "AP of worst-2 at ρ = 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "worst-2")), verdict.level),
     Claim(
         "compose.tie", "composition, 2", "ρ = 0.02, full scene: best-2 − worst-2", POINTS,
         Paper(0.0, significant=False), _pair(0.02, "best-2", "worst-2"), headline=True,
     ),
-    Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at ρ = 0.02", AP, Paper(0.787, digits=3), Level(Condition(0.02, "best-2"), "mission"), verdict.level),
-    Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at ρ = 0.02", AP, Paper(0.728, digits=3), Level(Condition(0.02, "worst-2"), "mission"), verdict.level),
+    Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at ρ = 0.02", AP, Paper(0.787, digits=3), ApOf(Sharing(0.02, "best-2"), "mission"), verdict.level),
+    Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at ρ = 0.02", AP, Paper(0.728, digits=3), ApOf(Sharing(0.02, "worst-2"), "mission"), verdict.level),
     Claim(
         "compose.mission", "composition, 5", "ρ = 0.02, mission: best-2 − worst-2", POINTS,
         Paper(5.9, 2.5, 9.4), _pair(0.02, "best-2", "worst-2", "mission"), headline=True,
@@ -267,6 +267,6 @@ SECTIONS: dict[str, tuple[Claim, ...]] = {
 CLAIMS: tuple[Claim, ...] = tuple(claim for claims in SECTIONS.values() for claim in claims)
 
 
-def conditions(claims: Iterable[Claim] = CLAIMS) -> tuple[Condition, ...]:
+def conditions(claims: Iterable[Claim] = CLAIMS) -> tuple[Sharing, ...]:
     """What has to be evaluated for the claims, each once, in their order."""
     return tuple(dict.fromkeys(c for claim in claims for c in claim.measure.conditions()))

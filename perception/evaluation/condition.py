@@ -18,7 +18,7 @@ _ALLOWED = {"allocation": get_args(Allocation), "cells_by": get_args(CellsBy), "
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class Sharing:
     """What every ego of every frame is given.
 
     Raises:
@@ -71,7 +71,7 @@ class Condition:
         return ",".join([f"{self.peers}@{rho}", *marks, *(["roi"] if self.roi else [])])
 
     @classmethod
-    def parse(cls, label: str) -> Condition:
+    def parse(cls, label: str) -> Sharing:
         """The condition that a label names.
 
         Raises:
@@ -90,7 +90,7 @@ class Condition:
         except (ValueError, KeyError) as error:
             raise ValueError(f"condition is {label!r}, must be like best-2@0.02,masked ({error})") from None
 
-    def plain(self, drones: int = 5) -> Condition:
+    def plain(self, drones: int = 5) -> Sharing:
         """The simplest condition that gives the same boxes in a fleet of this size; what is equal is computed once.
 
         Knobs that choose among cells say nothing when every cell goes, nor those that choose among peers when all
@@ -107,7 +107,7 @@ class Condition:
         return out
 
 
-SINGLE = Condition(0.0, "none")
+SINGLE = Sharing(0.0, "none")
 """A drone alone."""
-FULL_SHARING = Condition(1.0)
+FULL_SHARING = Sharing(1.0)
 """Every peer sends every cell."""

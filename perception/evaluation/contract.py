@@ -45,7 +45,7 @@ class Exchange(NamedTuple):
     unsent: Unsent = "zero"
 
 
-class View(Protocol):
+class FrameView(Protocol):
     """One fleet-frame as a model sees it."""
 
     def rank(self, by: CellsBy) -> NDArray[np.floating]:
@@ -69,5 +69,5 @@ class Instrument(Protocol):
     def geometry(self) -> Geometry:
         """Its grids; cars inside the ego's square of that size are what there is to find."""
 
-    def look(self, frames: FleetFrames, frame: int) -> View:
+    def look(self, frames: FleetFrames, frame: int) -> FrameView:
         """What it makes of one fleet-frame; all that conditions share is computed once."""

@@ -23,7 +23,7 @@ import torch
 from sortie.perception.benchmark.dataset import FORMAT, Frames, start_worker
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.metrics.ap import Matched
@@ -34,13 +34,13 @@ from sortie.perception.scene.scene_model import SceneModel
 
 SEED = 7
 SCENES = 12
-CONDITIONS: tuple[Condition, ...] = (SINGLE, FULL_SHARING)
+CONDITIONS: tuple[Sharing, ...] = (SINGLE, FULL_SHARING)
 BEGIN, END = "<!-- effects: begin -->", "<!-- effects: end -->"
 """Around the table in the README; `write_table` replaces what is between."""
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class ParameterShift:
     """One parameter moved."""
 
     parameter: str
@@ -52,14 +52,14 @@ def _moved(name: str, value: Any) -> Difficulty:
     return replace(Difficulty(), **{name: value})
 
 
-def moves() -> list[Move]:
+def moves() -> list[ParameterShift]:
     """The default first, then every parameter at the ends of its range, or well beyond for the errors and the fleet."""
     d = Difficulty()
     out = [
-        Move("as it is", "", d),
-        Move("density", "sparse", replace(d, density="sparse")),
-        Move("density", "dense", replace(d, density="dense")),
-        Move("unseen", "as seen in training", replace(d, unseen=d.seen)),
+        ParameterShift("as it is", "", d),
+        ParameterShift("density", "sparse", replace(d, density="sparse")),
+        ParameterShift("density", "dense", replace(d, density="dense")),
+        ParameterShift("unseen", "as seen in training", replace(d, unseen=d.seen)),
     ]
     for name, ends, unit in (
         ("building_density", d.building_density, ""),
@@ -71,7 +71,7 @@ def moves() -> list[Move]:
         ("spacing_m", (10.0, 40.0), " m"),
         ("altitude_m", (45.0, 80.0), " m"),
     ):
-        out += [Move(name, f"{end:g}{unit}", _moved(name, (end, end))) for end in ends]
+        out += [ParameterShift(name, f"{end:g}{unit}", _moved(name, (end, end))) for end in ends]
     for name, values, unit in (
         ("slot_sigma_m", (0.0, 3.0), " m"),
         ("yaw_sigma_deg", (0.0, 45.0), "°"),
@@ -79,7 +79,7 @@ def moves() -> list[Move]:
         ("position_error_sigma_m", (0.0, 0.5), " m"),
         ("heading_error_sigma_deg", (0.0, 1.0), "°"),
     ):
-        out += [Move(name, f"{value:g}{unit}", _moved(name, value)) for value in values]
+        out += [ParameterShift(name, f"{value:g}{unit}", _moved(name, value)) for value in values]
     return out
 
 
@@ -87,7 +87,7 @@ def moves() -> list[Move]:
 class Effect:
     """What a move did."""
 
-    move: Move
+    move: ParameterShift
     gain: Difference
     """AP alone (a) and with all five sharing all (b)."""
     change: Difference | None
@@ -135,7 +135,7 @@ def measure(
     ]
 
 
-def evaluate_scene(weights: Path, index: int, rows: Sequence[Move], path: Path) -> None:
+def evaluate_scene(weights: Path, index: int, rows: Sequence[ParameterShift], path: Path) -> None:
     """One scene under every move, one frame each; towns that moves share are drawn once."""
     instrument = CarNetInstrument.load(weights)
     towns: dict[str, SceneModel] = {}

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import Condition
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument, View
+from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, FrameView, Instrument
 from sortie.perception.evaluation.matched import (
     FLOOR,
     NMS_IOU,
     Evaluation,
     FrameResult,
+    MatchedStore,
     Region,
     Settings,
-    Store,
     assemble,
 )
 from sortie.perception.geometry import CELLS, Geometry
@@ -47,7 +47,7 @@ FLUSH_FRAMES = 4
 def evaluate(
     instrument: Instrument,
     frames: FleetFrames,
-    conditions: Sequence[Condition],
+    conditions: Sequence[Sharing],
     *,
     regions: Sequence[Region] = ("full", "mission"),
     egos: int = 5,
@@ -62,7 +62,7 @@ def evaluate(
 
     Args:
         instrument, frames: a model and what it looks at.
-        conditions: duplicates are evaluated once, and so are those that differ in nothing (`Condition.plain`).
+        conditions: duplicates are evaluated once, and so are those that differ in nothing (`Sharing.plain`).
         regions: full: every car in the ego's square; mission: 32 m around the frame's target; ego: around the ego.
         egos: how many drones of each frame are egos, the first ones.
         floor: the lowest score that is kept.
@@ -88,7 +88,7 @@ def evaluate(
     plain = {c: c.plain(drones) for c in conditions}
     todo = tuple(dict.fromkeys(plain.values()))
     keys = frame_keys(frames)
-    kept = None if store is None else Store(store, instrument.fingerprint, settings, regions)
+    kept = None if store is None else MatchedStore(store, instrument.fingerprint, settings, regions)
 
     def task(f: int) -> tuple[str, FrameResult]:
         name = "" if kept is None else frame_hash(frames, f, keys[f])
@@ -175,11 +175,11 @@ def truth(frames: FleetFrames, f: int, ego: int, geometry: Geometry) -> Boxes:
 
 
 def exchanges(
-    view: View,
+    view: FrameView,
     frames: FleetFrames,
     f: int,
     key: tuple[int, int],
-    conditions: Sequence[Condition],
+    conditions: Sequence[Sharing],
     settings: Settings,
     geometry: Geometry,
     target: tuple[float, float] | None,
@@ -212,7 +212,7 @@ def _frame(
     frames: FleetFrames,
     f: int,
     key: tuple[int, int],
-    conditions: Sequence[Condition],
+    conditions: Sequence[Sharing],
     regions: Sequence[Region],
     settings: Settings,
 ) -> FrameResult:
@@ -228,8 +228,8 @@ def _frame(
     }
     ego_of = np.array([e.ego for e, _ in given])
     matched = match_all(local, ego_of, frames.est_pose[f], there, {r: discs[r] for r in regions}, settings)
-    cost: dict[Condition, list[tuple[int, int, int]]] = {}
-    units: dict[tuple[Condition, Region], list[Matched]] = {}
+    cost: dict[Sharing, list[tuple[int, int, int]]] = {}
+    units: dict[tuple[Sharing, Region], list[Matched]] = {}
     for n, c in enumerate(conditions):
         these = slice(n * settings.egos, (n + 1) * settings.egos)
         cost[c] = [(sum(count), *selection.link_bytes(count)) for _, count in given[these]]

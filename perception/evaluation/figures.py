@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.perception.evaluation.claims import BUDGETS, CURVE
-from sortie.perception.evaluation.rows import INSTRUMENTS, Point, Row
-from sortie.perception.evaluation.verdict import Verdict
+from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, Point
+from sortie.perception.evaluation.verdict import ClaimVerdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ PAPER, INK = "#9a9a9a", "#222222"
 COLOURS = {"full": "#1f6fb4", "mission": "#c2571a"}
 POLICY_COLOURS = {"all-4": "#1f6fb4", "best-2": "#2a9d5c", "worst-2": "#c2571a", "random-2": "#8a63b8"}
 VERDICTS = {
-    Verdict.REPRODUCED: "#2a9d5c", Verdict.NOT_REPRODUCED: "#d08a00", Verdict.OPPOSITE: "#c33a2f",
+    ClaimVerdict.REPRODUCED: "#2a9d5c", ClaimVerdict.NOT_REPRODUCED: "#d08a00", ClaimVerdict.OPPOSITE: "#c33a2f",
 }  # fmt: skip
 DASHES = {"zero": "-", "masked": (0, (4, 2))}
 PAPER_CURVE = {
@@ -93,7 +93,7 @@ def peer_selection(points: Sequence[Point]) -> Figure:
     return figure
 
 
-def forest(rows: Iterable[Row]) -> Figure:
+def forest(rows: Iterable[ClaimRow]) -> Figure:
     """Every difference of APs: the paper's interval in grey, ours by verdict, masked fusion hollow."""
     rows = [r for r in rows if r.unit == "AP points"]
     ids = list(dict.fromkeys(r.id for r in rows))
@@ -111,7 +111,7 @@ def forest(rows: Iterable[Row]) -> Figure:
         for instrument, down in (("zero", 0.02), ("masked", -0.2)):
             row = its.get(instrument)
             if row is not None and row.value is not None:
-                colour = VERDICTS.get(Verdict(row.verdict), INK)
+                colour = VERDICTS.get(ClaimVerdict(row.verdict), INK)
                 _bar(ax, y + down, row.value, row.low, row.high, colour, "o", filled=instrument == "zero")
         if i % 2:
             ax.axhspan(y - 0.5, y + 0.5, color=INK, alpha=0.035, lw=0)

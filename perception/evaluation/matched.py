@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import Condition
+from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, average_precision
 
 Region = Literal["full", "mission", "ego"]
@@ -45,9 +45,9 @@ class FrameResult:
 
     target: tuple[float, float]
     """Centre of the mission's disc; NaN where there is none."""
-    units: Mapping[tuple[Condition, Region], Sequence[Matched]]
+    units: Mapping[tuple[Sharing, Region], Sequence[Matched]]
     """One for each ego."""
-    cost: Mapping[Condition, Sequence[tuple[int, int, int]]]
+    cost: Mapping[Sharing, Sequence[tuple[int, int, int]]]
     """Cells shared to each ego, their bytes, and the bytes that say which cells they are."""
 
 
@@ -55,20 +55,20 @@ class FrameResult:
 class Evaluation:
     """n frames × `egos` under every condition. A unit is one ego of one frame, frame by frame."""
 
-    conditions: tuple[Condition, ...]
+    conditions: tuple[Sharing, ...]
     regions: tuple[Region, ...]
     settings: Settings
     scene: Ints
     """[n]"""
     target: Floats
     """[n, 2] centre of the mission's disc; NaN where the frame has none and does not count for the mission."""
-    units: Mapping[tuple[Condition, Region], Sequence[Matched]]
+    units: Mapping[tuple[Sharing, Region], Sequence[Matched]]
     """One `Matched` per unit [n · egos]."""
-    cells: Mapping[Condition, Ints]
+    cells: Mapping[Sharing, Ints]
     """[n · egos] cells shared to the unit, in all."""
-    payload_bytes: Mapping[Condition, Ints]
+    payload_bytes: Mapping[Sharing, Ints]
     """[n · egos] cells × 80 × 2."""
-    index_bytes: Mapping[Condition, Ints]
+    index_bytes: Mapping[Sharing, Ints]
     """[n · egos] which cells they are, counted apart."""
 
     def at(self, tau: float) -> Evaluation:
@@ -87,7 +87,7 @@ class Evaluation:
         every = np.ones(len(self.scene), bool) if region != "mission" else ~np.isnan(self.target[:, 0])
         return np.repeat(every, self.settings.egos)
 
-    def matched(self, condition: Condition, region: Region = "full") -> list[Matched]:
+    def matched(self, condition: Sharing, region: Region = "full") -> list[Matched]:
         """The units that count, in order."""
         several = self.units[condition, region]
         return [several[i] for i in np.flatnonzero(self.counts(region)).tolist()]
@@ -97,7 +97,7 @@ class Evaluation:
         label = np.arange(len(self.scene)) if by == "frame" else self.scene
         return np.repeat(label, self.settings.egos)[self.counts(region)]
 
-    def ap(self, condition: Condition, region: Region = "full") -> float:
+    def ap(self, condition: Sharing, region: Region = "full") -> float:
         """AP@0.5 over the units that count, in the convention of the settings."""
         return average_precision(self.matched(condition, region), CONVENTIONS[self.settings.convention])
 
@@ -121,7 +121,7 @@ class Evaluation:
             facts = json.loads(table.schema.metadata[b"sortie"])
             results = _from_table(table)
             frames = [results[f"{f:06d}"] for f in range(len(facts["scene"]))]
-            conditions = [Condition.parse(label) for label in facts["conditions"]]
+            conditions = [Sharing.parse(label) for label in facts["conditions"]]
             return assemble(frames, conditions, facts["regions"], Settings(**facts["settings"]), facts["scene"])
         except (OSError, pa.ArrowInvalid, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: not an evaluation of this project ({error!r})") from None
@@ -138,11 +138,11 @@ class Evaluation:
 
 def assemble(
     frames: Sequence[FrameResult],
-    conditions: Sequence[Condition],
+    conditions: Sequence[Sharing],
     regions: Sequence[Region],
     settings: Settings,
     scene: Sequence[int] | Ints,
-    computed_as: Mapping[Condition, Condition] | None = None,
+    computed_as: Mapping[Sharing, Sharing] | None = None,
 ) -> Evaluation:
     """Frames in order as one evaluation; `computed_as` says under which equal condition a condition was evaluated."""
     source = {c: c for c in conditions} | dict(computed_as or {})
@@ -158,7 +158,7 @@ def assemble(
     )  # fmt: skip
 
 
-class Store:
+class MatchedStore:
     """Finished frames of one instrument under one set of settings, in a folder of Parquet parts.
 
     A later evaluation takes from it what it needs, whichever conditions and frames the earlier ones were about.
@@ -236,9 +236,9 @@ def _from_table(table: pa.Table) -> dict[str, FrameResult]:
     hit = lists[1].values.to_numpy(zero_copy_only=False)
     ends = lists[0].offsets.to_numpy()
     out: dict[str, FrameResult] = {}
-    known: dict[str, Condition] = {}
+    known: dict[str, Sharing] = {}
     for n, (key, label, region, ego, x, y, cells, payload, index, truths) in enumerate(zip(*rows, strict=True)):
-        condition = known.get(label) or known.setdefault(label, Condition.parse(label))
+        condition = known.get(label) or known.setdefault(label, Sharing.parse(label))
         frame: Any = out.get(key) or out.setdefault(key, FrameResult((x, y), {}, {}))
         here = slice(ends[n], ends[n + 1])
         units = frame.units.setdefault((condition, region), [])

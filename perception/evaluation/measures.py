@@ -13,8 +13,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Condition, Unsent
-from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing, Unsent
+from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.perception.metrics.bootstrap import interval, p_value
 
 Region = Literal["full", "mission"]
@@ -26,35 +26,35 @@ POINTS = 100.0
 class Scores(Protocol):
     """Bootstrapped APs (0 … 1) by condition and region, every draw made of the same frames for all of them."""
 
-    def ap(self, condition: Condition, region: Region) -> float:
+    def ap(self, condition: Sharing, region: Region) -> float:
         """On all frames."""
         ...
 
-    def draws(self, condition: Condition, region: Region) -> Floats:
+    def draws(self, condition: Sharing, region: Region) -> Floats:
         """[b], on resampled frames."""
         ...
 
-    def halves(self, condition: Condition, region: Region, *, resampled: bool) -> Floats:
+    def halves(self, condition: Sharing, region: Region, *, resampled: bool) -> Floats:
         """[s, 2], on the two halves of s random splits of the frames, resampled within each half or not."""
         ...
 
-    def fleet_frame_bytes(self, condition: Condition) -> Sequence[float]:
+    def fleet_frame_bytes(self, condition: Sharing) -> Sequence[float]:
         """Payload bytes of each frame, summed over all egos."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class ApOf:
     """The AP of one way of sharing."""
 
-    of: Condition
+    of: Sharing
     region: Region = "full"
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield self.of
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """AP, 0 … 1."""
         return _interval(scores.ap(self.of, self.region), scores.draws(self.of, self.region), test=False)
 
@@ -63,15 +63,15 @@ class Level:
 class Contrast:
     """AP of `of` minus AP of `over`, in points. Of several ways the best in this region, chosen once on all frames."""
 
-    of: tuple[Condition, ...]
-    over: tuple[Condition, ...]
+    of: tuple[Sharing, ...]
+    over: tuple[Sharing, ...]
     region: Region = "full"
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield from (*self.of, *self.over)
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """The difference."""
         a, b = best(self.of, self.region, scores), best(self.over, self.region, scores)
         names = " − ".join(c.peers for c in (a, b)) if len(self.of) + len(self.over) > 2 else ""
@@ -86,12 +86,12 @@ class Widest:
 
     among: tuple[Contrast, ...]
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         for contrast in self.among:
             yield from contrast.conditions()
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """That contrast's difference."""
         measured = [(abs(m.value), -i, m) for i, m in enumerate(c.measure(scores) for c in self.among)]
         _, minus_i, widest = max(measured)
@@ -102,13 +102,13 @@ class Widest:
 class Kept:
     """The part of the cooperative gain that a way of sharing keeps, in per cent."""
 
-    of: Condition
+    of: Sharing
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield from (self.of, SINGLE, FULL_SHARING)
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """(AP − AP alone) / (AP at full sharing − AP alone)."""
 
         def part(of: Floats | float, alone: Floats | float, full: Floats | float) -> Floats:
@@ -120,7 +120,7 @@ class Kept:
         return _interval(POINTS * value, POINTS * part(*(scores.draws(c, "full") for c in three)))
 
 
-Policies = tuple[tuple[Condition, ...], ...]
+Policies = tuple[tuple[Sharing, ...], ...]
 """Fixed policies in rows, the same budgets in columns."""
 
 
@@ -134,11 +134,11 @@ class WrongChoice:
     judged_at: int
     """Column in which it is used."""
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield from (row[i] for row in self.policies for i in (self.chosen_at, self.judged_at))
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """Its AP minus the winner's there, in points; 0 where one policy wins at both."""
         ap = table(self.policies, scores)
         chosen, winner = (int(np.argmax(ap[:, i])) for i in (self.chosen_at, self.judged_at))
@@ -160,12 +160,12 @@ class Oracle:
     policies: Policies
     held_out: bool = False
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         for row in self.policies:
             yield from row
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """The gain."""
         if self.held_out:
             value = float(np.mean(held_out(self._halves(scores, resampled=False))))
@@ -190,12 +190,12 @@ class MeanLevel:
     policies: Policies
     fixed: bool
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         for row in self.policies:
             yield from row
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """AP, 0 … 1."""
         ap, draws = table(self.policies, scores), _table_draws(self.policies, scores)
         columns = np.arange(ap.shape[1])
@@ -211,59 +211,59 @@ class Crossover:
     contrasts: tuple[Contrast, ...]
     """Concentrating over spreading, by ascending budget."""
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         for contrast in self.contrasts:
             yield from contrast.conditions()
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """Where the line between the last significant lead of concentrating and the first of spreading meets zero, in per cent."""
         seen = [(c.of[0].rho, c.measure(scores)) for c in self.contrasts]
         signs = [(1 if m.value > 0 else -1) if m.significant else 0 for _, m in seen]
         if 1 not in signs or -1 not in signs:
             ahead = {(True, False): "concentrating never trails", (False, True): "concentrating never leads"}
-            return Measured(float("nan"), note=ahead.get((1 in signs, -1 in signs), "no significant lead"))
+            return MeasuredValue(float("nan"), note=ahead.get((1 in signs, -1 in signs), "no significant lead"))
         last = max(i for i, s in enumerate(signs) if s == 1)
         first = min(i for i, s in enumerate(signs) if s == -1)
         if last > first:
-            return Measured(float("nan"), note="the lead changes more than once")
+            return MeasuredValue(float("nan"), note="the lead changes more than once")
         (low, a), (high, b) = seen[last], seen[first]
         at = low + (high - low) * a.value / (a.value - b.value)
-        return Measured(POINTS * at, note=f"between {low:g} and {high:g}")
+        return MeasuredValue(POINTS * at, note=f"between {low:g} and {high:g}")
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
     """The budget at which a curve is highest, in per cent of full sharing."""
 
-    curve: tuple[Condition, ...]
+    curve: tuple[Sharing, ...]
     region: Region
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield from self.curve
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """That budget; NaN where there was nothing to find under any."""
         top = best(self.curve, self.region, scores)
         if not np.isfinite(scores.ap(top, self.region)):
-            return Measured(float("nan"), note="nothing was there to be found")
-        return Measured(POINTS * top.rho)
+            return MeasuredValue(float("nan"), note="nothing was there to be found")
+        return MeasuredValue(POINTS * top.rho)
 
 
 @dataclass(frozen=True, slots=True)
 class FleetFrameBytes:
     """Feature bytes of one fleet-frame, all egos together, in MB."""
 
-    of: Condition
+    of: Sharing
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         yield self.of
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """Mean over the frames."""
-        return Measured(float(np.mean(scores.fleet_frame_bytes(self.of))) / 1e6)
+        return MeasuredValue(float(np.mean(scores.fleet_frame_bytes(self.of))) / 1e6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,18 +272,18 @@ class UnequalBytes:
 
     policies: Policies
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """What has to be evaluated."""
         for row in self.policies:
             yield from row
 
-    def measure(self, scores: Scores) -> Measured:
+    def measure(self, scores: Scores) -> MeasuredValue:
         """The largest relative spread in any frame of any budget."""
         worst = 0.0
         for column in zip(*self.policies, strict=True):
             sent = np.array([scores.fleet_frame_bytes(c) for c in column])
             worst = max(worst, float(np.max(np.ptp(sent, axis=0) / np.maximum(sent.max(axis=0), 1.0))))
-        return Measured(POINTS * worst)
+        return MeasuredValue(POINTS * worst)
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,23 +292,23 @@ class Elsewhere:
 
     name: str
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """Nothing."""
         yield from ()
 
 
-Accuracy = Level | Contrast | Widest | Kept | WrongChoice | Oracle | MeanLevel | Crossover | Peak
+Accuracy = ApOf | Contrast | Widest | Kept | WrongChoice | Oracle | MeanLevel | Crossover | Peak
 Counted = FleetFrameBytes | UnequalBytes
 Measure = Accuracy | Counted | Elsewhere
 
 
-def under(condition: Condition, unsent: Unsent, cells_by: CellsBy = "confidence") -> Condition:
+def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence") -> Sharing:
     """A claim's condition under another instrument; where every cell is sent, or none asked for, it is the same."""
     everything = condition.peers == "none" or (condition.rule == "all" and condition.rho >= 1.0)
     return condition if everything else replace(condition, unsent=unsent, cells_by=cells_by)
 
 
-def best(conditions: Sequence[Condition], region: Region, scores: Scores) -> Condition:
+def best(conditions: Sequence[Sharing], region: Region, scores: Scores) -> Sharing:
     """The one with the highest AP; the first of equal ones."""
     return max(conditions, key=lambda c: scores.ap(c, region))
 
@@ -335,9 +335,9 @@ def _table_draws(policies: Policies, scores: Scores) -> Floats:
     return np.array([[scores.draws(c, "full") for c in row] for row in policies])
 
 
-def _interval(value: float, draws: Floats, note: str = "", *, test: bool = True) -> Measured:
+def _interval(value: float, draws: Floats, note: str = "", *, test: bool = True) -> MeasuredValue:
     """The value with its 95 % percentile interval, and the two-sided level at which zero leaves it."""
     if not np.isfinite(draws).any():
-        return Measured(value, note=note)
+        return MeasuredValue(value, note=note)
     low, high = interval(draws)
-    return Measured(value, low, high, p_value(draws) if test else None, note)
+    return MeasuredValue(value, low, high, p_value(draws) if test else None, note)

@@ -14,7 +14,7 @@ from sortie.perception.evaluation.claims import conditions
 from sortie.perception.evaluation.contract import FleetFrames, Instrument
 from sortie.perception.evaluation.evaluate import Region, evaluate
 from sortie.perception.evaluation.measures import under
-from sortie.perception.evaluation.results import Asked, Found
+from sortie.perception.evaluation.results import TableResults, TableSettings
 from sortie.perception.scene.render import Renderer
 from sortie.perception.scene.scene_model import SceneModel
 
@@ -22,12 +22,12 @@ from sortie.perception.scene.scene_model import SceneModel
 def measure(
     instrument: Instrument,
     frames: FleetFrames,
-    asked: Asked,
+    asked: TableSettings,
     *,
     store: Path | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
-) -> Found:
+) -> TableResults:
     """Evaluate what the claims need, all instruments over the same features.
 
     Args:
@@ -39,7 +39,7 @@ def measure(
     every = dict.fromkeys(under(c, unsent, asked.cells_by) for unsent in asked.unsent for c in conditions())
     regions: tuple[Region, ...] = ("full", "mission", "ego")
     found = evaluate(instrument, frames, tuple(every), regions=regions, store=store, workers=workers, progress=progress)
-    return Found(found, asked)
+    return TableResults(found, asked)
 
 
 def bench_frames(

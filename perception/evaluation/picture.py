@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
 from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
 from sortie.perception.geometry import CELLS, Geometry
@@ -68,7 +68,7 @@ def picture(
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)
     view, geometry = instrument.look(frames, f), instrument.geometry
-    asked = (FULL_SHARING, *(Condition(rho) for rho in budgets))
+    asked = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
     given = [e for e, _ in exchanges(view, frames, f, key, asked, settings, geometry, target) if e.ego == ego]
     found = Boxes.placed(view.detect(given[:1], tau)[0], tuple(frames.est_pose[f, ego].tolist()))
     return Picture(

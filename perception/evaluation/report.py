@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from sortie.perception.evaluation.rows import INSTRUMENTS, Row
+from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow
 from sortie.perception.evaluation.sensitivity import Varied
-from sortie.perception.evaluation.verdict import Verdict
+from sortie.perception.evaluation.verdict import ClaimVerdict
 
 BEGIN, END = "<!-- paper:begin -->", "<!-- paper:end -->"
 MINUS = "−"
@@ -35,7 +35,7 @@ def figure(value: float | None, low: float | None, high: float | None, unit: str
     return text if low is None or high is None else f"{text} [{_plain(low, places)}, {_plain(high, places)}]"
 
 
-def papers(row: Row) -> str:
+def papers(row: ClaimRow) -> str:
     """What the paper prints."""
     text = figure(row.paper_value, row.paper_low, row.paper_high, row.unit, row.digits)
     if row.rule == "contrast" and not row.paper_significant:
@@ -43,34 +43,34 @@ def papers(row: Row) -> str:
     return f"({text})" if row.follows and text != "–" else text
 
 
-def ours(row: Row) -> str:
+def ours(row: ClaimRow) -> str:
     """What we measured."""
     if row.value is None:
-        return "none" if row.verdict == Verdict.NOT_REPRODUCED else "–"
+        return "none" if row.verdict == ClaimVerdict.NOT_REPRODUCED else "–"
     small = row.rule != "contrast" and 0 < abs(row.value) < 10.0 ** -_DECIMALS[row.unit]
     text = f"{row.value:.1g}{_suffix(row.unit)}" if small else figure(row.value, row.low, row.high, row.unit)
     contains_zero = row.low is not None and row.high is not None and row.low <= 0 <= row.high
     return f"{text} n.s." if row.rule == "contrast" and contains_zero else text
 
 
-def verdict(row: Row) -> str:
+def verdict(row: ClaimRow) -> str:
     """The verdict, and how the sizes compare."""
     mark = {
-        Verdict.REPRODUCED: "**reproduced**",
-        Verdict.NOT_REPRODUCED: "*not reproduced*",
-        Verdict.OPPOSITE: "*opposite*",
-    }.get(Verdict(row.verdict), row.verdict)
+        ClaimVerdict.REPRODUCED: "**reproduced**",
+        ClaimVerdict.NOT_REPRODUCED: "*not reproduced*",
+        ClaimVerdict.OPPOSITE: "*opposite*",
+    }.get(ClaimVerdict(row.verdict), row.verdict)
     return f"{mark}, {row.size}" if row.size and row.rule != "exact" else mark
 
 
-def tally(rows: Iterable[Row]) -> str:
+def tally(rows: Iterable[ClaimRow]) -> str:
     """How many claims got which verdict."""
     count = Counter(row.verdict for row in rows)
-    return ", ".join(f"{count[v]} {v}" for v in Verdict if count[v])
+    return ", ".join(f"{count[v]} {v}" for v in ClaimVerdict if count[v])
 
 
 def report(
-    rows: Sequence[Row],
+    rows: Sequence[ClaimRow],
     facts: Mapping[str, Any],
     figures: Sequence[tuple[str, str]] = (),
     varied: Sequence[Varied] = (),
@@ -89,7 +89,7 @@ def report(
     return "\n".join(lines)
 
 
-def short(rows: Sequence[Row], facts: Mapping[str, Any], link: str) -> str:
+def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
     """The README's section: the headline claims, between its markers."""
     chosen = [r for r in rows if r.headline]
     head = [BEGIN, "", _made(facts), ""]
@@ -148,7 +148,7 @@ The paper names neither its score threshold nor the centre of its mission region
 them, over both, from the same detections; a star marks another verdict than above."""
 
 
-def _section(rows: Sequence[Row], shown: Sequence[str]) -> list[str]:
+def _section(rows: Sequence[ClaimRow], shown: Sequence[str]) -> list[str]:
     if not any(r.instrument for r in rows):
         lines = ["| claim | sentence | paper | ours | verdict | |", "|---|---|---|---|---|---|"]
         return lines + [f"| {r.says} | {r.place} | {papers(r)} | {ours(r)} | {verdict(r)} | {r.note} |" for r in rows]
@@ -165,7 +165,7 @@ def _section(rows: Sequence[Row], shown: Sequence[str]) -> list[str]:
     return lines
 
 
-def _sensitivity(rows: Sequence[Row], varied: Sequence[Varied]) -> list[str]:
+def _sensitivity(rows: Sequence[ClaimRow], varied: Sequence[Varied]) -> list[str]:
     """A table a knob and instrument, its settings in columns; a star where the verdict is not that of the table above."""
     lines = ["## What the verdicts hang on", "", _SENSITIVITY, ""]
     first = {(r.id, r.instrument): r for r in rows}
@@ -194,9 +194,9 @@ def _sensitivity(rows: Sequence[Row], varied: Sequence[Varied]) -> list[str]:
     return lines
 
 
-def _by_claim(rows: Iterable[Row]) -> list[dict[str, Row]]:
+def _by_claim(rows: Iterable[ClaimRow]) -> list[dict[str, ClaimRow]]:
     """Rows of one claim together, by instrument, claims in their order."""
-    claims: dict[str, dict[str, Row]] = {}
+    claims: dict[str, dict[str, ClaimRow]] = {}
     for row in rows:
         claims.setdefault(row.id, {})[row.instrument] = row
     return list(claims.values())

@@ -17,7 +17,7 @@ Disc = Literal["mission", "ego"]
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class TableSettings:
     """How the table is measured. The defaults are the paper's instrument, with masked fusion beside it.
 
     Raises:
@@ -42,11 +42,11 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class TableResults:
     """An evaluation of the paper's conditions under every instrument that was asked for."""
 
     evaluation: Evaluation
-    asked: Asked
+    asked: TableSettings
     _made: dict[tuple[Unsent, float, Disc], Bootstrap] = field(default_factory=dict)
     _cut: dict[float, Evaluation] = field(default_factory=dict)
 

@@ -16,8 +16,8 @@ from scipy.special import ndtri
 
 from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, conditions
 from sortie.perception.evaluation.condition import Unsent
-from sortie.perception.evaluation.measures import Elsewhere, Level, Region, Scores
-from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.evaluation.measures import ApOf, Elsewhere, Region, Scores
+from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.perception.metrics.bootstrap import benjamini_hochberg
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
@@ -27,7 +27,7 @@ _DRAWS = ndtri((np.arange(999) + 0.5) / 999)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ClaimRow:
     """One claim under one instrument. Missing figures are None."""
 
     id: str
@@ -76,22 +76,22 @@ def points(scores: Mapping[Unsent, Scores]) -> list[Point]:
     for instrument, its in scores.items():
         for region in get_args(Region):
             for c in conditions():
-                m = Level(c, region).measure(its)
+                m = ApOf(c, region).measure(its)
                 low, high = (m.value if bound is None else bound for bound in (m.low, m.high))
                 out.append(Point(c.peers, c.rho, c.allocation, instrument, region, m.value, low, high))
     return out
 
 
 def judge(
-    scores: Mapping[Unsent, Scores], elsewhere: Mapping[str, Measured], claims: Sequence[Claim] = CLAIMS
-) -> list[Row]:
+    scores: Mapping[Unsent, Scores], elsewhere: Mapping[str, MeasuredValue], claims: Sequence[Claim] = CLAIMS
+) -> list[ClaimRow]:
     """Measure and judge every claim.
 
     Args:
         scores: by instrument; each answers for the claims' conditions as they stand there (unsent cells "zero").
         elsewhere: what was measured in other rooms, by the name that `Elsewhere` gives it.
     """
-    rows: list[Row] = []
+    rows: list[ClaimRow] = []
     for instrument, its in scores.items():
         measured = {c.id: c.measure.measure(its) for c in claims if not isinstance(c.measure, Elsewhere)}
         tested = [i for i, m in measured.items() if m.p is not None]
@@ -102,7 +102,7 @@ def judge(
     return sorted(rows, key=lambda r: place[r.id])
 
 
-def differ_by_chance(rows: Iterable[Row], claims: Sequence[Claim] = CLAIMS) -> float:
+def differ_by_chance(rows: Iterable[ClaimRow], claims: Sequence[Claim] = CLAIMS) -> float:
     """In how many verdicts two tables of the same truth would differ on average, each made on frames of its own: every
     figure is taken to be normal about what it is here, as wide as its interval, which moves along."""
     by_id = {c.id: c for c in claims}
@@ -111,17 +111,17 @@ def differ_by_chance(rows: Iterable[Row], claims: Sequence[Claim] = CLAIMS) -> f
         if row.value is None or row.low is None or row.high is None or row.id not in by_id:
             continue
         claim, wide = by_id[row.id], (row.high - row.low) / (_NORMAL[-1] - _NORMAL[0])
-        drawn = (Measured(row.value + d, row.low + d, row.high + d) for d in (wide * _DRAWS).tolist())
+        drawn = (MeasuredValue(row.value + d, row.low + d, row.high + d) for d in (wide * _DRAWS).tolist())
         count = Counter(claim.rule(claim.paper, m).verdict for m in drawn)
         expected += 1.0 - sum((n / len(_DRAWS)) ** 2 for n in count.values())
     return expected
 
 
-def _row(claim: Claim, instrument: str, ours: Measured | None, q: float | None) -> Row:
+def _row(claim: Claim, instrument: str, ours: MeasuredValue | None, q: float | None) -> ClaimRow:
     judgement = claim.rule(claim.paper, ours)
-    shown = Measured(float("nan")) if ours is None else ours
+    shown = MeasuredValue(float("nan")) if ours is None else ours
     section = next((name for name, claims in SECTIONS.items() if claim in claims), "")
-    return Row(
+    return ClaimRow(
         id=claim.id, section=section, place=claim.place, says=claim.says, unit=claim.unit, headline=claim.headline,
         follows=claim.follows, rule=claim.rule.__name__, paper_value=claim.paper.value, paper_low=claim.paper.low,
         paper_high=claim.paper.high, paper_significant=claim.paper.significant, digits=claim.paper.digits,
@@ -131,15 +131,15 @@ def _row(claim: Claim, instrument: str, ours: Measured | None, q: float | None) 
 
 
 _TYPES = {"str": pa.string(), "float": pa.float64(), "bool": pa.bool_(), "int": pa.int32()}
-SCHEMA = pa.schema([(f.name, _TYPES[str(f.type).split(" |")[0]]) for f in fields(Row)])
+SCHEMA = pa.schema([(f.name, _TYPES[str(f.type).split(" |")[0]]) for f in fields(ClaimRow)])
 
 
-def to_table(rows: Iterable[Row], facts: Mapping[str, Any]) -> pa.Table:
+def to_table(rows: Iterable[ClaimRow], facts: Mapping[str, Any]) -> pa.Table:
     """The rows, with what the run was made with as JSON in the schema's metadata."""
     return pa.Table.from_pylist([asdict(r) for r in rows], SCHEMA.with_metadata({"sortie": json.dumps(dict(facts))}))
 
 
-def from_table(table: pa.Table) -> tuple[list[Row], dict[str, Any]]:
+def from_table(table: pa.Table) -> tuple[list[ClaimRow], dict[str, Any]]:
     """Rows and facts back.
 
     Raises:
@@ -149,10 +149,10 @@ def from_table(table: pa.Table) -> tuple[list[Row], dict[str, Any]]:
     if missing:
         raise ValueError(f"column {missing[0]} is missing")
     facts: dict[str, Any] = json.loads((table.schema.metadata or {}).get(b"sortie", b"{}"))
-    return [Row(**r) for r in table.select(SCHEMA.names).to_pylist()], facts
+    return [ClaimRow(**r) for r in table.select(SCHEMA.names).to_pylist()], facts
 
 
-def read(path: Path) -> tuple[list[Row], dict[str, Any]]:
+def read(path: Path) -> tuple[list[ClaimRow], dict[str, Any]]:
     """The table of a report.
 
     Raises:

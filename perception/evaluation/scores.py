@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sortie.perception.evaluation.condition import CellsBy, Condition, Unsent
+from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
 from sortie.perception.evaluation.matched import Evaluation
 from sortie.perception.evaluation.matched import Region as Evaluated
 from sortie.perception.evaluation.measures import Floats, Region, under
@@ -47,35 +47,35 @@ class Bootstrap:
         self._evaluation, self._unsent, self._cells_by = evaluation, unsent, cells_by
         self._disc, self._by = disc, by
         self._draws, self._seed = draws, seed
-        self._ranked: dict[tuple[Condition, Evaluated], Ranked] = {}
-        self._found: dict[tuple[Condition, Evaluated], tuple[float, Floats]] = {}
+        self._ranked: dict[tuple[Sharing, Evaluated], Ranked] = {}
+        self._found: dict[tuple[Sharing, Evaluated], tuple[float, Floats]] = {}
         self._weights: dict[tuple[str, int], Floats] = {}
 
-    def ap(self, condition: Condition, region: Region) -> float:
+    def ap(self, condition: Sharing, region: Region) -> float:
         """On all frames."""
         return self._get(condition, region)[0]
 
-    def draws(self, condition: Condition, region: Region) -> Floats:
+    def draws(self, condition: Sharing, region: Region) -> Floats:
         """[draws], on resampled frames, the same ones for all conditions."""
         return self._get(condition, region)[1]
 
-    def halves(self, condition: Condition, region: Region, *, resampled: bool) -> Floats:
+    def halves(self, condition: Sharing, region: Region, *, resampled: bool) -> Floats:
         """[draws, 2], on the halves of random splits."""
         ranked = self._rank(condition, region)
         n = len(ranked.truths)
         both = [self._once(f"half {side} {resampled}", n) for side in (0, 1)]
         return np.stack([ranked.ap(w) for w in both], axis=1)
 
-    def fleet_frame_bytes(self, condition: Condition) -> Sequence[float]:
+    def fleet_frame_bytes(self, condition: Sharing) -> Sequence[float]:
         """Payload bytes of each frame, all egos together, the index apart."""
         sent = self._evaluation.payload_bytes[self._under(condition)]
         per_frame: list[float] = sent.reshape(-1, self._evaluation.settings.egos).sum(axis=1).astype(float).tolist()
         return per_frame
 
-    def _under(self, condition: Condition) -> Condition:
+    def _under(self, condition: Sharing) -> Sharing:
         return under(condition, self._unsent, self._cells_by)
 
-    def _get(self, condition: Condition, asked: Region) -> tuple[float, Floats]:
+    def _get(self, condition: Sharing, asked: Region) -> tuple[float, Floats]:
         key = self._key(condition, asked)
         if key not in self._found:
             ranked = self._rank(condition, asked)
@@ -83,10 +83,10 @@ class Bootstrap:
             self._found[key] = (self._evaluation.ap(*key), ranked.ap(weights))
         return self._found[key]
 
-    def _key(self, condition: Condition, asked: Region) -> tuple[Condition, Evaluated]:
+    def _key(self, condition: Sharing, asked: Region) -> tuple[Sharing, Evaluated]:
         return self._under(condition), self._disc if asked == "mission" else asked
 
-    def _rank(self, condition: Condition, asked: Region) -> Ranked:
+    def _rank(self, condition: Sharing, asked: Region) -> Ranked:
         key = self._key(condition, asked)
         if key not in self._ranked:
             self._ranked[key] = rank(self._evaluation.matched(*key), self._evaluation.groups(key[1], self._by))

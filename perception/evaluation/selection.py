@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.budget import index_bytes, payload_bytes
-from sortie.perception.evaluation.condition import Allocation, Condition
+from sortie.perception.evaluation.condition import Allocation, Sharing
 from sortie.perception.geometry import CELLS as GRID
 from sortie.perception.geometry import FULL, Geometry
 from sortie.scenarios.streams import stream
@@ -42,9 +42,7 @@ def footprint_overlap(xy_m: Floats, radius_m: Floats) -> Floats:
     return np.asarray(np.clip(area / (np.pi * a * a), 0.0, 1.0))
 
 
-def choose(
-    condition: Condition, ego: int, overlap: Floats, key: tuple[int, ...] = (), seed: int = 0
-) -> tuple[int, ...]:
+def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] = (), seed: int = 0) -> tuple[int, ...]:
     """The peers that share with `ego`, most overlapping first.
 
     Args:

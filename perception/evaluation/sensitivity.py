@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from sortie.perception.evaluation.claims import CLAIMS, Claim
 from sortie.perception.evaluation.condition import Unsent
-from sortie.perception.evaluation.results import Disc, Found
+from sortie.perception.evaluation.results import Disc, TableResults
 
 TAUS = (0.01, 0.1, 0.2, 0.3, 0.5)
 DISCS: dict[Disc, str] = {"mission": "around the target", "ego": "around the ego"}
@@ -35,7 +35,7 @@ class Varied:
     verdict: str
 
 
-def sensitivity(found: Found, claims: Sequence[Claim] = CLAIMS) -> list[Varied]:
+def sensitivity(found: TableResults, claims: Sequence[Claim] = CLAIMS) -> list[Varied]:
     """The claims above over all thresholds and discs, under every instrument that was evaluated."""
     by_id = {c.id: c for c in claims}
     out = []
@@ -48,7 +48,7 @@ def sensitivity(found: Found, claims: Sequence[Claim] = CLAIMS) -> list[Varied]:
 
 
 def _varied(
-    found: Found,
+    found: TableResults,
     claim: Claim,
     unsent: Unsent,
     knob: str,

@@ -39,7 +39,7 @@ NEGLIGIBLE = 0.5
 not have told half a point from nothing; and with frames enough any difference is significant."""
 
 
-class Verdict(StrEnum):
+class ClaimVerdict(StrEnum):
     """What became of a claim."""
 
     REPRODUCED = "reproduced"
@@ -73,7 +73,7 @@ class Paper:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredValue:
     """What we measured, in the claim's unit; `low`, `high` the 95 % interval and `p` its two-sided level, where there are any."""
 
     value: float
@@ -98,75 +98,77 @@ class Measured:
 class Judgement:
     """A verdict, and how the sizes compare."""
 
-    verdict: Verdict
+    verdict: ClaimVerdict
     size: Size = Size.UNTOLD
 
 
-def contrast(paper: Paper, ours: Measured | None) -> Judgement:
+def contrast(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """Judge a difference in points by sign, significance and overlap (see the module)."""
     if ours is None or not _known(ours.value) or ours.low is None or ours.high is None:
-        return Judgement(Verdict.NOT_MEASURABLE)
+        return Judgement(ClaimVerdict.NOT_MEASURABLE)
     size = _size(paper, ours)
     if not paper.significant and ours.negligible:
-        return Judgement(Verdict.REPRODUCED, size)
+        return Judgement(ClaimVerdict.REPRODUCED, size)
     if paper.significant != ours.significant:
-        return Judgement(Verdict.NOT_REPRODUCED, size)
+        return Judgement(ClaimVerdict.NOT_REPRODUCED, size)
     if paper.significant and paper.value is not None and paper.value * ours.value < 0:
-        return Judgement(Verdict.OPPOSITE, size)
-    return Judgement(Verdict.REPRODUCED, size)
+        return Judgement(ClaimVerdict.OPPOSITE, size)
+    return Judgement(ClaimVerdict.REPRODUCED, size)
 
 
-def most(paper: Paper, ours: Measured | None) -> Judgement:
+def most(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """A claim that most of something is kept: reproduced when our interval lies above a half, opposite when below."""
     judgement = contrast(paper, ours)
-    if judgement.verdict == Verdict.NOT_MEASURABLE or ours is None or ours.low is None or ours.high is None:
-        return Judgement(Verdict.NOT_MEASURABLE)
+    if judgement.verdict == ClaimVerdict.NOT_MEASURABLE or ours is None or ours.low is None or ours.high is None:
+        return Judgement(ClaimVerdict.NOT_MEASURABLE)
     if ours.low > HALF:
-        return Judgement(Verdict.REPRODUCED, judgement.size)
-    return Judgement(Verdict.OPPOSITE if ours.high < HALF else Verdict.NOT_REPRODUCED, judgement.size)
+        return Judgement(ClaimVerdict.REPRODUCED, judgement.size)
+    return Judgement(ClaimVerdict.OPPOSITE if ours.high < HALF else ClaimVerdict.NOT_REPRODUCED, judgement.size)
 
 
-def level(paper: Paper, ours: Measured | None) -> Judgement:
+def level(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """Absolute APs are shown side by side and not judged."""
-    return Judgement(Verdict.NOT_MEASURABLE if ours is None or not _known(ours.value) else Verdict.NOT_COMPARABLE)
+    return Judgement(
+        ClaimVerdict.NOT_MEASURABLE if ours is None or not _known(ours.value) else ClaimVerdict.NOT_COMPARABLE
+    )
 
 
-def exact(paper: Paper, ours: Measured | None) -> Judgement:
+def exact(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """Reproduced when ours rounds to what the paper prints."""
     if ours is None or paper.value is None or not _known(ours.value):
-        return Judgement(Verdict.NOT_MEASURABLE)
+        return Judgement(ClaimVerdict.NOT_MEASURABLE)
     if abs(ours.value - paper.value) <= 0.5 * 10.0**-paper.digits * (1 + 1e-9):
-        return Judgement(Verdict.REPRODUCED, Size.SAME)
-    return Judgement(Verdict.NOT_REPRODUCED, Size.LARGER if ours.value > paper.value else Size.SMALLER)
+        return Judgement(ClaimVerdict.REPRODUCED, Size.SAME)
+    return Judgement(ClaimVerdict.NOT_REPRODUCED, Size.LARGER if ours.value > paper.value else Size.SMALLER)
 
 
-def at_most(paper: Paper, ours: Measured | None) -> Judgement:
+def at_most(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """A claim that something is small: reproduced up to half an order of magnitude above the paper's figure."""
     return _order(paper, ours, good=Size.SMALLER)
 
 
-def at_least(paper: Paper, ours: Measured | None) -> Judgement:
+def at_least(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """A claim that something is large: reproduced down to half an order of magnitude below the paper's figure."""
     return _order(paper, ours, good=Size.LARGER)
 
 
-def same_order(paper: Paper, ours: Measured | None) -> Judgement:
+def same_order(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """Reproduced within half an order of magnitude either way."""
     return _order(paper, ours, good=Size.SAME)
 
 
-def same_place(paper: Paper, ours: Measured | None) -> Judgement:
+def same_place(paper: Paper, ours: MeasuredValue | None) -> Judgement:
     """A place on the axis of budgets (a crossover, a peak): reproduced inside the paper's bracket, ends included."""
     if ours is None or paper.low is None or paper.high is None:
-        return Judgement(Verdict.NOT_MEASURABLE)
+        return Judgement(ClaimVerdict.NOT_MEASURABLE)
     if not _known(ours.value):  # measured, and there is no such place
-        return Judgement(Verdict.NOT_REPRODUCED)
+        return Judgement(ClaimVerdict.NOT_REPRODUCED)
     if paper.low <= ours.value <= paper.high:
-        return Judgement(Verdict.REPRODUCED, Size.SAME)
-    return Judgement(Verdict.NOT_REPRODUCED, Size.LARGER if ours.value > paper.high else Size.SMALLER)
+        return Judgement(ClaimVerdict.REPRODUCED, Size.SAME)
+    return Judgement(ClaimVerdict.NOT_REPRODUCED, Size.LARGER if ours.value > paper.high else Size.SMALLER)
 
 
-def _size(paper: Paper, ours: Measured) -> Size:
+def _size(paper: Paper, ours: MeasuredValue) -> Size:
     if paper.value is None or ours.low is None or ours.high is None:
         return Size.UNTOLD
     low = paper.value if paper.low is None else paper.low
@@ -176,12 +178,12 @@ def _size(paper: Paper, ours: Measured) -> Size:
     return Size.LARGER if abs(ours.value) > abs(paper.value) else Size.SMALLER
 
 
-def _order(paper: Paper, ours: Measured | None, good: Size) -> Judgement:
+def _order(paper: Paper, ours: MeasuredValue | None, good: Size) -> Judgement:
     if ours is None or paper.value is None or not _known(ours.value) or ours.value <= 0:
-        return Judgement(Verdict.NOT_MEASURABLE)
+        return Judgement(ClaimVerdict.NOT_MEASURABLE)
     ratio = ours.value / paper.value
     size = Size.LARGER if ratio > HALF_AN_ORDER else Size.SMALLER if ratio < 1 / HALF_AN_ORDER else Size.SAME
-    return Judgement(Verdict.REPRODUCED if size in (Size.SAME, good) else Verdict.NOT_REPRODUCED, size)
+    return Judgement(ClaimVerdict.REPRODUCED if size in (Size.SAME, good) else ClaimVerdict.NOT_REPRODUCED, size)
 
 
 def _known(value: float) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames
 from sortie.perception.evaluation.evaluate import FLOOR, evaluate
 from sortie.perception.evaluation.matched import Evaluation
@@ -116,7 +116,7 @@ def content_hash(path: Path) -> str:
 
 def evaluate_recording(
     path: Path,
-    conditions: Sequence[Condition] | None = None,
+    conditions: Sequence[Sharing] | None = None,
     *,
     fusion: str | None = None,
     floor: float = FLOOR,
@@ -135,7 +135,7 @@ def evaluate_recording(
     if conditions is None:
         conditions = [
             SINGLE,
-            *(Condition(rho, peers) for rho in (0.01, 0.02, 0.05, 0.1, 0.25, 1.0) if recording.drones > 1),
+            *(Sharing(rho, peers) for rho in (0.01, 0.02, 0.05, 0.1, 0.25, 1.0) if recording.drones > 1),
         ]
     found = evaluate(
         RecordedInstrument(recording, fusion), frames_of(recording), conditions,

@@ -57,7 +57,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Uav3dSample:
     """One sample of a split."""
 
     token: str
@@ -72,7 +72,7 @@ class Sample:
         return self.cameras[f"CAMERA_BOTTOM_id_{uav}"].position_m
 
 
-def read_infos(path: Path | str) -> list[Sample]:
+def read_infos(path: Path | str) -> list[Uav3dSample]:
     """The samples of `uav3d_infos_{train,val}.pkl`, in its order. The pickle is read as data (`unpickle`).
 
     Raises:
@@ -88,7 +88,7 @@ def read_infos(path: Path | str) -> list[Sample]:
     return [_info(_Record(f"{path}: infos[{k}]", info)) for k, info in enumerate(data["infos"])]
 
 
-def _info(r: _Record) -> Sample:
+def _info(r: _Record) -> Uav3dSample:
     origin = r.vector("ego2global_translation", 3)
     cams = r.record("cams")
     cameras = {}
@@ -103,7 +103,7 @@ def _info(r: _Record) -> Sample:
         raise Uav3dError(
             f"{r.where}.gt_boxes row {int(np.argmax((boxes[:, 3:6] <= 0).any(axis=1)))} has a size ≤ 0, must be above 0 m"
         )
-    return Sample(r.text("token"), r.whole("timestamp"), cameras, boxes)
+    return Uav3dSample(r.text("token"), r.whole("timestamp"), cameras, boxes)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sortie.perception.evaluation.figures import INK, PAPER, figure_of, legend_below, save
-from sortie.perception.study.measure import Row
-from sortie.perception.study.plan import Plan
-from sortie.perception.study.report import UNSENT, Found, View
+from sortie.perception.study.measure import StudyRow
+from sortie.perception.study.plan import StudyPlan
+from sortie.perception.study.report import UNSENT, FixedSettings, StudyRows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,16 +25,16 @@ CAPTIONS = {
 COLOURS = {"full": "#1f6fb4", "full-more": "#7fb2dd", "dropout": "#2a9d5c", "signed": "#8a63b8", "deep": "#c2571a"}
 
 
-def draw_all(plan: Plan, rows: Sequence[Row], folder: Path) -> list[tuple[str, str]]:
+def draw_all(plan: StudyPlan, rows: Sequence[StudyRow], folder: Path) -> list[tuple[str, str]]:
     """Write every figure as PNG; returns file names and captions."""
     for name, draw in (("contrasts.png", contrasts), ("starved.png", starved)):
         save(draw(plan, rows), folder / name)
     return list(CAPTIONS.items())
 
 
-def contrasts(plan: Plan, rows: Sequence[Row]) -> Figure:
+def contrasts(plan: StudyPlan, rows: Sequence[StudyRow]) -> Figure:
     """Two peers minus four at matched bytes by budget, a panel a filling, one mark a network, the paper's beside."""
-    found, budgets = Found(rows), plan.measured.budgets
+    found, budgets = StudyRows(rows), plan.measured.budgets
     figure, axes = figure_of(1, len(plan.measured.unsent), (10.4, 3.9), sharey=True)
     networks = found.networks()
     for ax, unsent in zip(axes, plan.measured.unsent, strict=True):
@@ -43,7 +43,7 @@ def contrasts(plan: Plan, rows: Sequence[Row]) -> Figure:
             at = [budgets.index(rho) for rho in PAPER_CONTRAST if rho in budgets]
             ax.plot(at, [PAPER_CONTRAST[budgets[i]] for i in at], "D", ms=6, mfc="none", color=PAPER, label="paper")
         for k, (variant, seed) in enumerate(networks):
-            its = [found.get(View(variant, seed, unsent), "contrast", rho) for rho in budgets]
+            its = [found.get(FixedSettings(variant, seed, unsent), "contrast", rho) for rho in budgets]
             x = np.arange(len(budgets)) + 0.6 * ((k + 0.5) / len(networks) - 0.5)
             _whiskers(ax, x, its, COLOURS.get(variant, INK), _first(networks, variant, seed))
         ax.set_xticks(range(len(budgets)), [f"{rho:g}" for rho in budgets])
@@ -54,14 +54,14 @@ def contrasts(plan: Plan, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def starved(plan: Plan, rows: Sequence[Row]) -> Figure:
+def starved(plan: StudyPlan, rows: Sequence[StudyRow]) -> Figure:
     """All four peers at the least budget minus a single drone, network by network, under each filling."""
-    found, networks = Found(rows), Found(rows).networks()
+    found, networks = StudyRows(rows), StudyRows(rows).networks()
     figure, (ax,) = figure_of(1, 1, (7.2, 1.2 + 0.36 * len(networks)))
     ax.axvline(0, color=INK, lw=0.8)
     for k, (variant, seed) in enumerate(networks):
         for unsent, down, face in (("zero", 0.12, None), ("masked", -0.12, "white")):
-            row = found.get(View(variant, seed, unsent), "starved", plan.measured.starved)
+            row = found.get(FixedSettings(variant, seed, unsent), "starved", plan.measured.starved)
             if row is not None:
                 colour = COLOURS.get(variant, INK)
                 ax.plot([row.low, row.high], [down - k] * 2, color=colour, lw=1.6)
@@ -76,7 +76,7 @@ def _first(networks: Sequence[tuple[str, int]], variant: str, seed: int) -> str:
     return variant if (variant, seed) == next(n for n in networks if n[0] == variant) else ""
 
 
-def _whiskers(ax: object, x: np.ndarray, rows: Sequence[Row | None], colour: str, label: str) -> None:
+def _whiskers(ax: object, x: np.ndarray, rows: Sequence[StudyRow | None], colour: str, label: str) -> None:
     there = [(at, r) for at, r in zip(x, rows, strict=True) if r is not None]
     value = np.array([r.value for _, r in there])
     spread = np.abs(np.array([[r.low for _, r in there], [r.high for _, r in there]]) - value)

@@ -9,14 +9,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.matched import Evaluation
-from sortie.perception.evaluation.measures import POINTS, Contrast, Level, Oracle
+from sortie.perception.evaluation.measures import POINTS, ApOf, Contrast, Oracle
 from sortie.perception.evaluation.scores import Bootstrap
-from sortie.perception.evaluation.verdict import Measured as Measurement
+from sortie.perception.evaluation.verdict import MeasuredValue as Measurement
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import interval
-from sortie.perception.study.plan import Measured, Tau, Variant
+from sortie.perception.study.plan import MeasuredGrid, Tau, Variant
 
 MODEL_TAU = 0.1
 
@@ -30,7 +30,7 @@ class F1:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StudyRow:
     """One quantity of one network under one way to fuse, rank and cut; AP in points, interval paired over frames."""
 
     variant: str
@@ -63,17 +63,19 @@ def optimal_f1(units: Sequence[Matched], taus: NDArray[np.float64]) -> F1:
     return F1(float(taus[best]), float(f1[best]))
 
 
-def rows_of(measured: Measured, variant: Variant, seed: int, density: str, found: Evaluation, tau_f1: F1) -> list[Row]:
+def rows_of(
+    measured: MeasuredGrid, variant: Variant, seed: int, density: str, found: Evaluation, tau_f1: F1
+) -> list[StudyRow]:
     """Every quantity of one network on one density's test split.
 
     gain: full sharing over a drone alone; level: AP itself; starved: everyone at the least budget over a drone alone;
     contrast: two peers over four at each budget; fill: zero fill over masked fusion, everyone sharing, at each budget;
     oracle: the best of each budget over the best single policy.
     """
-    out: list[Row] = []
+    out: list[StudyRow] = []
     many, few = measured.policies
-    starved = Condition(measured.starved, many)
-    wide = tuple(tuple(Condition(rho, peers) for rho in measured.budgets) for peers in measured.policies)
+    starved = Sharing(measured.starved, many)
+    wide = tuple(tuple(Sharing(rho, peers) for rho in measured.budgets) for peers in measured.policies)
     for cells_by in measured.cells_by:
         if replace(starved, cells_by=cells_by, unsent=measured.unsent[0]) not in found.conditions:
             continue
@@ -86,20 +88,20 @@ def rows_of(measured: Measured, variant: Variant, seed: int, density: str, found
 
                 def add(quantity: str, rho: float, of: Figures, unit: float = 1.0) -> None:
                     value, low, high = (unit * v for v in of)
-                    out.append(Row(*head, quantity, rho, value, low, high, len(found.scene)))  # noqa: B023 (called at once)
+                    out.append(StudyRow(*head, quantity, rho, value, low, high, len(found.scene)))  # noqa: B023 (called at once)
 
                 add("gain", np.nan, _figures(Contrast((FULL_SHARING,), (SINGLE,)).measure(scores)))
-                add("level", 0.0, _figures(Level(SINGLE).measure(scores)), POINTS)  # levels come as 0 … 1
-                add("level", 1.0, _figures(Level(FULL_SHARING).measure(scores)), POINTS)
+                add("level", 0.0, _figures(ApOf(SINGLE).measure(scores)), POINTS)  # levels come as 0 … 1
+                add("level", 1.0, _figures(ApOf(FULL_SHARING).measure(scores)), POINTS)
                 add("starved", measured.starved, _figures(Contrast((starved,), (SINGLE,)).measure(scores)))
                 for rho in measured.budgets:
-                    two, four = Condition(rho, few), Condition(rho, many)
+                    two, four = Sharing(rho, few), Sharing(rho, many)
                     add("contrast", rho, _figures(Contrast((two,), (four,)).measure(scores)))
                     for c in (two, four):
-                        add(f"level {c.peers}", rho, _figures(Level(c).measure(scores)), POINTS)
+                        add(f"level {c.peers}", rho, _figures(ApOf(c).measure(scores)), POINTS)
                 if unsent == "zero" and "masked" in ways:
                     for rho in (measured.starved, *measured.budgets):
-                        add("fill", rho, _between(scores, ways["masked"], Condition(rho, many)), POINTS)
+                        add("fill", rho, _between(scores, ways["masked"], Sharing(rho, many)), POINTS)
                 add("oracle", np.nan, _figures(Oracle(wide).measure(scores)))
     return out
 
@@ -112,7 +114,7 @@ def _figures(m: Measurement) -> Figures:
     return m.value, np.nan if m.low is None else m.low, np.nan if m.high is None else m.high
 
 
-def _between(a: Bootstrap, b: Bootstrap, condition: Condition) -> Figures:
+def _between(a: Bootstrap, b: Bootstrap, condition: Sharing) -> Figures:
     """AP of one condition under a minus under b, 0 … 1, on the same resamples."""
     low, high = interval(a.draws(condition, "full") - b.draws(condition, "full"))
     return a.ap(condition, "full") - b.ap(condition, "full"), low, high
@@ -125,11 +127,11 @@ def threshold(name: Tau, tau_f1: F1) -> float:
     return tau_f1.tau if name == "f1" else float(name)
 
 
-def to_table(rows: Sequence[Row]) -> pa.Table:
-    """Rows as an Arrow table, columns as `Row` names them."""
+def to_table(rows: Sequence[StudyRow]) -> pa.Table:
+    """Rows as an Arrow table, columns as `StudyRow` names them."""
     return pa.Table.from_pylist([asdict(r) for r in rows])
 
 
-def from_table(table: pa.Table) -> list[Row]:
+def from_table(table: pa.Table) -> list[StudyRow]:
     """The rows of such a table."""
-    return [Row(**r) for r in table.to_pylist()]
+    return [StudyRow(**r) for r in table.to_pylist()]

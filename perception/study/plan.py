@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from sortie.perception.benchmark.difficulty import Density
-from sortie.perception.evaluation.condition import CellsBy, Condition, Unsent
+from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
 from sortie.perception.training.recipe import Recipe
 
 PLAN = Path(__file__).parent / "variants.toml"
@@ -44,7 +44,7 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredGrid:
     """What is measured of every trained network."""
 
     budgets: tuple[float, ...]
@@ -55,20 +55,20 @@ class Measured:
     taus: tuple[Tau, ...]
     densities: tuple[Density, ...]
 
-    def conditions(self) -> Iterator[Condition]:
+    def conditions(self) -> Iterator[Sharing]:
         """Every policy at every budget, one fusion and one ranking; others follow by `measures.under`."""
         for rho in (self.starved, *self.budgets):
             for peers in self.policies:
-                yield Condition(rho, peers)
+                yield Sharing(rho, peers)
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class StudyPlan:
     """The whole study."""
 
     paper: str
     hypothesis: str
-    measured: Measured
+    measured: MeasuredGrid
     variants: tuple[Variant, ...]
 
     def jobs(self) -> list[tuple[Variant, int]]:
@@ -77,7 +77,7 @@ class Plan:
         return [(v, s) for s in seeds for v in self.variants if s in v.seeds]
 
 
-def read_plan(path: Path = PLAN) -> Plan:
+def read_plan(path: Path = PLAN) -> StudyPlan:
     """The plan in a TOML file.
 
     Raises:
@@ -86,9 +86,9 @@ def read_plan(path: Path = PLAN) -> Plan:
     try:
         raw = tomllib.loads(path.read_text("utf-8"))
         given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in raw["evaluation"].items()}
-        measured = Measured(**given)
+        measured = MeasuredGrid(**given)
         variants = tuple(_variant(v) for v in raw["variant"])
-        plan = Plan(raw["question"]["paper"].strip(), raw["question"]["hypothesis"].strip(), measured, variants)
+        plan = StudyPlan(raw["question"]["paper"].strip(), raw["question"]["hypothesis"].strip(), measured, variants)
     except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a plan of a study ({error})") from None
     for name, values, allowed in (

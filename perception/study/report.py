@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sortie.perception.benchmark.dataset import SIZES
-from sortie.perception.study.measure import MODEL_TAU, Row
-from sortie.perception.study.plan import Plan
+from sortie.perception.study.measure import MODEL_TAU, StudyRow
+from sortie.perception.study.plan import StudyPlan
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
 MINUS = "−"
@@ -16,7 +16,7 @@ UNSENT: Mapping[str, str] = {"zero": "Zero fill, as in the paper", "masked": "Ma
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class FixedSettings:
     """What is held fixed while one quantity is looked at."""
 
     variant: str
@@ -27,17 +27,17 @@ class View:
     density: str = "default"
 
 
-class Found:
+class StudyRows:
     """Rows of the study, asked for one at a time."""
 
-    def __init__(self, rows: Iterable[Row]) -> None:
+    def __init__(self, rows: Iterable[StudyRow]) -> None:
         self.rows = tuple(rows)
         self._by = {
-            (View(r.variant, r.seed, r.unsent, r.cells_by, r.tau_name, r.density), r.quantity, _key(r.rho)): r
+            (FixedSettings(r.variant, r.seed, r.unsent, r.cells_by, r.tau_name, r.density), r.quantity, _key(r.rho)): r
             for r in self.rows
         }
 
-    def get(self, view: View, quantity: str, rho: float = math.nan) -> Row | None:
+    def get(self, view: FixedSettings, quantity: str, rho: float = math.nan) -> StudyRow | None:
         """The row, or None where that was not measured."""
         return self._by.get((view, quantity, _key(rho)))
 
@@ -46,22 +46,22 @@ class Found:
         return list(dict.fromkeys((r.variant, r.seed) for r in self.rows))
 
 
-def sign(row: Row | None) -> int:
+def sign(row: StudyRow | None) -> int:
     """+1 or −1 where the interval leaves zero out, else 0."""
     if row is None or not (row.low > 0 or row.high < 0):
         return 0
     return 1 if row.value > 0 else -1
 
 
-def flips(found: Found, view: View, budgets: Sequence[float]) -> bool:
+def flips(found: StudyRows, view: FixedSettings, budgets: Sequence[float]) -> bool:
     """Whether two peers beat four at some budget and four beat two at a larger one, both significantly."""
     signs = [sign(found.get(view, "contrast", rho)) for rho in sorted(budgets)]
     return any(a > 0 and min(signs[i:]) < 0 for i, a in enumerate(signs))
 
 
-def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] = ()) -> str:
+def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[str, str]] = ()) -> str:
     """The whole report; `figures` are file names beside it and what they show."""
-    found = Found(rows)
+    found = StudyRows(rows)
     missing = [v.job(s) for v, s in plan.jobs() if (v.name, s) not in found.networks()]
     lines = ["# Why the flip exists: an experiment", "", "## The question", "", *_quoted(plan.paper), ""]
     lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
@@ -84,22 +84,22 @@ def report(plan: Plan, rows: Sequence[Row], figures: Sequence[tuple[str, str]] =
     return "\n".join(lines) + "\n"
 
 
-def networks(plan: Plan, found: Found) -> str:
+def networks(plan: StudyPlan, found: StudyRows) -> str:
     """Every network at the model's own threshold, a table a filling."""
     lines = [_LEGEND, ""]
     for unsent in plan.measured.unsent:
-        views = {v.job(s): View(v.name, s, unsent) for v in plan.variants for s in v.seeds}
+        views = {v.job(s): FixedSettings(v.name, s, unsent) for v in plan.variants for s in v.seeds}
         lines += [f"**{UNSENT[unsent]}**, τ = {MODEL_TAU:g}, cells by confidence:", ""]
         lines += [*_table(plan, found, "network", views), ""]
     return "\n".join(lines)
 
 
-def thresholds(plan: Plan, found: Found) -> str:
+def thresholds(plan: StudyPlan, found: StudyRows) -> str:
     """The first network at every score threshold, a table a filling."""
     variant, lines = plan.variants[0], []
     for unsent in plan.measured.unsent:
         views = {
-            _tau(found, variant.name, variant.seeds[0], str(t)): View(
+            _tau(found, variant.name, variant.seeds[0], str(t)): FixedSettings(
                 variant.name, variant.seeds[0], unsent, tau_name=str(t)
             )
             for t in plan.measured.taus
@@ -108,14 +108,14 @@ def thresholds(plan: Plan, found: Found) -> str:
     return "\n".join(lines)
 
 
-def short(plan: Plan, rows: Sequence[Row], link: str) -> str:
+def short(plan: StudyPlan, rows: Sequence[StudyRow], link: str) -> str:
     """The README's section between its markers: three sentences."""
-    sentences = answers(plan, Found(rows))[:3]
+    sentences = answers(plan, StudyRows(rows))[:3]
     whole = f"{on_frames(rows)} The whole study: [{link}]({link})."
     return "\n".join([BEGIN, "", *(s.removeprefix("- ") for s in sentences), whole, "", END])
 
 
-def on_frames(rows: Sequence[Row]) -> str:
+def on_frames(rows: Sequence[StudyRow]) -> str:
     """A sentence: how many frames of the test split all this stands on."""
     scenes, per_scene = SIZES["test"]
     of = scenes * per_scene
@@ -123,25 +123,28 @@ def on_frames(rows: Sequence[Row]) -> str:
     return f"Measured on {_and(measured)} frames of the test split."
 
 
-def answers(plan: Plan, found: Found) -> list[str]:
+def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
     """What the rows say of the paper's observation and of each part of the hypothesis."""
     m, networks = plan.measured, found.networks()
     first = plan.variants[0].name
     seeds = [s for v, s in networks if v == first]
-    flipped = [f"{v}-{s}" for v, s in networks for u in m.unsent if flips(found, View(v, s, u), m.budgets)]
+    flipped = [f"{v}-{s}" for v, s in networks for u in m.unsent if flips(found, FixedSettings(v, s, u), m.budgets)]
     fallen = [
-        f"{v}-{s}" for v, s in networks for u in m.unsent if sign(found.get(View(v, s, u), "starved", m.starved)) < 0
+        f"{v}-{s}"
+        for v, s in networks
+        for u in m.unsent
+        if sign(found.get(FixedSettings(v, s, u), "starved", m.starved)) < 0
     ]
     little = min(m.budgets)
-    contrast = [found.get(View(first, s), "contrast", little) for s in seeds]
-    starved = [found.get(View(first, s), "starved", m.starved) for s in seeds]
-    fill = [found.get(View(first, s), "fill", m.starved) for s in seeds]
-    masked = [found.get(View(first, s, "masked"), "contrast", little) for s in seeds]
+    contrast = [found.get(FixedSettings(first, s), "contrast", little) for s in seeds]
+    starved = [found.get(FixedSettings(first, s), "starved", m.starved) for s in seeds]
+    fill = [found.get(FixedSettings(first, s), "fill", m.starved) for s in seeds]
+    masked = [found.get(FixedSettings(first, s, "masked"), "contrast", little) for s in seeds]
     swept = [
         name
         for v, s in networks for u in m.unsent for t in m.taus for c in m.cells_by for d in m.densities
         for name in [f"{v}-{s}, {u}, cells by {c}, τ {t}, {d}"]
-        if flips(found, View(v, s, u, c, str(t), d), m.budgets)
+        if flips(found, FixedSettings(v, s, u, c, str(t), d), m.budgets)
     ]  # fmt: skip
     flip = "No network shows the flip" if not flipped else f"The flip shows in {', '.join(dict.fromkeys(flipped))}"
     fall = "none falls" if not fallen else f"{', '.join(dict.fromkeys(fallen))} fall"
@@ -152,13 +155,13 @@ def answers(plan: Plan, found: Found) -> list[str]:
         f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
         f"- Zero fill costs {_several(fill)} against masked fusion at ρ = {m.starved:g}, significantly in "
         + " and ".join(
-            f"{sum(sign(found.get(View(v.name, s), 'fill', m.starved)) < 0 for s in its)} of {len(its)} networks of `{v.name}`"
+            f"{sum(sign(found.get(FixedSettings(v.name, s), 'fill', m.starved)) < 0 for s in its)} of {len(its)} networks of `{v.name}`"
             for v in (plan.variants[0], *dropped)
             if (its := [s for s in v.seeds if (v.name, s) in networks])
         )
         + f": masking moves the contrast at ρ = {little:g} to {_several(masked)}"
         + "".join(
-            f", {v.name} training to {_several([found.get(View(v.name, s), 'contrast', little) for s in seeds])}"
+            f", {v.name} training to {_several([found.get(FixedSettings(v.name, s), 'contrast', little) for s in seeds])}"
             for v in dropped
             if any((v.name, s) in networks for s in seeds)
         )
@@ -176,7 +179,7 @@ def answers(plan: Plan, found: Found) -> list[str]:
             else "Where it appears, the tables below say what removes it."
         ),
     ]
-    oracles = [found.get(View(v, s, u), "oracle") for v, s in networks for u in m.unsent]
+    oracles = [found.get(FixedSettings(v, s, u), "oracle") for v, s in networks for u in m.unsent]
     gains = [r for r in oracles if r is not None]
     if gains:
         top = max(gains, key=lambda r: r.value)
@@ -194,22 +197,22 @@ _LEGEND = (
 )
 
 
-def _others(plan: Plan, name: str, seed: int) -> Iterable[tuple[str, Mapping[str, View]]]:
+def _others(plan: StudyPlan, name: str, seed: int) -> Iterable[tuple[str, Mapping[str, FixedSettings]]]:
     m = plan.measured
     yield (
         "How cells are ranked",
         {
-            f"{v.job(s)}, {unsent}, by {rank}": View(v.name, s, unsent, rank)
+            f"{v.job(s)}, {unsent}, by {rank}": FixedSettings(v.name, s, unsent, rank)
             for v in plan.variants if not v.begins_from for s in v.seeds for unsent in m.unsent for rank in m.cells_by
         },
     )  # fmt: skip
     yield (
         f"Car density ({name}-{seed})",
-        {f"{d}, {unsent}": View(name, seed, unsent, density=d) for d in m.densities for unsent in m.unsent},
+        {f"{d}, {unsent}": FixedSettings(name, seed, unsent, density=d) for d in m.densities for unsent in m.unsent},
     )
 
 
-def _table(plan: Plan, found: Found, head: str, views: Mapping[str, View]) -> list[str]:
+def _table(plan: StudyPlan, found: StudyRows, head: str, views: Mapping[str, FixedSettings]) -> list[str]:
     """One row a view that was measured; empty where none was."""
     m = plan.measured
     shown = {name: view for name, view in views.items() if found.get(view, "gain") is not None}
@@ -233,8 +236,8 @@ def _table(plan: Plan, found: Found, head: str, views: Mapping[str, View]) -> li
     return lines
 
 
-def _tau(found: Found, variant: str, seed: int, name: str) -> str:
-    row = found.get(View(variant, seed, tau_name=name), "gain")
+def _tau(found: StudyRows, variant: str, seed: int, name: str) -> str:
+    row = found.get(FixedSettings(variant, seed, tau_name=name), "gain")
     return (
         name
         if row is None
@@ -242,11 +245,11 @@ def _tau(found: Found, variant: str, seed: int, name: str) -> str:
     )
 
 
-def _plain(row: Row | None) -> str:
+def _plain(row: StudyRow | None) -> str:
     return "–" if row is None else f"{row.value:.1f}"
 
 
-def _difference(row: Row | None) -> str:
+def _difference(row: StudyRow | None) -> str:
     if row is None:
         return "–"
     if math.isnan(row.low):
@@ -254,7 +257,7 @@ def _difference(row: Row | None) -> str:
     return f"{_signed(row.value)} [{_signed(row.low)}, {_signed(row.high)}]"
 
 
-def _several(rows: Sequence[Row | None]) -> str:
+def _several(rows: Sequence[StudyRow | None]) -> str:
     there = [r for r in rows if r is not None]
     return _and([_difference(r) for r in there]) if there else "not measured"
 

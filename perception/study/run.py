@@ -12,15 +12,15 @@ import numpy as np
 
 from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
 from sortie.perception.benchmark.difficulty import Density, Difficulty
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
 from sortie.perception.evaluation.measures import under
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.model import ModelConfig
-from sortie.perception.study.measure import F1, Row, optimal_f1, rows_of
-from sortie.perception.study.plan import Measured, Plan, Variant
+from sortie.perception.study.measure import F1, StudyRow, optimal_f1, rows_of
+from sortie.perception.study.plan import MeasuredGrid, StudyPlan, Variant
 from sortie.perception.training.train import TrainResult, train
 
 log_to_nowhere = logging.getLogger("sortie.study")
@@ -36,7 +36,7 @@ def weights_of(job: str, *folders: Path) -> Path | None:
 
 
 def train_job(
-    plan: Plan,
+    plan: StudyPlan,
     job: str,
     folder: Path,
     root: Path,
@@ -75,7 +75,7 @@ def train_job(
 
 
 def measure(
-    plan: Plan,
+    plan: StudyPlan,
     folder: Path,
     root: Path,
     *,
@@ -83,7 +83,7 @@ def measure(
     frames: int = 80,
     workers: int = 1,
     progress: Progress | None = None,
-) -> Iterator[tuple[str, list[Row]]]:
+) -> Iterator[tuple[str, list[StudyRow]]]:
     """Rows of every network that has weights, one network after the other; what has none gives no rows.
 
     Finished frames are kept in `folder`, so that a run that was cut off goes on where it was.
@@ -98,7 +98,7 @@ def measure(
         instrument = CarNetInstrument(load_weights(weights))
         first = variant is plan.variants[0] and seed == variant.seeds[0]
         tau_f1 = _f1(instrument, root, folder, workers, partial(tell, f"{job}: tau split"))
-        rows: list[Row] = []
+        rows: list[StudyRow] = []
         for density in plan.measured.densities if first else DEFAULT_DENSITY:
             bench = Benchmark(difficulty=replace(Difficulty(), density=density))
             data = load_frames(make_split(bench, "test", root, scenes=frames))
@@ -116,7 +116,7 @@ def measure(
         yield job, rows
 
 
-def conditions(measured: Measured, variant: Variant, density: Density) -> Iterator[Condition]:
+def conditions(measured: MeasuredGrid, variant: Variant, density: Density) -> Iterator[Sharing]:
     """Everything that is evaluated of a network; cells by norm only for variants from scratch at the default density."""
     yield from (SINGLE, FULL_SHARING)
     ranks: tuple[CellsBy, ...] = measured.cells_by

@@ -15,14 +15,14 @@ from sortie.perception.geometry import FULL
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, ground_truth
-from sortie.perception.surrogate.collect import FLOOR, Asked, collect, read
+from sortie.perception.surrogate.collect import FLOOR, DetectorRuns, collect, read
 from sortie.perception.surrogate.correlation import hang_together, seen_by_several
 from sortie.perception.surrogate.fit import fit
-from sortie.perception.surrogate.judge import WITHIN, Verdict, judge
+from sortie.perception.surrogate.judge import WITHIN, CalibrationVerdict, judge
 from sortie.perception.surrogate.levels import level
 from sortie.perception.surrogate.model import Parameters, save
 from sortie.perception.surrogate.plan import MANNERS, THRESHOLD, Split, scene_model
-from sortie.perception.surrogate.rows import Rows, rows_of
+from sortie.perception.surrogate.rows import FitRows, rows_of
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)
 LOST = 0.003
@@ -39,7 +39,7 @@ def calibrate(
     held_out: int = 14,
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[Parameters, Verdict]:
+) -> tuple[Parameters, CalibrationVerdict]:
     """Run the detector over `scenes` and `held_out` scenes, fit to the first, judge by the second, and write both to `out`.
 
     Args:
@@ -67,7 +67,9 @@ def calibrate(
         rows.append(rows_of(asked, floor, seed))
         tell("rows", k + 1, len(fitted))
     parts = iter(range(1, 6))  # those of `fit`
-    parameters = fit(Rows.join(rows), _boxes(fitted, seed), floor, seed, progress=lambda _: tell("fit", next(parts), 5))
+    parameters = fit(
+        FitRows.join(rows), _boxes(fitted, seed), floor, seed, progress=lambda _: tell("fit", next(parts), 5)
+    )
     facts: dict[str, Any] = {
         "fusion": config.fusion,
         "weights": key,
@@ -98,7 +100,7 @@ def calibrate(
 
 def _asked(
     split: Split, count: int, work: Path, seed: int, weights: Path | None, key: str, tell: Progress
-) -> list[Asked]:
+) -> list[DetectorRuns]:
     out = []
     for k in range(count):
         tell(f"the detector, {split} scenes", k, count)
@@ -107,7 +109,7 @@ def _asked(
     return out
 
 
-def _floor(asked: Sequence[Asked], seed: int) -> float:
+def _floor(asked: Sequence[DetectorRuns], seed: int) -> float:
     """The highest score below which boxes hardly count, alone and with plenty shared."""
     for floor in FLOORS:
         if all(full - left <= LOST for full, left in (_ap(asked, seed, shared, floor) for shared in (False, True))):
@@ -115,7 +117,7 @@ def _floor(asked: Sequence[Asked], seed: int) -> float:
     return FLOORS[-1]
 
 
-def _ap(asked: Sequence[Asked], seed: int, shared: bool, floor: float) -> tuple[float, float]:
+def _ap(asked: Sequence[DetectorRuns], seed: int, shared: bool, floor: float) -> tuple[float, float]:
     """AP of the detector's boxes, and of those above `floor`."""
     matched = []
     for a in asked:
@@ -129,9 +131,9 @@ def _ap(asked: Sequence[Asked], seed: int, shared: bool, floor: float) -> tuple[
     return average_precision(matched), average_precision([m.at(floor) for m in matched])
 
 
-def _boxes(asked: Sequence[Asked], seed: int) -> NDArray[np.float64]:
+def _boxes(asked: Sequence[DetectorRuns], seed: int) -> NDArray[np.float64]:
     """[3, s]: score thresholds; of a drone alone, the part of the cars that have a box above each, and boxes of nothing."""
-    rows = Rows.join(
+    rows = FitRows.join(
         [rows_of(replace(a, jobs=jobs, boxes=boxes), FLOOR, seed) for a in asked for jobs, boxes in [_alone(a)]]
     )
     thresholds = np.array([FLOOR, 0.05, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
@@ -140,12 +142,12 @@ def _boxes(asked: Sequence[Asked], seed: int) -> NDArray[np.float64]:
     return np.array([thresholds, found, alarms])
 
 
-def _alone(asked: Asked) -> tuple[list[Any], list[Any]]:
+def _alone(asked: DetectorRuns) -> tuple[list[Any], list[Any]]:
     pairs = [(j, b) for j, b in zip(asked.jobs, asked.boxes, strict=True) if not j.shares]
     return [j for j, _ in pairs], [b for _, b in pairs]
 
 
-def card(parameters: Parameters, verdict: Verdict) -> str:
+def card(parameters: Parameters, verdict: CalibrationVerdict) -> str:
     """The calibration's card, Markdown."""
     f = parameters.card
     levels = "\n".join(

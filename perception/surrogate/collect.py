@@ -17,7 +17,7 @@ from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.plan import (
     THRESHOLD,
-    Job,
+    Question,
     Split,
     draw_scene,
     draw_target,
@@ -38,7 +38,7 @@ class Probe(TorchDetector):
     def __init__(self, scene: SceneModel, seed: int, weights: Path | None) -> None:
         super().__init__(scene, Perception(score_threshold=FLOOR), seed, weights)
 
-    def ask(self, job: Job) -> Boxes:
+    def ask(self, job: Question) -> Boxes:
         """Its boxes, best first. Where boxes are averaged, weak ones would move those that count: they stay away."""
         least = FLOOR if job.join == "nms" else THRESHOLD
         if least != self._config.score_threshold:
@@ -57,7 +57,7 @@ class Probe(TorchDetector):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DetectorRuns:
     """One moment's runs.
 
     `jobs` and the `boxes` of each; `ranks` of every capture in them, [2, 64, 64].
@@ -66,12 +66,12 @@ class Asked:
     split: Split
     scene: int
     """Its index in the split."""
-    jobs: list[Job]
+    jobs: list[Question]
     boxes: list[Boxes]
     ranks: dict[Capture, NDArray[np.float32]]
 
 
-def captures_of(jobs: Sequence[Job]) -> list[Capture]:
+def captures_of(jobs: Sequence[Question]) -> list[Capture]:
     """Every capture in the jobs, once, in order."""
     return list(dict.fromkeys(c for job in jobs for c in (job.ego, *(s.capture for s in job.shares))))
 
@@ -104,7 +104,7 @@ def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weigh
     return path
 
 
-def read(path: Path, split: Split) -> Asked:
+def read(path: Path, split: Split) -> DetectorRuns:
     """The answers in a file, with the jobs drawn again."""
     with np.load(path, allow_pickle=False) as file:
         seed, scene, index = (int(v) for v in file["of"])
@@ -115,4 +115,4 @@ def read(path: Path, split: Split) -> Asked:
         raise ValueError(f"{path}: holds {len(count)} answers, the plan has {len(jobs)} jobs; remove it")
     parts = np.split(table, np.cumsum(count)[:-1])
     boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
-    return Asked(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))
+    return DetectorRuns(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))

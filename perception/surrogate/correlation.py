@@ -19,9 +19,9 @@ from sortie.perception.joining import NMS_IOU, Rule, Told, joined
 from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.overlap import iou_pairs, near_pairs
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
-from sortie.perception.surrogate.features import Eyes, Fleet
+from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.model import Parameters
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.surrogate.rows import claim
@@ -37,14 +37,14 @@ MOST = 0.95
 REPEATS = 2
 
 
-def towns_of(asked: Sequence[Asked], seed: int) -> dict[int, tuple[SceneModel, Eyes]]:
+def towns_of(asked: Sequence[DetectorRuns], seed: int) -> dict[int, tuple[SceneModel, Eyes]]:
     """The fitted scenes by their index, with who looks at them: a part of a second each, and asked for often."""
     scenes = {k: scene_model(seed, "fit", k) for k in dict.fromkeys(a.scene for a in asked)}
     return {k: (scene, Eyes(scene)) for k, scene in scenes.items()}
 
 
 def hang_together(
-    parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
+    parameters: Parameters, asked: Sequence[DetectorRuns], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
     """The parameters with `alike` such that joined boxes gain most nearly what they should.
 
@@ -86,7 +86,7 @@ def _with_common(parameters: Parameters, part: float) -> Parameters:
 
 def _gain(
     parameters: Parameters,
-    asked: Sequence[Asked],
+    asked: Sequence[DetectorRuns],
     towns: Mapping[int, tuple[SceneModel, Eyes]],
     threshold: float,
     rule: Rule,
@@ -115,14 +115,14 @@ def _gain(
     return average_precision(together) - average_precision(alone)
 
 
-def seen_by_several(asked: Sequence[Asked], floor: float, seed: int) -> NDArray[np.float32]:
+def seen_by_several(asked: Sequence[DetectorRuns], floor: float, seed: int) -> NDArray[np.float32]:
     """`Parameters.mirages` from the detector's own false alarms, where all drones of a moment have the place in view."""
     seen, apart, turned = list[int](), list[float](), list[float]()
     others = 0
     for a in asked:
         eyes = Eyes(scene_model(seed, a.split, a.scene))
         egos = [(j.ego, b.take(b.score >= floor)) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
-        looks = eyes.look(Fleet.of([ego for ego, _ in egos]))
+        looks = eyes.look(CaptureColumns.of([ego for ego, _ in egos]))
         # by where drones were: what they are wrong about that, they are wrong about in a sortie as well
         poses = [(*ego.position_m[:2], ego.true_yaw_rad) for ego, _ in egos]
         alarms = [

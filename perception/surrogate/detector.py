@@ -17,8 +17,8 @@ from sortie.perception.joining import Heard, joined_many, told
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import Drawn, Luck
-from sortie.perception.surrogate.exchange import Exchange, alarm_covariates, covariates, mean_shift, pair
-from sortie.perception.surrogate.features import Eyes, Fleet, Ints, Looks, axes, off_axes, square, turned
+from sortie.perception.surrogate.exchange import FeatureShares, alarm_covariates, covariates, mean_shift, pair
+from sortie.perception.surrogate.features import CaptureColumns, Eyes, Ints, Looks, axes, off_axes, square, turned
 from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from sortie.perception.surrogate.shared_false_positives import Mirages
@@ -32,7 +32,7 @@ BATCH = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class BoxColumns:
     """Boxes of many jobs: those of job k are rows `first[k]` to `first[k + 1]`, best first."""
 
     first: NDArray[np.int64]
@@ -104,7 +104,7 @@ class SurrogateDetector:
         """Each ego's boxes from its own look and what it was sent, ENU, best first."""
         return list(self.detect_many([jobs]))
 
-    def detect_many(self, moments: Sequence[Sequence[Job]]) -> Found:
+    def detect_many(self, moments: Sequence[Sequence[Job]]) -> BoxColumns:
         """The same for many moments at once, job after job; a moment's jobs are those of one instant."""
         jobs = [
             (ego, shares if self._config.fusion != "none" else (), {e.drone: e for e, _ in moment})
@@ -118,15 +118,15 @@ class SurrogateDetector:
         """The cars inside the ego's square at `t_s`, about its true position and heading at capture."""
         return self.truth_many([t_s], [ego]).boxes
 
-    def truth_many(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Found:
+    def truth_many(self, t_s: Sequence[float], egos: Sequence[Capture]) -> BoxColumns:
         """The same for many moments at once."""
         parts = [self._truth(t_s[a : a + BATCH], egos[a : a + BATCH]) for a in range(0, len(egos), BATCH)]
         return _joined(parts)
 
-    def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Found:
-        looks = self._eyes.look(replace(Fleet.of(egos), t_s=np.asarray(t_s, float)), bare=True)
+    def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> BoxColumns:
+        looks = self._eyes.look(replace(CaptureColumns.of(egos), t_s=np.asarray(t_s, float)), bare=True)
         columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
-        return Found(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
+        return BoxColumns(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
 
     def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
@@ -134,7 +134,7 @@ class SurrogateDetector:
         x, y, radius = (*capture.position_m[:2], 2 * half / np.sqrt(np.pi)) if roi is None else roi
         if roi is not None and np.hypot(x - capture.position_m[0], y - capture.position_m[1]) + radius > half:
             # a disc that leaves the drone's square, or may: what lies beyond is not seen
-            looks = self._eyes.look(Fleet.of([capture]), bare=True)
+            looks = self._eyes.look(CaptureColumns.of([capture]), bare=True)
             cars = int(np.count_nonzero(np.hypot(*(looks.world_m - (x, y)).T) <= radius))
             part = budget.cells_sent(1.0, roi, *capture.est_pose) / budget.CELLS
         else:
@@ -152,12 +152,12 @@ class SurrogateDetector:
 
     # --- one batch ---------------------------------------------------------------------------------
 
-    def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> Found:
+    def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
         asked = [(ego, shares) for ego, shares, _ in jobs]
         late = {s.capture: None for _, shares in asked for s in shares if s.representation in LATE and s.weight > 0.0}
         captures = list(dict.fromkeys(c for ego, shares in asked for c in (ego, *(s.capture for s in shares))))
         column = {c: i for i, c in enumerate(captures)}
-        fleet = Fleet.of(captures)
+        fleet = CaptureColumns.of(captures)
         looks = self._eyes.look(fleet)
         luck = self._luck.of(captures, looks)
         p = self.parameters
@@ -167,7 +167,7 @@ class SurrogateDetector:
         if not self._config.motion_compensation:
             lies = [[now.get(s.capture.drone, s.capture).est_pose for s in shares] for _, shares, now in jobs]
             lies += [[] for _ in late]
-        exchange = Exchange.of(asked, column, lies)
+        exchange = FeatureShares.of(asked, column, lies)
         found = self._fuse(exchange, looks, fleet, confidence, luck)
         if not late:
             return found
@@ -179,11 +179,11 @@ class SurrogateDetector:
             others = [told(s, alone[s.capture]) for s in shares if s.representation in LATE and s.weight > 0.0]
             heard.append(Heard(ego.est_pose, own, f, others))
         out = joined_many(heard, self._config.join)
-        return Found(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
+        return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(
-        self, exchange: Exchange, looks: Looks, fleet: Fleet, confidence: NDArray[np.float32], luck: Drawn
-    ) -> Found:
+        self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, confidence: NDArray[np.float32], luck: Drawn
+    ) -> BoxColumns:
         p, config = self.parameters, self._config
         pairs = pair(exchange, looks, fleet)
         zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
@@ -221,9 +221,11 @@ class SurrogateDetector:
         x_m, y_m, turn = fleet.est[exchange.ego[row]].T
         xy = turned(at, turn) + np.stack([x_m, y_m], axis=1)
         first = np.searchsorted(row, np.arange(len(exchange.ego) + 1))
-        return Found(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
+        return BoxColumns(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
 
-    def _alarms(self, exchange: Exchange, looks: Looks, fleet: Fleet, zeros: NDArray[np.bool_], luck: Drawn) -> _Alarms:
+    def _alarms(
+        self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], luck: Drawn
+    ) -> _Alarms:
         """False alarms: a drone's own, and those of things that others may see as well. One that comes at a rate also comes at
         a higher one."""
         p, ego = self.parameters, exchange.ego
@@ -235,7 +237,7 @@ class SurrogateDetector:
         loud = drawn[:, 5] >= self._config.score_threshold
         return _Alarms(job[loud], drawn[loud])
 
-    def _seen(self, rate: NDArray[np.float32], ego: Ints, fleet: Fleet, luck: Drawn) -> _Alarms:
+    def _seen(self, rate: NDArray[np.float32], ego: Ints, fleet: CaptureColumns, luck: Drawn) -> _Alarms:
         """Alarms of things in the town, at `rate` [m, bands] of all alarms. They are there for everybody; whether a drone takes
         one for a car, how surely and where exactly, is its own affair."""
         part, chance, spread_m, spread_rad = self.parameters.mirages.astype(np.float64)
@@ -271,6 +273,6 @@ class _Alarms:
     drawn: Floats
 
 
-def _joined(parts: Sequence[Found]) -> Found:
+def _joined(parts: Sequence[BoxColumns]) -> BoxColumns:
     counts = np.concatenate([np.zeros(1, np.int64), *(np.diff(p.first) for p in parts)])
-    return Found(np.cumsum(counts), Boxes.join([p.boxes for p in parts]))
+    return BoxColumns(np.cumsum(counts), Boxes.join([p.boxes for p in parts]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sortie.perception import budget
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.scene.town import Floats
-from sortie.perception.surrogate.features import LOOK_COVARIATES, Fleet, Ints, Looks, beside, square
+from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.schema import Scene
 
@@ -38,7 +38,7 @@ ALARM_COVARIATES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Exchange:
+class FeatureShares:
     """m egos' feature shares, padded to k slots.
 
     `ego` [m] and `sender` [m, k] are columns of the fleet (−1: no share); `cells` [m, k] how many cells go and `allowed`
@@ -79,7 +79,7 @@ class Exchange:
         jobs: Sequence[tuple[Capture, Sequence[Share]]],
         column: dict[Capture, int],
         lies: Sequence[Sequence[tuple[float, float, float]]] | None = None,
-    ) -> Exchange:
+    ) -> FeatureShares:
         """Of jobs whose captures stand in `column`; `lies` are other poses than the senders' own for their maps."""
         rows: list[tuple[int, int, int]] = []
         values: list[tuple[float, ...]] = []
@@ -139,7 +139,7 @@ class Pairs:
     aimed: NDArray[np.bool_]
 
 
-def pair(exchange: Exchange, looks: Looks, fleet: Fleet) -> Pairs:
+def pair(exchange: FeatureShares, looks: Looks, fleet: CaptureColumns) -> Pairs:
     """Every car that an ego's square holds, with what its peers' maps hold of it."""
     first, count = looks.first[exchange.ego], np.diff(looks.first)[exchange.ego]
     row = np.repeat(np.arange(len(count)), count)
@@ -181,7 +181,7 @@ def _into(x: Floats, y: Floats, yaw: Floats) -> tuple[Floats, Floats]:
 
 def covariates(
     pairs: Pairs,
-    exchange: Exchange,
+    exchange: FeatureShares,
     looks: Looks,
     confidence: NDArray[np.float32],
     sent: NDArray[np.bool_],
@@ -235,7 +235,7 @@ def covariates(
 
 
 def mean_shift(
-    pairs: Pairs, exchange: Exchange, sent: NDArray[np.bool_], here: Ints | slice = _ALL
+    pairs: Pairs, exchange: FeatureShares, sent: NDArray[np.bool_], here: Ints | slice = _ALL
 ) -> NDArray[np.float32]:
     """How far off what was sent of each car lies, [n, 2] m of the ego's frame, by the shares' weights; or of some cars alone."""
     weight = (exchange.weight[pairs.row[here]] * sent[here]).astype(np.float32)
@@ -247,7 +247,7 @@ def mean_shift(
 
 
 def alarm_covariates(
-    exchange: Exchange, looks: Looks, fleet: Fleet, zeros: NDArray[np.bool_], scene: Scene
+    exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], scene: Scene
 ) -> NDArray[np.float32]:
     """What the number of false alarms depends on, [m, 18] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
     light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was asked

@@ -36,7 +36,7 @@ _ROAD_TONE, _TONE = 0.34, np.array([0.299, 0.587, 0.114]) / 255.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
+class CaptureColumns:
     """Captures as columns: `t_s` [c], `position_m` [c, 3], `est` [c, 3] (x, y, yaw), `yaw_rad` [c], `tilt` [c, 3, 3] (body to level), `stretch` [c]
     the height that the lift believes over the height there is: by that much its map is too large."""
 
@@ -48,7 +48,7 @@ class Fleet:
     stretch: Floats
 
     @classmethod
-    def of(cls, captures: Sequence[Capture]) -> Fleet:
+    def of(cls, captures: Sequence[Capture]) -> CaptureColumns:
         t_s = np.array([c.t_s for c in captures])
         position = np.array([c.position_m for c in captures]).reshape(-1, 3)
         est = np.array([(c.est_position_m[0], c.est_position_m[1], c.est_yaw_rad) for c in captures]).reshape(-1, 3)
@@ -161,7 +161,7 @@ class Eyes:
         parked = self.traffic.parked_xy
         self._lit = self._field.lit(parked[:, 0], parked[:, 1])
 
-    def look(self, fleet: Fleet, *, bare: bool = False) -> Looks:
+    def look(self, fleet: CaptureColumns, *, bare: bool = False) -> Looks:
         """All looks of the captures; `bare` leaves the covariates out."""
         traffic, half = self.traffic, FULL.half_extent_m
         where = fleet.position_m[:, :2]
@@ -192,7 +192,7 @@ class Eyes:
         return Looks(capture, car, local * fleet.stretch[capture, None], world, turn, covariates, index, first)
 
     def _covariates(
-        self, fleet: Fleet, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats, beside_it: Floats
+        self, fleet: CaptureColumns, capture: Ints, car: Ints, local: Floats, xy: Floats, yaw: Floats, beside_it: Floats
     ) -> NDArray[np.float32]:
         traffic = self.traffic
         eye = fleet.position_m[capture]

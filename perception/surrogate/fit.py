@@ -30,7 +30,7 @@ from sortie.perception.surrogate.model import (
     rank_covariates,
     vague,
 )
-from sortie.perception.surrogate.rows import Rows
+from sortie.perception.surrogate.rows import FitRows
 from sortie.scenarios.streams import stream
 
 Array = NDArray[Any]
@@ -52,7 +52,7 @@ BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.95, 0.98, 0.995])
 
 
 def fit(
-    rows: Rows,
+    rows: FitRows,
     boxes: Array,
     floor: float,
     seed: int = 0,
@@ -251,7 +251,7 @@ def _place_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
     )  # Laplace: outliers count once
 
 
-def _alike(rows: Rows, out: Array, looks: Array) -> float:
+def _alike(rows: FitRows, out: Array, looks: Array) -> float:
     """What part of a look's luck is the car's own: correlation, over pairs of such `looks` at one car, of where in its
     predicted distribution each fell."""
     z = ndtri(np.clip(_below(rows.confidence[looks], out[looks]), 1e-4, 1 - 1e-4))
@@ -292,7 +292,7 @@ def _pairs(group: Array) -> tuple[Array, Array]:
     return order[first], order[first + lag]
 
 
-def _alarms(rows: Rows, floor: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+def _alarms(rows: FitRows, floor: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Bands of scores, how many of each job's alarms lie in each, and alarms to draw from."""
     score = rows.alarm[:, 5]
     if len(score) < 50:

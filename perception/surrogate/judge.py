@@ -8,10 +8,10 @@ from typing import Any
 
 from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.bootstrap import compare, interval, rank, resamples
-from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.plan import THRESHOLD, Disc, Job, scene_model
+from sortie.perception.surrogate.plan import THRESHOLD, Disc, Question, scene_model
 from sortie.scenarios.schema import Perception
 
 WITHIN = 0.02
@@ -35,7 +35,7 @@ CONTRASTS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class LevelError:
     """One condition's AP@0.5 by both, on `egos` moments; the error with its 95 % interval by whole scenes."""
 
     condition: str
@@ -48,7 +48,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class OrderKept:
     """AP of b minus AP of a by both; the torch detector's with its 95 % interval by whole scenes."""
 
     a: str
@@ -69,11 +69,11 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CalibrationVerdict:
     """All levels and orders."""
 
-    levels: list[Level]
-    orders: list[Order]
+    levels: list[LevelError]
+    orders: list[OrderKept]
 
     def facts(self) -> dict[str, Any]:
         """As JSON."""
@@ -81,7 +81,7 @@ class Verdict:
         return {"levels": [asdict(v) for v in self.levels], "orders": orders}
 
 
-def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> Verdict:
+def judge(parameters: Parameters, held_out: Sequence[DetectorRuns], seed: int = 0) -> CalibrationVerdict:
     """Both detectors' AP under every condition of the held-out scenes; the surrogate's with several draws of its luck,
     other ones in every scene."""
     theirs: dict[str, list[Matched]] = {}
@@ -112,21 +112,21 @@ def judge(parameters: Parameters, held_out: Sequence[Asked], seed: int = 0) -> V
     orders = []
     for a, b in (pair for pair in CONTRASTS if ap.keys() >= set(pair)):
         d = compare(theirs[a], theirs[b], scenes[a])
-        orders.append(Order(a, b, d.delta, d.low, d.high, ap[b] - ap[a]))
-    return Verdict(levels, orders)
+        orders.append(OrderKept(a, b, d.delta, d.low, d.high, ap[b] - ap[a]))
+    return CalibrationVerdict(levels, orders)
 
 
 def _level(
     name: str, theirs: Sequence[Matched], ours: Sequence[Matched], scenes: Sequence[int], drawn: Sequence[int]
-) -> Level:
+) -> LevelError:
     torch, surrogate = rank(theirs, scenes), rank(ours, drawn)
     weights = resamples(len(torch.truths))
     a, b = average_precision(theirs), average_precision(ours)
     low, high = interval(surrogate.ap(weights) - torch.ap(weights))
-    return Level(name, a, b, b - a, low, high, len(theirs))
+    return LevelError(name, a, b, b - a, low, high, len(theirs))
 
 
-def _regions(job: Job) -> list[tuple[str, Disc | None]]:
+def _regions(job: Question) -> list[tuple[str, Disc | None]]:
     """Where the job's condition is judged, and under which name."""
     everywhere: list[tuple[str, Disc | None]] = [(job.condition, None)]
     return everywhere if job.disc is None else [*everywhere, (job.condition + IN_DISC, job.disc)]

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import Matched, average_precision, match
-from sortie.perception.surrogate.collect import Asked
+from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.correlation import towns_of
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import square
 from sortie.perception.surrogate.model import FEW, KINDS, SQUARE, WHOLE, Parameters
-from sortie.perception.surrogate.plan import Job
+from sortie.perception.surrogate.plan import Question
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Perception
 
@@ -36,7 +36,7 @@ BOUNDS = (0.7, 1.4)
 
 
 def level(
-    parameters: Parameters, asked: Sequence[Asked], seed: int, threshold: float, tell: Callable[[int, int], None]
+    parameters: Parameters, asked: Sequence[DetectorRuns], seed: int, threshold: float, tell: Callable[[int, int], None]
 ) -> Parameters:
     """The parameters with residuals so long that every group's AP is the detector's; as they are where a group has no runs."""
     towns = towns_of(asked, seed)
@@ -75,7 +75,7 @@ def longer(parameters: Parameters, factor: Floats) -> Parameters:
     return replace(parameters, residuals=residuals)
 
 
-def group_of(job: Job) -> int | None:
+def group_of(job: Question) -> int | None:
     """The pool (`model.kind_of`) that most of the job's boxes draw residuals from: drones that fly square to the streets see
     square cars. None where it is no plain job: all it gets is of now, from everywhere, in full weight and at one budget."""
     along = int(square(np.asarray(job.ego.true_yaw_rad)) > SQUARE)
@@ -95,13 +95,13 @@ class _Runs:
     """The plain jobs of one moment: the group of each, the truth, and the detector's matches."""
 
     scene: int
-    jobs: list[Job]
+    jobs: list[Question]
     groups: list[int]
     truths: list[Boxes]
     theirs: list[tuple[int, Matched]]
 
     @classmethod
-    def of(cls, asked: Asked, detector: SurrogateDetector, threshold: float) -> _Runs:
+    def of(cls, asked: DetectorRuns, detector: SurrogateDetector, threshold: float) -> _Runs:
         found = [(j, g, b) for j, b in zip(asked.jobs, asked.boxes, strict=True) if (g := group_of(j)) is not None]
         jobs, groups = [j for j, _, _ in found], [g for _, g, _ in found]
         truths = list(detector.truth_many([j.ego.t_s for j in jobs], [j.ego for j in jobs]))

@@ -50,7 +50,7 @@ Fleets = tuple[list[Capture], dict[float, list[Capture]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class Question:
     """One question to the detector, and the condition under which it is asked."""
 
     ego: Capture
@@ -114,7 +114,7 @@ def scene_model(seed: int, split: Split, index: int) -> SceneModel:
     return SceneModel(draw_scene(seed, split, index), draw_target(seed, split, index), bounds)
 
 
-def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Job]:
+def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Question]:
     """What is asked at moment `index` of a scene.
 
     For the fit, every drone is asked alone, under some exchanges that are drawn in every respect, and under some plain ones: all
@@ -130,12 +130,12 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
             return [job for ego in egos for job in conditions(ego, now, old)]
         x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
         return [job for ego in egos for job in street_conditions(ego, now, old, (x, y, 32.0))]
-    jobs = [Job(ego, (), "masked", "confidence", "") for ego in now]
+    jobs = [Question(ego, (), "masked", "confidence", "") for ego in now]
     jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(DRAWN)]
     return jobs + [_plain(rng, ego, now) for ego in now for _ in range(PLAIN)]
 
 
-def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Job]:
+def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Question]:
     """One drone under the exchanges that calibrations are judged by."""
     peers = [i for i in range(len(now)) if i != ego]
     near = sorted(peers, key=lambda i: np.hypot(*np.subtract(now[i].position_m, now[ego].position_m)[:2]))
@@ -156,11 +156,11 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         weight: float = 1.0,
         boxes_of: list[int] | None = None,
         join: Rule = "nms",
-    ) -> Job:
+    ) -> Question:
         of = old[age_s] if age_s else now
         shares = tuple(Share(of[i], representation, rho, roi, weight) for i in who)
         shares += tuple(Share(of[i], "detections", 0.0, None, 1.0) for i in boxes_of or [])
-        return Job(now[ego], shares, unsent, cells_by, name, join)
+        return Question(now[ego], shares, unsent, cells_by, name, join)
 
     yield job("alone", 0.0, [])
     for rho in BUDGETS:
@@ -183,7 +183,7 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         yield job(f"nearest 2, ρ = 0.1, boxes of the others, {rule}", 0.1, near[:2], boxes_of=near[2:], join=rule)
 
 
-def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]], disc: Disc) -> Iterator[Job]:
+def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]], disc: Disc) -> Iterator[Question]:
     """One drone of a fleet that flies along a street, under exchanges as sorties have them, in the mission's disc too."""
     peers = [i for i in range(len(now)) if i != ego]
 
@@ -194,9 +194,9 @@ def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Captur
         representation: str = "features",
         roi: Disc | None = None,
         join: Rule = "nms",
-    ) -> Job:
+    ) -> Question:
         shares = tuple(Share(of[i], representation, rho, roi, 1.0) for i in peers if name != "alone")
-        return Job(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
+        return Question(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
 
     yield job("alone", 0.0)
     for rho in (0.006, 0.025, 0.1, 0.35):
@@ -300,14 +300,14 @@ def _rho(everything: float, u: float) -> float:
     return 1.0 if everything < 0.3 else float(0.004 * 250.0**u)
 
 
-def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> Job:
+def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> Question:
     """All others send a drawn part of their maps as they are now."""
     rho = _rho(*rng.random(2))
     shares = tuple(Share(c, "features", rho, None, 1.0) for c in now if c is not ego)
-    return Job(ego, shares, "masked", "confidence", "")
+    return Question(ego, shares, "masked", "confidence", "")
 
 
-def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]) -> Job:
+def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]) -> Question:
     """A drawn exchange: who, how many cells, where, how old, what a cell that was not sent counts as."""
     u = rng.random(9)
     peers = rng.permutation([c.drone for c in now if c is not ego])[: 1 + int(4 * u[0])]
@@ -328,4 +328,4 @@ def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: d
         Share((old[float(a)] if a else now)[p], "features", rho, roi, float(w))
         for p, a, w in zip(peers, ages, weights, strict=True)
     )
-    return Job(ego, shares, "zero" if u[7] < 0.25 else "masked", "norm" if u[8] < 0.15 else "confidence", "")
+    return Question(ego, shares, "zero" if u[7] < 0.25 else "masked", "norm" if u[8] < 0.15 else "confidence", "")

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.scene.town import Floats
-from sortie.perception.surrogate.collect import Asked, captures_of
+from sortie.perception.surrogate.collect import DetectorRuns, captures_of
 from sortie.perception.surrogate.exchange import (
-    Exchange,
+    FeatureShares,
     Pairs,
     alarm_covariates,
     cell_of,
@@ -20,7 +20,7 @@ from sortie.perception.surrogate.exchange import (
     mean_shift,
     pair,
 )
-from sortie.perception.surrogate.features import Eyes, Fleet, Looks
+from sortie.perception.surrogate.features import CaptureColumns, Eyes, Looks
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.types import Boxes
 
@@ -31,7 +31,7 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class FitRows:
     """Rows of one or more scenes.
 
     Looks (l): `look` [l, 19] covariates, `confidence` [l] and `norm` [l] what ranks the car's best cell, `above` [l] and
@@ -63,7 +63,7 @@ class Rows:
     alarm: Array
 
     @classmethod
-    def join(cls, several: list[Rows]) -> Rows:
+    def join(cls, several: list[FitRows]) -> FitRows:
         """All rows; jobs, looks and objects numbered on."""
         out: dict[str, list[Array]] = {f.name: [] for f in fields(cls)}
         jobs = looks = objects = 0
@@ -78,13 +78,13 @@ class Rows:
         return cls(**{name: np.concatenate(parts) for name, parts in out.items()})
 
 
-def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
+def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     """One scene's answers as rows; boxes below `floor` count as none."""
     scene = scene_model(seed, asked.split, asked.scene)
     eyes = Eyes(scene)
     captures = captures_of(asked.jobs)
     column = {c: i for i, c in enumerate(captures)}
-    fleet = Fleet.of(captures)
+    fleet = CaptureColumns.of(captures)
     looks = eyes.look(fleet)
     ranks = np.stack([asked.ranks[c] for c in captures])
     r, c = cell_of(looks.xy_m)
@@ -103,7 +103,7 @@ def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
 
     jobs = [(j.ego, j.shares) for j in asked.jobs]
     zeros = np.array([j.unsent == "zero" for j in asked.jobs])
-    exchange = Exchange.of(jobs, column)
+    exchange = FeatureShares.of(jobs, column)
     pairs = pair(exchange, looks, fleet)
     sent = _sent(asked, pairs, cell_r, cell_c, column)
     by_norm = np.array([j.cells_by == "norm" for j in asked.jobs])[pairs.row, None]
@@ -123,7 +123,7 @@ def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
     alarm = alarm[~late[alarm[:, 0].astype(int)]]
     of_jobs = alarm_covariates(exchange, looks, fleet, zeros, scene.config)
     of_jobs[late] = np.nan  # boxes that were sent are worked out, not fitted
-    return Rows(
+    return FitRows(
         looks.covariates, confidence, norm, above / 4096.0, above_norm / 4096.0, looks.car,
         np.bincount(looks.capture, minlength=len(captures))[looks.capture],
         fused[keep], np.concatenate(score)[keep], np.concatenate(offset)[keep], looks.xy_m[pairs.look][keep], shift[keep],
@@ -132,7 +132,7 @@ def rows_of(asked: Asked, floor: float, seed: int = 0) -> Rows:
     )  # fmt: skip
 
 
-def _sent(asked: Asked, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict[Any, int]) -> NDArray[np.bool_]:
+def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict[Any, int]) -> NDArray[np.bool_]:
     """Whether the cell of each pair's car was sent, by the detector's own choice."""
     sent = np.zeros(pairs.peer.shape, bool)
     for m, job in enumerate(asked.jobs):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.geometry import FULL, in_square
 from sortie.perception.scene.town import Floats
-from sortie.perception.surrogate.features import Fleet
+from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.hashing import GAMMA, Words, mixed, uniform
 from sortie.scenarios.streams import stream
 
@@ -46,7 +46,7 @@ class Mirages:
     def __init__(self, town: int) -> None:
         self._key = stream(town, 0, (), "surrogate.mirage").integers(2**64, dtype=np.uint64)
 
-    def about(self, fleet: Fleet, most: float) -> Things:
+    def about(self, fleet: CaptureColumns, most: float) -> Things:
         """Those in any capture's square, where at most so many are expected in one."""
         own = np.unique(np.floor(fleet.position_m[:, :2] / TILE_M).astype(np.int64), axis=0)
         around = np.array(list(itertools.product(_AROUND, _AROUND)))

@@ -27,7 +27,7 @@ LEVELS = ((1.0, 1.0), (1.0, 2.5), (0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class PoseErrorAp:
     """AP@0.5 of a drone alone (a) and with all five (b) under pose errors of these standard deviations."""
 
     position_sigma_m: float
@@ -56,13 +56,13 @@ def validate_all(
     bench: Benchmark,
     device: torch.device,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Level]:
+) -> list[PoseErrorAp]:
     """`validate` at every level of pose error, the benchmark's own first."""
     out = []
     d = bench.difficulty
     for k, (position, heading) in enumerate(LEVELS):
         gain = validate(net, with_errors(frames, position, heading), device)
-        out.append(Level(position * d.position_error_sigma_m, heading * d.heading_error_sigma_deg, gain))
+        out.append(PoseErrorAp(position * d.position_error_sigma_m, heading * d.heading_error_sigma_deg, gain))
         if progress is not None:
             progress(k + 1, len(LEVELS))
     return out
@@ -76,7 +76,9 @@ def history(weights: Path | None) -> list[dict[str, Any]]:
     return runs
 
 
-def publish(net: CarNet, path: Path, bench: Benchmark, runs: list[dict[str, Any]], levels: Sequence[Level]) -> None:
+def publish(
+    net: CarNet, path: Path, bench: Benchmark, runs: list[dict[str, Any]], levels: Sequence[PoseErrorAp]
+) -> None:
     """Write the weights with their history, and the card beside them (`<name>.md`)."""
     facts = {"runs": runs, "benchmark": of_benchmark(bench), "validation": [asdict(level) for level in levels]}
     save_weights(net, path, facts)

@@ -153,14 +153,14 @@ class Logic:
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
+class LinksTerm:
     """A function over all links."""
 
     function: str
     body: Node
 
 
-Node = Number | Name | Fresh | Binary | Logic | Links
+Node = Number | Name | Fresh | Binary | Logic | LinksTerm
 
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "<": lambda a, b: a < b,
@@ -214,14 +214,14 @@ def _below(node: Node) -> tuple[Node, ...]:
             return (node.left, node.right)
         case Logic():
             return node.parts
-        case Links():
+        case LinksTerm():
             return (node.body,)
         case _:
             return ()
 
 
 def _speaks_of_link(node: Node) -> bool:
-    if isinstance(node, Links):
+    if isinstance(node, LinksTerm):
         return False  # it binds the link itself
     if isinstance(node, Fresh):
         return True
@@ -304,9 +304,9 @@ def _node(tree: ast.expr) -> Node:
             return pairs[0] if len(pairs) == 1 else Logic("and", tuple(pairs))
         case ast.Call(func=ast.Name(id=function), args=[body], keywords=[]) if function in LINK_FUNCTIONS:
             inner = _of_kind(LINK_FUNCTIONS[function][0], body)
-            if any(isinstance(n, Links) for n in walk(inner)):
+            if any(isinstance(n, LinksTerm) for n in walk(inner)):
                 raise InvariantError(f"{function}(…) holds another function over links")
-            return Links(function, inner)
+            return LinksTerm(function, inner)
     raise InvariantError(f"{ast.unparse(tree)!r} has no place in an invariant")
 
 
@@ -328,7 +328,7 @@ def _kind(node: Node) -> Kind:
             return "truth" if node.sign in _COMPARE else "number"
         case Logic():
             return "truth"
-        case Links():
+        case LinksTerm():
             return LINK_FUNCTIONS[node.function][1]
 
 
@@ -381,7 +381,7 @@ def evaluate(node: Node, scope: Scope) -> Any:
             if node.sign == "/" and right == 0:
                 return float("inf")
             return _ARITHMETIC[node.sign](left, right)
-        case Links():
+        case LinksTerm():
             links = (evaluate(node.body, scope._replace(link=d)) for d in scope.directives)
             if node.function == "any_link":
                 return any(links)

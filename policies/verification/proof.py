@@ -49,11 +49,11 @@ class Property:
     """Something to prove: a complaint about a policy on a view, None where it is kept."""
 
     name: str
-    complaint: Callable[[Policy, View], str | None]
+    complaint: Callable[[Policy, RepeatableView], str | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ProofVerdict:
     """What became of one property."""
 
     name: str
@@ -64,7 +64,7 @@ class Verdict:
     """The ages to which the counterexample's were raised, where that is what the property is about."""
 
 
-class View:
+class RepeatableView:
     """A view that can be had as often as it is asked for, over the same inputs: plain, at age 0, or older."""
 
     def __init__(
@@ -103,7 +103,7 @@ class View:
 # --- properties ----------------------------------------------------------------------------------
 
 
-def keeps_contract(policy: Policy, view: View) -> str | None:
+def keeps_contract(policy: Policy, view: RepeatableView) -> str | None:
     """Bounds, and one directive a link."""
     directives = list(policy(view.now()))
     try:
@@ -114,7 +114,7 @@ def keeps_contract(policy: Policy, view: View) -> str | None:
     return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
 
 
-def only_falls_with_age(policy: Policy, view: View) -> str | None:
+def only_falls_with_age(policy: Policy, view: RepeatableView) -> str | None:
     """Raising any ages raises no directive's rung, budget or rate."""
     before = list(policy(view.now()))
     for older in view.older():
@@ -128,7 +128,7 @@ def only_falls_with_age(policy: Policy, view: View) -> str | None:
 def property_of(invariant: Invariant) -> Property:
     """An invariant as something to prove."""
 
-    def complaint(policy: Policy, view: View) -> str | None:
+    def complaint(policy: Policy, view: RepeatableView) -> str | None:
         directives = list(policy(view.now()))
         fresh = list(policy(view.just_heard())) if invariant.needs_fresh else []
         for broken in violations(invariant, view.now(), directives, fresh):
@@ -156,7 +156,7 @@ def prove(
     period_s: float = 0.1,
     max_cells: int = MAX_CELLS,
     seed: int = 0,
-) -> list[Verdict]:
+) -> list[ProofVerdict]:
     """Prove or refute the plane's properties and a policy's invariants.
 
     Args:
@@ -174,7 +174,9 @@ def prove(
     return [_verdict(policy, p, max_drones, period_s, max_cells, seed) for p in properties]
 
 
-def _verdict(policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int, seed: int) -> Verdict:
+def _verdict(
+    policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int, seed: int
+) -> ProofVerdict:
     def fails(view: FleetView) -> bool:
         return complaint_on(prop, policy, view) is not None
 
@@ -188,17 +190,17 @@ def _verdict(policy: Policy, prop: Property, max_drones: int, period_s: float, m
             raised = system.raised_example()
             confirmed = complaint_on(prop, policy, found, raised)
             if confirmed is not None:
-                return Verdict(prop.name, "refuted", confirmed, found, raised)
+                return ProofVerdict(prop.name, "refuted", confirmed, found, raised)
             reason = "the search meets a fault that no plain view shows"
         elif looks_up(policy, type):
             reason = "asks for a type(…), which is another one in the search"
         else:
-            return Verdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
+            return ProofVerdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
     for view in draw_views(seed, TRIED_VIEWS):
         if fails(view):
             small = smaller(view, fails)
-            return Verdict(prop.name, "refuted", complaint_on(prop, policy, small) or "", small)
-    return Verdict(prop.name, "not proved", f"{reason}; {TRIED_VIEWS} drawn views keep it")
+            return ProofVerdict(prop.name, "refuted", complaint_on(prop, policy, small) or "", small)
+    return ProofVerdict(prop.name, "not proved", f"{reason}; {TRIED_VIEWS} drawn views keep it")
 
 
 def complaint_on(
@@ -206,7 +208,7 @@ def complaint_on(
 ) -> str | None:
     """What is wrong with a policy on one plain view; raising is."""
     try:
-        return prop.complaint(policy, View(plain=view, raised=raised))
+        return prop.complaint(policy, RepeatableView(plain=view, raised=raised))
     except Exception as error:
         return _unsound(policy, view) or f"raises {type(error).__name__}: {error}"
 
@@ -231,7 +233,7 @@ def _search(
         ) -> tuple[str | None, FleetOfRanges]:
             system = FleetOfRanges(path, drones, ego, heard, period_s)
             try:
-                return prop.complaint(policy, View(system=system)), system
+                return prop.complaint(policy, RepeatableView(system=system)), system
             except Exception as error:  # its own fault or the ranges': the plain view will tell
                 return f"raises {type(error).__name__}", system
 

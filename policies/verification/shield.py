@@ -21,7 +21,7 @@ from sortie.policies.verification.invariants import (
     Binary,
     Invariant,
     InvariantError,
-    Links,
+    LinksTerm,
     Name,
     Node,
     Scope,
@@ -70,7 +70,7 @@ def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
     for rule in rules:
         for top in (rule.when, rule.then):
             for node in () if top is None else walk(top):
-                if isinstance(node, Links) and node.function in _SUMS:
+                if isinstance(node, LinksTerm) and node.function in _SUMS:
                     raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
     return rules
 
@@ -190,7 +190,7 @@ def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
         if not isinstance(node, Binary) or node.sign not in ("<", "<=", ">", ">=", "==", "!="):
             continue
         for side, other in ((node.left, node.right), (node.right, node.left)):
-            if isinstance(side, Name) and side.word in _HIGHEST and not isinstance(other, Links):
+            if isinstance(side, Name) and side.word in _HIGHEST and not isinstance(other, LinksTerm):
                 edge = evaluate(other, scope)
                 near = (edge - 1, edge, edge + 1) if side.word == "representation" else _around(edge)
                 values.setdefault(side.word, set()).update(v for v in near if 0 <= v <= _HIGHEST[side.word])

@@ -17,7 +17,7 @@ IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
+class LinkList:
     """Directed links, in some order."""
 
     n: int
@@ -41,10 +41,10 @@ class Links:
         return out
 
 
-def all_links(n: int) -> Links:
+def all_links(n: int) -> LinkList:
     """Every drone with every drone."""
     ids = np.arange(n)
-    return Links(n, np.repeat(ids, n), np.tile(ids, n), np.arange(n * n), [i * n for i in range(n + 1)], True)
+    return LinkList(n, np.repeat(ids, n), np.tile(ids, n), np.arange(n * n), [i * n for i in range(n + 1)], True)
 
 
 def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntArray, FloatArray]:
@@ -81,9 +81,9 @@ def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntAr
     return low[near], high[near], apart[:, near]
 
 
-def both_ways(n: int, low: IntArray, high: IntArray) -> Links:
+def both_ways(n: int, low: IntArray, high: IntArray) -> LinkList:
     """The links of some pairs: all those from the lower id, then all those from the higher one."""
     sender, receiver = np.concatenate([low, high]), np.concatenate([high, low])
     order = np.argsort(sender * n + receiver)
     begin = np.searchsorted(sender[order], np.arange(n + 1)).tolist()
-    return Links(n, sender, receiver, order, begin, False)
+    return LinkList(n, sender, receiver, order, begin, False)

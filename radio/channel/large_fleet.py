@@ -23,7 +23,7 @@ from sortie.radio.channel.draws import (
     numbers,
     uniforms,
 )
-from sortie.radio.channel.earshot import IntArray, Links, both_ways, near_pairs
+from sortie.radio.channel.earshot import IntArray, LinkList, both_ways, near_pairs
 from sortie.radio.channel.pathloss import path_loss_db
 from sortie.radio.channel.shadowing import ShadowField, gauss_markov, keep
 from sortie.scenarios.schema import Radio
@@ -34,10 +34,10 @@ EPOCH = 32
 """Frames for which the list of links stands."""
 
 
-class Block(NamedTuple):
+class BlockStart(NamedTuple):
     """What a block of frames begins with."""
 
-    links: Links
+    links: LinkList
     gain_db: Array
     """[frames, L]: path, antennas and shadowing."""
     shadow_db: Array
@@ -75,7 +75,7 @@ class Crowd:
         self._last_pairs: IntArray = np.empty(0, np.int64)
         self._last_db: Array = np.empty(0, np.float32)
 
-    def block(self, frame: int, positions_m: Array, up: Array | None) -> Block:
+    def block(self, frame: int, positions_m: Array, up: Array | None) -> BlockStart:
         """The frames from `frame` on, of [frames, N, 3] positions (and vectors along the airframes' z axes)."""
         p = positions_m.astype(np.float32)
         low, high, distance = near_pairs(p, self._earshot_m)
@@ -98,7 +98,7 @@ class Crowd:
             shadow_db = self._shadowing(low, high, len(p))
             shadow_db[:, :early] = np.take(early_shadow_db, places[:early], axis=1, mode="clip")
         gain_db = shadow_db - loss_db
-        return Block(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
+        return BlockStart(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
 
     def chance(self, first: int, frames: int, links: IntArray) -> tuple[Array, Array]:
         """Fades in dB and luck, [frames, L'], of some links in the block's frames from `first` on."""

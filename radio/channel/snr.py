@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.draws import StreamDraws, fade_table_db
-from sortie.radio.channel.earshot import IntArray, Links, all_links
+from sortie.radio.channel.earshot import IntArray, LinkList, all_links
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
@@ -68,7 +68,7 @@ class FrameLinks:
 
     __slots__ = ("_rows", "_square", "links", "snr_db")
 
-    def __init__(self, links: Links, snr_db: AnyFloats, rows_db: list[list[float]] | None = None) -> None:
+    def __init__(self, links: LinkList, snr_db: AnyFloats, rows_db: list[list[float]] | None = None) -> None:
         self.links, self.snr_db = links, snr_db
         self._square: FloatArray | None = None
         self._rows = rows_db

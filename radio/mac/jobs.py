@@ -19,7 +19,7 @@ class End(Enum):
     DEADLINE_IN_SERVICE = "deadline_in_service"
 
 
-class Job:
+class AirJob:
     """One sample's claim on the air; subclassed by what knows the sample.
 
     `remaining` runs from 1 to 0 while it is served. `granted_s` is the channel time that it was given

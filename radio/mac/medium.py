@@ -26,14 +26,14 @@ from typing import Generic, TypeVar
 import simpy
 
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, contention
-from sortie.radio.mac.jobs import End, GroupFrame, Job
+from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 
 AIFS_CONTEXT_S = SIFS_S + 2 * SLOT_S
 CW_CONTEXT = 15
 _EPS_S = 1e-10
 _SERVED = End.SERVED  # members of an enumeration are slow to look up
 
-J = TypeVar("J", bound=Job)
+J = TypeVar("J", bound=AirJob)
 F = TypeVar("F", bound=GroupFrame)
 
 
@@ -421,5 +421,5 @@ class Medium(Generic[J, F]):
         return (self.data_busy_s + self.context_busy_s) / elapsed if elapsed > 0 else 0.0
 
 
-def _number(job: Job) -> int:
+def _number(job: AirJob) -> int:
     return job.number

@@ -25,7 +25,7 @@ PROBE_SHARE = 0.1
 _HIGH, _LOW = 0.9, 0.1
 
 
-class _Link:
+class _LinkHistory:
     """What is known of one ordered link."""
 
     __slots__ = ("best", "credit", "frames", "losses", "order", "probed", "rng", "success", "until_s")
@@ -53,7 +53,7 @@ class Minstrel:
     def __init__(self, rates_mbps: Sequence[float], seed: int, replication: int) -> None:
         self._rates = tuple(rates_mbps)
         self._key = (seed, replication)
-        self._links: dict[tuple[int, int], _Link] = {}
+        self._links: dict[tuple[int, int], _LinkHistory] = {}
 
     def mcs(self, sender: int, receiver: int, now_s: float) -> int:
         """The MCS in use now; 0 on a link that was never used."""
@@ -93,14 +93,14 @@ class Minstrel:
             link.frames[at] += count
             link.losses[at] += count * per_by_mcs[at]
 
-    def _link(self, sender: int, receiver: int, now_s: float) -> _Link:
+    def _link(self, sender: int, receiver: int, now_s: float) -> _LinkHistory:
         link = self._links.get((sender, receiver))
         if link is None:
             rng = stream(*self._key, (sender, receiver), "rate control")
-            link = self._links[sender, receiver] = _Link(len(self._rates), rng, now_s)
+            link = self._links[sender, receiver] = _LinkHistory(len(self._rates), rng, now_s)
         return link
 
-    def _weigh(self, link: _Link) -> None:
+    def _weigh(self, link: _LinkHistory) -> None:
         best, best_mbps = 0, 0.0
         for m, rate in enumerate(self._rates):
             frames = link.frames[m]

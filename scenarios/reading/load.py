@@ -227,7 +227,7 @@ def read_scalar(text: str) -> tuple[Scalar, str, str]:
     return text, "", ""
 
 
-class _Reader:
+class _EventReader:
     """Builds nodes from the parser's events, within the bounds, so that nothing is expanded before it is weighed."""
 
     def __init__(self, text: str, source: str, line: int) -> None:
@@ -343,7 +343,7 @@ def _read(text: str, source: str, line: int = 1) -> Node | None:
         at = Node(None, source, line and line + text.count("\n", 0, odd.start()))
         raise ScenarioError(f"{at.where}: character U+{ord(odd.group()):04X} is not allowed in YAML")
     try:
-        return _Reader(text, source, line).document()
+        return _EventReader(text, source, line).document()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         row = mark.line if mark else 0

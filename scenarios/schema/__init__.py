@@ -22,7 +22,7 @@ from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Airframe, Battery, DroneOverride, Fleet, Formation, Motion, Route, Viewpoints
 from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
 from sortie.scenarios.schema.perception import Perception, Scene
-from sortie.scenarios.schema.policy import Policy, PolicyChange, PolicyCommand, ViewReplay
+from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import MIN_TILE_BYTES, Bursts, Radio
 from sortie.scenarios.schema.scenario import Scenario, json_schema
 
@@ -54,7 +54,7 @@ __all__ = [
     "Phase",
     "PhaseName",
     "PointM",
-    "Policy",
+    "PolicySection",
     "PolicyChange",
     "PolicyCommand",
     "Radio",

@@ -129,7 +129,7 @@ _LEFT_TO = {
 """Fields of the base that the plan writes itself: varied, they would stand in the table and not be flown."""
 
 
-class Sample(Section):
+class SampledField(Section):
     method: Literal["random", "latin_hypercube", "sobol", "morris", "saltelli"] = Field(
         "latin_hypercube",
         description="How the drawn fields are spread together; morris and saltelli are designs for sensitivity.",
@@ -142,7 +142,7 @@ class Sample(Section):
     )
 
     @model_validator(mode="after")
-    def _power(self) -> Sample:
+    def _power(self) -> SampledField:
         if self.method in ("sobol", "saltelli") and self.count & (self.count - 1):
             raise inconsistent(("count",), f"{self.count}", f"a power of two where method is {self.method}")
         return self
@@ -170,7 +170,7 @@ class Campaign(Section):
     vary: dict[str, Spread] = Field(
         {}, max_length=100, description="Dotted fields of the base, and how each is spread."
     )
-    sample: Sample = Sample()
+    sample: SampledField = SampledField()
     policies: tuple[str, ...] = Field(
         ("",), min_length=1, max_length=50, description="As after --policy; left out, the base's own."
     )

@@ -14,7 +14,7 @@ from sortie.scenarios.schema.base import Section, inconsistent
 Override = Annotated[str, Field(min_length=3, description="As after `--set`.")]
 
 
-class Context(Section):
+class Condition(Section):
     """One condition."""
 
     name: str = Field(pattern=r"^[a-z0-9_]+$", max_length=64, description="Short name.")
@@ -34,7 +34,7 @@ class Contexts(Section):
     seeds: tuple[Annotated[int, Field(ge=0, lt=2**63)], ...] = Field(
         (1,), min_length=1, max_length=100, description="Each context is flown once with each."
     )
-    contexts: tuple[Context, ...] = Field(min_length=1, max_length=1000, description="The contexts.")
+    contexts: tuple[Condition, ...] = Field(min_length=1, max_length=1000, description="The contexts.")
 
     @model_validator(mode="after")
     def _named_once(self) -> Contexts:

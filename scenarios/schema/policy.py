@@ -34,7 +34,7 @@ class ViewReplay(Section):
     view: str = Field(min_length=1, description="A fleet view as JSON, as `sortie verify` writes counterexamples.")
 
 
-class Policy(Section):
+class PolicySection(Section):
     name: str = Field("worked", min_length=1, description="A registered policy, or path/to/file.py:function.")
     params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
     dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
@@ -60,7 +60,7 @@ class Policy(Section):
     )
 
     @model_validator(mode="after")
-    def _fits_together(self) -> Policy:
+    def _fits_together(self) -> PolicySection:
         known = [c.command for c in self.changes if c.command is not None]
         for i, given in enumerate(self.commands):
             if given.command not in known:

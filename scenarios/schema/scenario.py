@@ -15,7 +15,7 @@ from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Fleet
 from sortie.scenarios.schema.mission import Mission
 from sortie.scenarios.schema.perception import Perception
-from sortie.scenarios.schema.policy import Policy, PolicyChange, PolicyCommand, ViewReplay
+from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import Radio
 
 
@@ -31,7 +31,7 @@ class Scenario(Section):
     radio: Radio = Radio()
     context: Context = Context()
     perception: Perception = Perception()
-    policy: Policy = Policy()
+    policy: PolicySection = PolicySection()
     events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
     expect: tuple[Expectation, ...] = Field(
         (), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`."

@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow as pa
 
 from sortie.sim.campaign.engine import Engine
-from sortie.sim.campaign.plan import Plan
-from sortie.sim.campaign.statistics import Mean, t_interval
-from sortie.sim.campaign.store import Store
+from sortie.sim.campaign.plan import CampaignPlan
+from sortie.sim.campaign.statistics import RunningMean, t_interval
+from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task
 
 
@@ -42,7 +42,7 @@ class Progress:
 
 
 def run_campaign(
-    plan: Plan,
+    plan: CampaignPlan,
     folder: Path,
     engine: Engine,
     *,
@@ -60,14 +60,14 @@ def run_campaign(
     Raises:
         RunError: a folder that cannot be used, a cluster that is not there, a disk that is full.
     """
-    store = Store(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
+    store = CampaignStore(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
         return _drive(plan, store, engine, progress)
     finally:
         store.close()
 
 
-def _drive(plan: Plan, store: Store, engine: Engine, progress: Callable[[Progress], None]) -> Progress:
+def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: Callable[[Progress], None]) -> Progress:
     stop = Stop(plan)
     frontier = 0
     begin_s, flown = time.perf_counter(), 0
@@ -109,9 +109,9 @@ class Stop:
     less spread than they are: with `at_least` 30 the coverage of a 95 % interval loses about a point.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: CampaignPlan) -> None:
         self._plan, self._asked = plan, plan.campaign.stop_when
-        self._means = [Mean() for _ in plan.policies]
+        self._means = [RunningMean() for _ in plan.policies]
         self._open: list[list[float]] = [[] for _ in plan.policies]
         self._unit = 0
 

@@ -18,7 +18,7 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
-from sortie.sim.campaign.work import Result, Task, fly_batch, task_key
+from sortie.sim.campaign.work import RunResult, Task, fly_batch, task_key
 from sortie.sim.folders import RunError
 
 BATCH_S = 1.0
@@ -35,7 +35,7 @@ class Engine(Protocol):
     @property
     def workers(self) -> int: ...
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         """Results of tasks, in any order. Raises RunError where runs would not be the campaign's, or nobody flies them."""
 
 
@@ -44,7 +44,7 @@ class InProcess:
 
     workers = 1
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         """As `Engine`."""
         for task in tasks:
             yield fly_batch(code, [task])[0]
@@ -62,7 +62,7 @@ class Dask:
         """Threads of all workers, each of which flies one batch at a time."""
         return sum(w["nthreads"] for w in self._client.scheduler_info(n_workers=-1)["workers"].values())
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         """As `Engine`. A batch on which workers died again and again is flown run by run, and the run at fault told."""
         from distributed import KilledWorker, as_completed
 
@@ -119,11 +119,11 @@ class Dask:
         self._seconds_per_run = seconds if known is None else 0.8 * known + 0.2 * seconds
 
 
-def _killer(task: Task, code: str) -> Result:
+def _killer(task: Task, code: str) -> RunResult:
     """The row of a run that no worker survived."""
     run, text = task
     nothing = (None,) * len(json.loads(text)["metrics"])
-    return Result(run, task_key(text, code), "failed", "WorkerDied: on every attempt", "", nothing)
+    return RunResult(run, task_key(text, code), "failed", "WorkerDied: on every attempt", "", nothing)
 
 
 @contextmanager

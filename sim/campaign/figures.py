@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sortie.sim.campaign.rows import Rows, is_accuracy
+from sortie.sim.campaign.rows import CampaignRows, is_accuracy
 from sortie.sim.campaign.statistics import estimate
 
 MAX_METRICS, MAX_FIELDS = 8, 6
@@ -18,7 +18,7 @@ APART = 0.012
 COST = ("bytes.data_sent", "data_rate_mbps", "energy_j.total")
 
 
-def with_values(rows: Rows) -> list[str]:
+def with_values(rows: CampaignRows) -> list[str]:
     """The campaign's metrics that some run has a value of; of the others nothing can be drawn or said."""
     return [m for m in rows.plan.campaign.metrics if not np.isnan(rows.values(m)).all()]
 
@@ -28,7 +28,7 @@ def costs(metrics: Sequence[str]) -> list[str]:
     return [m for m in COST if m in metrics]
 
 
-def drawn(rows: Rows) -> tuple[list[str], list[str]]:
+def drawn(rows: CampaignRows) -> tuple[list[str], list[str]]:
     """Metrics and fields that have a place in the figure."""
     fields = [f for f in rows.plan.campaign.vary if rows.bins(f)]
     return with_values(rows)[:MAX_METRICS], fields[:MAX_FIELDS]
@@ -50,7 +50,7 @@ def on_front(x: list[float], y: list[float]) -> list[bool]:
     ]
 
 
-def draw_varied(rows: Rows, path: Path) -> bool:
+def draw_varied(rows: CampaignRows, path: Path) -> bool:
     """Metrics (rows) over varied fields (columns), a line a policy, whiskers 95 %; whether there is anything to draw."""
     metrics, fields = drawn(rows)
     if not metrics or not fields:
@@ -86,7 +86,7 @@ def draw_varied(rows: Rows, path: Path) -> bool:
     return True
 
 
-def draw_pareto(rows: Rows, path: Path) -> bool:
+def draw_pareto(rows: CampaignRows, path: Path) -> bool:
     """Accuracy against each cost, a point a policy with both intervals; whether there is anything to draw."""
     metrics = with_values(rows)
     accuracies, prices = [m for m in metrics if is_accuracy(m)], costs(metrics)

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sortie.scenarios.schema.campaign import Choice, Column, Grid
-from sortie.sim.campaign.plan import FORMAT, Plan
-from sortie.sim.campaign.work import Result
+from sortie.sim.campaign.plan import FORMAT, CampaignPlan
+from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
 MANIFEST, RUNS, JOURNAL = "campaign.json", "runs", "journal"
@@ -35,7 +35,7 @@ class BrokenPartError(RunError):
     """A file of the table that is damaged, or not the part that its name says."""
 
 
-def read_plan(folder: Path) -> Plan:
+def read_plan(folder: Path) -> CampaignPlan:
     """The plan of a campaign's folder.
 
     Raises:
@@ -46,7 +46,7 @@ def read_plan(folder: Path) -> Plan:
         spec = manifest["spec"]
         if spec["format"] != FORMAT:
             raise RunError(f"{folder}: holds results of format {spec['format']}, must be {FORMAT}; name another folder")
-        plan = Plan(spec)
+        plan = CampaignPlan(spec)
         if plan.digest != manifest["digest"]:
             raise RunError(f"{folder / MANIFEST}: was changed by hand, its digest is another")
     except FileNotFoundError:
@@ -58,7 +58,7 @@ def read_plan(folder: Path) -> Plan:
     return plan
 
 
-def columns(plan: Plan) -> dict[str, pa.DataType]:
+def columns(plan: CampaignPlan) -> dict[str, pa.DataType]:
     """The table's columns and their types."""
     found = dict(FIXED)
     for name, spread in plan.campaign.vary.items():
@@ -76,12 +76,12 @@ def columns(plan: Plan) -> dict[str, pa.DataType]:
     return found
 
 
-def shards(plan: Plan) -> int:
+def shards(plan: CampaignPlan) -> int:
     """Parts of the whole campaign."""
     return -(-plan.runs // plan.shard)
 
 
-def runs_of(plan: Plan, shard: int) -> range:
+def runs_of(plan: CampaignPlan, shard: int) -> range:
     """The runs of a part."""
     return range(shard * plan.shard, min(plan.runs, (shard + 1) * plan.shard))
 
@@ -96,7 +96,7 @@ def journal_file(folder: Path, shard: int) -> Path:
     return folder / JOURNAL / f"{shard:05d}.jsonl"
 
 
-def read_part(folder: Path, plan: Plan, shard: int) -> pa.Table | None:
+def read_part(folder: Path, plan: CampaignPlan, shard: int) -> pa.Table | None:
     """A finished part, read in full and held against the plan; None where there is no such file.
 
     Keys are held against the plan at the part's ends: each costs 0.3 ms, five minutes for a million runs.
@@ -131,12 +131,12 @@ def _broken(path: Path, why: str) -> BrokenPartError:
     return BrokenPartError(f"{path}: is broken ({why}); the campaign's command flies it again")
 
 
-def schema_of(plan: Plan) -> pa.Schema:
+def schema_of(plan: CampaignPlan) -> pa.Schema:
     """The schema of its parts, whose campaign stands in the metadata."""
     return pa.schema(list(columns(plan).items()), {"sortie.campaign": plan.digest})
 
 
-def find_in_journal(folder: Path, plan: Plan, run: int) -> Result | None:
+def find_in_journal(folder: Path, plan: CampaignPlan, run: int) -> RunResult | None:
     """A run's result, where its part is not finished; None where it has none."""
     try:
         results, _ = read_lines(journal_file(folder, run // plan.shard))
@@ -145,7 +145,7 @@ def find_in_journal(folder: Path, plan: Plan, run: int) -> Result | None:
     return next((r for r in results if r.run == run and r.key == plan.key(run)), None)
 
 
-def row_of(plan: Plan, kinds: Mapping[str, pa.DataType], result: Result) -> dict[str, Any]:
+def row_of(plan: CampaignPlan, kinds: Mapping[str, pa.DataType], result: RunResult) -> dict[str, Any]:
     """A result's row of the table, whose columns are `kinds`."""
     at = plan.at(result.run)
     varied = {
@@ -165,7 +165,7 @@ def row_of(plan: Plan, kinds: Mapping[str, pa.DataType], result: Result) -> dict
     }
 
 
-def check_same(folder: Path, plan: Plan) -> None:
+def check_same(folder: Path, plan: CampaignPlan) -> None:
     """Refuse a folder that holds results of another campaign, or of other code; an empty one will do.
 
     Raises:
@@ -191,15 +191,15 @@ def _what(old: Mapping[str, Any], new: Mapping[str, Any], key: str) -> str:
     return key
 
 
-def line_of(result: Result) -> bytes:
+def line_of(result: RunResult) -> bytes:
     """A result's line of the journal, its checksum first."""
     text = json.dumps(result, separators=(",", ":")).encode()
     return b"%08x %s\n" % (zlib.crc32(text), text)
 
 
-def read_lines(path: Path) -> tuple[list[Result], int]:
+def read_lines(path: Path) -> tuple[list[RunResult], int]:
     """The rows up to the first line that is not whole, and how many bytes they take."""
-    results: list[Result] = []
+    results: list[RunResult] = []
     good = 0
     with path.open("rb") as file:
         for line in file:
@@ -207,6 +207,6 @@ def read_lines(path: Path) -> tuple[list[Result], int]:
             if not line.endswith(b"\n") or checksum != b"%08x" % zlib.crc32(text):
                 break
             run, key, status, error, fingerprint, values = json.loads(text)
-            results.append(Result(run, key, status, error, fingerprint, tuple(values)))
+            results.append(RunResult(run, key, status, error, fingerprint, tuple(values)))
             good += len(line)
     return results, good

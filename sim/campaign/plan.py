@@ -39,7 +39,7 @@ from sortie.sim.results.outcome_fields import check_number, open_keys
 FORMAT = 1
 
 
-class Run(NamedTuple):
+class PlannedRun(NamedTuple):
     """Where a run stands in the campaign."""
 
     run: int
@@ -52,7 +52,7 @@ class Run(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class CampaignPlan:
     """A campaign, worked out.
 
     Args:
@@ -112,16 +112,16 @@ class Plan:
         p = len(self.policies)
         return max(1, min(5000, max(30, self.runs // 20)) // p) * p
 
-    def at(self, run: int) -> Run:
+    def at(self, run: int) -> PlannedRun:
         """A run's place."""
         rest, policy = divmod(run, len(self.policies))
         grid_points, replications = len(self.grid), self.campaign.replications
         if drawn_fields(self.campaign):
             unit, inner = divmod(rest, grid_points * replications)
             point, replication = divmod(inner, replications)
-            return Run(run, unit, unit * grid_points + point, replication, policy)
+            return PlannedRun(run, unit, unit * grid_points + point, replication, policy)
         unit, point = divmod(rest, grid_points)
-        return Run(run, unit, point, unit, policy)
+        return PlannedRun(run, unit, point, unit, policy)
 
     def varied(self, cell: int) -> dict[str, Any]:
         """A cell's values of the varied fields, in the campaign's order."""
@@ -166,7 +166,7 @@ class Plan:
         return task_key(self.task(run), self.code)
 
 
-def make_plan(study: Study) -> Plan:
+def make_plan(study: Study) -> CampaignPlan:
     """A campaign's plan; what is wrong is found before anything is flown.
 
     Raises:
@@ -193,7 +193,7 @@ def make_plan(study: Study) -> Plan:
         holder[within] = [section[room][key] for section in varied]
         reading += varied
     _check_metrics(study, [section for _, section in policies])
-    return Plan(
+    return CampaignPlan(
         {
             "format": FORMAT,
             "campaign": asked,

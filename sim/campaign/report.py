@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
-from sortie.sim.campaign.rows import Rows, figure, figures, is_accuracy, judged, read_rows
+from sortie.sim.campaign.rows import CampaignRows, figure, figures, is_accuracy, judged, read_rows
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.statistics import Estimate, Floats, estimate, paired
 from sortie.sim.campaign.winners import contexts, rule, winner
@@ -39,7 +39,7 @@ def write_report(folder: Path) -> Path:
     return folder / REPORT
 
 
-def _lines(rows: Rows, folder: Path, pictures: dict[str, bool]) -> Iterator[str]:
+def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Iterator[str]:
     plan = rows.plan
     yield f"# {plan.campaign.campaign}"
     if plan.campaign.description:
@@ -77,7 +77,7 @@ duckdb.sql("from '{folder}/runs/*.parquet'")
 ```"""
 
 
-def _lost(rows: Rows) -> Iterator[str]:
+def _lost(rows: CampaignRows) -> Iterator[str]:
     """What failed runs take out of the means, and by whose fault."""
     plan, lost = rows.plan, rows.lost()
     if units := int(lost.any(axis=1).sum()):
@@ -90,7 +90,7 @@ def _lost(rows: Rows) -> Iterator[str]:
         yield f"No run of {', '.join(none)} finished."
 
 
-def _by_policy(rows: Rows) -> Iterator[str]:
+def _by_policy(rows: CampaignRows) -> Iterator[str]:
     labels = rows.plan.policies
     yield "\n## Metrics by policy\n"
     yield _header("metric", *labels)
@@ -114,7 +114,7 @@ def _by_policy(rows: Rows) -> Iterator[str]:
             )
 
 
-def _varied(rows: Rows, picture: bool) -> Iterator[str]:
+def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
     valued = with_values(rows)
     metrics = judged(valued) or valued[:1]
     if not rows.plan.campaign.vary or not metrics:
@@ -134,7 +134,7 @@ def _varied(rows: Rows, picture: bool) -> Iterator[str]:
         yield ""
 
 
-def _pareto(rows: Rows, picture: bool) -> Iterator[str]:
+def _pareto(rows: CampaignRows, picture: bool) -> Iterator[str]:
     metrics = with_values(rows)
     accuracies, prices = [m for m in metrics if is_accuracy(m)], costs(metrics)
     if not accuracies or not prices:
@@ -149,7 +149,7 @@ def _pareto(rows: Rows, picture: bool) -> Iterator[str]:
             yield f"- {accuracy} against {price}: no policy is better in both than {', '.join(front)}"
 
 
-def _sensitivity(rows: Rows) -> Iterator[str]:
+def _sensitivity(rows: CampaignRows) -> Iterator[str]:
     found = [
         s
         for metric in rows.plan.campaign.metrics
@@ -173,7 +173,7 @@ def _sensitivity(rows: Rows) -> Iterator[str]:
             yield _row(s.metric, s.policy, field, *(figure(v) for v in row))
 
 
-def _winners(rows: Rows) -> Iterator[str]:
+def _winners(rows: CampaignRows) -> Iterator[str]:
     metrics = judged(with_values(rows))
     if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
@@ -195,7 +195,7 @@ def _winners(rows: Rows) -> Iterator[str]:
     yield "\nIntervals of parts are widened for all parts looked at (Bonferroni)."
 
 
-def _failed(rows: Rows, folder: Path) -> Iterator[str]:
+def _failed(rows: CampaignRows, folder: Path) -> Iterator[str]:
     failed = _failures(rows)
     if not failed:
         return
@@ -209,17 +209,17 @@ def _failed(rows: Rows, folder: Path) -> Iterator[str]:
         )
 
 
-def _failures(rows: Rows) -> list[dict[str, Any]]:
+def _failures(rows: CampaignRows) -> list[dict[str, Any]]:
     failed: list[dict[str, Any]] = rows.all.filter(pc.equal(rows.all["status"], "failed")).to_pylist()
     return failed
 
 
-def _sampled(rows: Rows) -> bool:
+def _sampled(rows: CampaignRows) -> bool:
     """Whether draws are of the fields' distributions; Morris' are a few levels, walked along in trajectories."""
     return rows.plan.campaign.sample.method != "morris" or rows.plan.unit == "replication"
 
 
-def _intervals(rows: Rows) -> str:
+def _intervals(rows: CampaignRows) -> str:
     """What the intervals are, or why there are none."""
     unit = rows.plan.unit
     if not _sampled(rows):
@@ -234,7 +234,7 @@ def _intervals(rows: Rows) -> str:
     return f"Intervals are 95 %, Student's, over {unit}s; differences are paired."
 
 
-def _stopped(rows: Rows) -> bool:
+def _stopped(rows: CampaignRows) -> bool:
     """Whether the campaign ended because enough was known, as its driver finds out."""
     stop, size, count = Stop(rows.plan), rows.plan.shard, rows.all.num_rows
     enough = False
@@ -243,7 +243,7 @@ def _stopped(rows: Rows) -> bool:
     return enough and count < rows.plan.runs
 
 
-def _mean(rows: Rows, values: Floats) -> str:
+def _mean(rows: CampaignRows, values: Floats) -> str:
     found = estimate(values)
     return _interval(found) if _sampled(rows) else figure(found.mean)
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.sim.campaign.parts import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
-from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.folders import RunError
 
 Floats = NDArray[np.float64]
@@ -27,10 +27,10 @@ LESS_IS_BETTER = {"bytes", "energy_j", "deadline_miss_rate", "age_s", "data_age_
 
 
 @dataclass(frozen=True)
-class Rows:
+class CampaignRows:
     """What is finished of a campaign, as far as whole units of it are."""
 
-    plan: Plan
+    plan: CampaignPlan
     table: pa.Table
     unit: NDArray[np.int64]
     policy: NDArray[np.int64]
@@ -114,7 +114,7 @@ class Rows:
         ]
 
 
-def read_rows(folder: Path) -> Rows:
+def read_rows(folder: Path) -> CampaignRows:
     """The finished parts of a campaign's folder.
 
     Raises:
@@ -134,7 +134,7 @@ def read_rows(folder: Path) -> Rows:
     kept = table.filter(whole)
     number = {label: i for i, label in enumerate(plan.policies)}
     policy = np.array([number[label] for label in kept["policy"].to_pylist()], np.int64)
-    return Rows(plan, kept, unit[whole], policy, table)
+    return CampaignRows(plan, kept, unit[whole], policy, table)
 
 
 def sign(metric: str) -> int:

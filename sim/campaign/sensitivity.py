@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.sim.campaign.rows import Rows
+from sortie.sim.campaign.rows import CampaignRows
 from sortie.sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
 from sortie.sim.campaign.statistics import Floats
 from sortie.sim.folders import RunError
@@ -41,7 +41,7 @@ class Sensitivity:
     """Draws that it is worked out from."""
 
 
-def sensitivity(rows: Rows, metric: str, policy: int) -> Sensitivity | None:
+def sensitivity(rows: CampaignRows, metric: str, policy: int) -> Sensitivity | None:
     """None where no numeric field is drawn, or too little is finished.
 
     Raises:
@@ -74,11 +74,11 @@ def sensitivity(rows: Rows, metric: str, policy: int) -> Sensitivity | None:
     return Sensitivity(label, metric, method, fields, figures, int(kept.sum()) * block)
 
 
-def _numeric(rows: Rows) -> tuple[str, ...]:
+def _numeric(rows: CampaignRows) -> tuple[str, ...]:
     return tuple(f for f in rows.plan.campaign.vary if rows.table[f].to_numpy(zero_copy_only=False).dtype != object)
 
 
-def _in_order(rows: Rows, metric: str, policy: int) -> tuple[Floats, NDArray[np.int64]]:
+def _in_order(rows: CampaignRows, metric: str, policy: int) -> tuple[Floats, NDArray[np.int64]]:
     """A policy's values by draw, 0, 1, 2, …, replications averaged; each row's fields held against the design's."""
     plan = rows.plan
     mine = np.flatnonzero(rows.policy == policy)

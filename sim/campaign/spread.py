@@ -20,7 +20,7 @@ from sortie.scenarios.schema.campaign import (
     Linspace,
     LogNormal,
     Normal,
-    Sample,
+    SampledField,
     Spread,
     Triangular,
     Uniform,
@@ -38,7 +38,7 @@ def drawn_fields(campaign: Campaign) -> list[str]:
     return [name for name, spread in campaign.vary.items() if isinstance(spread, SAMPLED)]
 
 
-def design(sample: Sample, fields: int, seed: int) -> Floats:
+def design(sample: SampledField, fields: int, seed: int) -> Floats:
     """Points of the unit cube [draws, fields], in the order in which they are flown.
 
     Random, Latin hypercube and scrambled Sobol' points come from `scipy.stats.qmc`, Morris' trajectories and Saltelli's

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 LEVEL = 0.95
 
 
-class Mean:
+class RunningMean:
     """A running mean and its spread (Welford 1962), whatever the number of values."""
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Mean:
         return self._squares / (self.count - 1) if self.count > 1 else math.nan
 
 
-def t_interval(mean: Mean, level: float = LEVEL) -> float:
+def t_interval(mean: RunningMean, level: float = LEVEL) -> float:
     """Half the width of Student's interval; infinite below two values."""
     if mean.count < 2:
         return math.inf
@@ -57,7 +57,7 @@ class Estimate:
 
 def estimate(values: Sequence[float] | Floats, level: float = LEVEL) -> Estimate:
     """The mean of independent values; NaN are left out."""
-    kept = Mean()
+    kept = RunningMean()
     for value in np.asarray(values, float).ravel().tolist():
         if not math.isnan(value):
             kept.add(value)

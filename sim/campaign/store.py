@@ -31,22 +31,24 @@ from sortie.sim.campaign.parts import (
     schema_of,
     shards,
 )
-from sortie.sim.campaign.plan import Plan
-from sortie.sim.campaign.work import Result
+from sortie.sim.campaign.plan import CampaignPlan
+from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError, ensure_folder, partial_file, sync_folder, write_durably
 
 LOCK = ".lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class Store:
+class CampaignStore:
     """The folder while a campaign runs: rows go in, finished parts come out.
 
     Raises:
         RunError: a folder that cannot be used, that another driver uses, or that holds another campaign's results.
     """
 
-    def __init__(self, folder: Path, plan: Plan, *, resume_only: bool = False, retry_failed: bool = False) -> None:
+    def __init__(
+        self, folder: Path, plan: CampaignPlan, *, resume_only: bool = False, retry_failed: bool = False
+    ) -> None:
         self.folder, self.plan = folder, plan
         self._columns = columns(plan)
         self._journals: dict[int, Any] = {}
@@ -126,13 +128,13 @@ class Store:
                 known = self._known.get(shard, set())
                 yield from (run for run in self.runs_of(shard) if run not in known)
 
-    def add(self, results: Sequence[Result]) -> list[int]:
+    def add(self, results: Sequence[RunResult]) -> list[int]:
         """Put rows on disk; returns the parts that became complete by them.
 
         Raises:
             RunError: the disk refuses; what was added before stays.
         """
-        by_shard: dict[int, list[Result]] = {}
+        by_shard: dict[int, list[RunResult]] = {}
         for result in results:
             by_shard.setdefault(result.run // self.plan.shard, []).append(result)
         complete = []
@@ -178,7 +180,7 @@ class Store:
 
     # --- on disk -----------------------------------------------------------------------------------
 
-    def _append(self, shard: int, rows: Sequence[Result]) -> None:
+    def _append(self, shard: int, rows: Sequence[RunResult]) -> None:
         """Rows into a journal, on disk at the return; where the disk refuses, none of them."""
         if shard not in self._journals:
             self._journals[shard] = journal_file(self.folder, shard).open("ab", buffering=0)
@@ -262,7 +264,7 @@ class Store:
         """A part back to a journal, without the rows that failed; at the first new row, so that until then it stands."""
         metrics = self.plan.campaign.metrics
         kept = [
-            Result(
+            RunResult(
                 row["run"], row["key"], row["status"], row["error"], row["fingerprint"], tuple(row[m] for m in metrics)
             )
             for row in self.rows(shard).to_pylist()
@@ -276,7 +278,7 @@ class Store:
         del self._again[shard]
 
 
-def ensure_usable(folder: Path, plan: Plan) -> None:
+def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
     """Refuse a folder that a campaign cannot use, before a cluster is started for nothing.
 
     Raises:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.sim.campaign.rows import Rows, sign
+from sortie.sim.campaign.rows import CampaignRows, sign
 from sortie.sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
 
 
 @dataclass(frozen=True, slots=True)
-class Context:
+class OtherWinner:
     """A part of a varied field's range where another policy than the overall winner comes out first."""
 
     field: str
@@ -40,12 +40,12 @@ class Rule:
     """Over the best fixed policy, unit by unit, on units that had no part in finding the rule."""
 
 
-def winner(rows: Rows, metric: str) -> str:
+def winner(rows: CampaignRows, metric: str) -> str:
     """The policy with the best mean; of a metric that has a `sign`."""
     return rows.plan.policies[_first(sign(metric) * rows.by_unit(metric))]
 
 
-def contexts(rows: Rows, metric: str) -> list[Context]:
+def contexts(rows: CampaignRows, metric: str) -> list[OtherWinner]:
     """Every part of every varied field in which another policy than the overall winner has the best mean."""
     policies = rows.plan.policies
     best = policies.index(winner(rows, metric))
@@ -59,7 +59,7 @@ def contexts(rows: Rows, metric: str) -> list[Context]:
         here = _first(means)
         if here != best:
             gain = estimate(means[:, here] - means[:, best], level)
-            found.append(Context(field, label, policies[here], gain))
+            found.append(OtherWinner(field, label, policies[here], gain))
     return found
 
 
@@ -69,7 +69,7 @@ def _first(means: Floats) -> int:
     return int(np.argmax(np.where(counts > 0, sums / np.maximum(counts, 1), -math.inf)))
 
 
-def rule(rows: Rows, metric: str) -> Rule | None:
+def rule(rows: CampaignRows, metric: str) -> Rule | None:
     """The best one-threshold rule, found on every second unit and judged on the others, and the other way round.
 
     Returns:
@@ -101,7 +101,7 @@ def rule(rows: Rows, metric: str) -> Rule | None:
     return Rule(field, threshold, labels[below], labels[above], estimate(gains))
 
 
-def _cells(rows: Rows, metric: str) -> tuple[NDArray[np.int64], dict[str, Floats], Floats]:
+def _cells(rows: CampaignRows, metric: str) -> tuple[NDArray[np.int64], dict[str, Floats], Floats]:
     """Cells of units in which every policy has a value: their units, their numeric fields, and what each policy got."""
     cell, values = rows.table["cell"].to_numpy(), sign(metric) * rows.values(metric)
     numbers, at = np.unique(rows.unit * rows.plan.cells + cell, return_inverse=True)

@@ -31,7 +31,7 @@ Task = tuple[int, str]
 MAX_ERROR = 300
 
 
-class Result(NamedTuple):
+class RunResult(NamedTuple):
     """A run's row, but for what the plan knows of it."""
 
     run: int
@@ -53,7 +53,7 @@ def task_key(task: str, code: str) -> str:
     return hashlib.sha256(f"{code}\n{task}".encode()).hexdigest()[:32]
 
 
-def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[Result], float]:
+def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
     """Fly some runs one after the other; a run that fails gives a row that says so.
 
     Returns:
@@ -90,7 +90,7 @@ def unpack(task: str) -> tuple[Scenario, int, int]:
     return scenario, asked["seed"], asked["replication"]
 
 
-def _fly(run: int, task: str, code: str) -> Result:
+def _fly(run: int, task: str, code: str) -> RunResult:
     asked, key = json.loads(task), task_key(task, code)
     for path, digest in asked["files"].items():
         _check_file(path, digest)
@@ -99,8 +99,8 @@ def _fly(run: int, task: str, code: str) -> Result:
         result = outcome(record)
         values = tuple(number(result, name) for name in asked["metrics"])
     except Exception as error:  # whatever it is, the other runs go on
-        return Result(run, key, "failed", _in_one_line(error), "", (None,) * len(asked["metrics"]))
-    return Result(run, key, "done", "", record.fingerprint[:16], values)
+        return RunResult(run, key, "failed", _in_one_line(error), "", (None,) * len(asked["metrics"]))
+    return RunResult(run, key, "done", "", record.fingerprint[:16], values)
 
 
 def number(result: dict[str, Any], name: str) -> float | None:

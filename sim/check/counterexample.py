@@ -9,7 +9,7 @@ from typing import Any
 
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
 from sortie.policies.verification.conformance import raised_part
-from sortie.policies.verification.proof import View
+from sortie.policies.verification.proof import RepeatableView
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
@@ -94,7 +94,7 @@ def raised_ages(policy: Policy, view: FleetView) -> dict[int, float] | None:
         before = _decided(policy, view)
     except Exception:  # the view alone shows the fault
         return None
-    for older in View(plain=view).older():
+    for older in RepeatableView(plain=view).older():
         try:
             raised = raised_part(before, _decided(policy, older))
         except Exception as error:

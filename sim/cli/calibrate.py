@@ -15,10 +15,10 @@ from sortie.scenarios.reading.load import load, load_contexts
 from sortie.sim.cli.console import out, stages, user_errors
 from sortie.sim.folders import ensure_files
 from sortie.sim.results.numbers import points
-from sortie.sim.studies.in_flight import REGIONS, Level, flights, means
+from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 
 if TYPE_CHECKING:
-    from sortie.perception.surrogate.judge import Verdict
+    from sortie.perception.surrogate.judge import CalibrationVerdict
 
 
 def calibrate(
@@ -67,7 +67,7 @@ def calibrate(
             out.print(table)
 
 
-def _tell(verdict: Verdict, out_file: Path) -> None:
+def _tell(verdict: CalibrationVerdict, out_file: Path) -> None:
     """Levels, orders, and where they are kept."""
     from sortie.perception.surrogate.judge import WITHIN
 
@@ -84,7 +84,7 @@ def _tell(verdict: Verdict, out_file: Path) -> None:
     out.print(f"kept in [bold]{out_file}[/bold], its card in [bold]{out_file.with_suffix('.md')}[/bold]")
 
 
-def _in_flight(levels: Sequence[Level], title: str) -> Iterator[Table]:
+def _in_flight(levels: Sequence[ConditionAp], title: str) -> Iterator[Table]:
     """AP by both detectors, and what policies gain over one another; in points, with 95 % intervals over contexts."""
     found = list(means(levels))
     for region, words in REGIONS.items():

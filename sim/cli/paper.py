@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sortie.perception.evaluation import report
-from sortie.perception.evaluation.rows import INSTRUMENTS, Row, differ_by_chance
-from sortie.perception.evaluation.verdict import Verdict
+from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, differ_by_chance
+from sortie.perception.evaluation.verdict import ClaimVerdict
 from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import RunError, ensure_between
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 NARROW, PIPED_WIDTH = 150, 170
 """Columns of a terminal that show both instruments, and those that a pipe or file is given."""
-COLOURS = {Verdict.REPRODUCED: "green", Verdict.NOT_REPRODUCED: "yellow", Verdict.OPPOSITE: "red"}
+COLOURS = {ClaimVerdict.REPRODUCED: "green", ClaimVerdict.NOT_REPRODUCED: "yellow", ClaimVerdict.OPPOSITE: "red"}
 
 
 def paper(
@@ -62,7 +62,7 @@ def paper(
     What is finished is kept, so that a run that was cut off goes on where it was.
     """
     from sortie.perception.evaluation import figures, rows
-    from sortie.perception.evaluation.results import Asked
+    from sortie.perception.evaluation.results import TableSettings
     from sortie.perception.network.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
     from sortie.sim.studies import paper as making
 
@@ -75,9 +75,9 @@ def paper(
         raise RunError(f"--{'against' if readme is None else 'readme'} goes with the whole report, not with --frame")
     ensure_between(readme, report.BEGIN, report.END)
     try:
-        asked = Asked(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
+        asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
-        job = making.Job(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live)
+        job = making.PaperSettings(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live)
         if frame is not None:
             _open_frame(
                 making.frame_picture(job, work, frame, ego),
@@ -109,7 +109,7 @@ def paper(
         out.print(f"results section of [bold]{readme}[/bold] written")
 
 
-def verdicts_table(rows: Sequence[Row], *, masked: bool = True) -> Table:
+def verdicts_table(rows: Sequence[ClaimRow], *, masked: bool = True) -> Table:
     """Every claim: the paper's figure, ours under each instrument (or the first alone), and the verdicts."""
     shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)][: None if masked else 1]
     more = None if masked else f"a terminal {NARROW} columns wide shows masked fusion too, and so does the report"
@@ -119,7 +119,7 @@ def verdicts_table(rows: Sequence[Row], *, masked: bool = True) -> Table:
     for i in shown:
         table.add_column(INSTRUMENTS[i], justify="right")
         table.add_column("verdict")
-    claims: dict[str, dict[str, Row]] = {}
+    claims: dict[str, dict[str, ClaimRow]] = {}
     for row in rows:
         claims.setdefault(row.id, {})[row.instrument] = row
     section = ""
@@ -137,7 +137,7 @@ def verdicts_table(rows: Sequence[Row], *, masked: bool = True) -> Table:
     return table
 
 
-def _tally(rows: Sequence[Row]) -> str:
+def _tally(rows: Sequence[ClaimRow]) -> str:
     names: dict[str, str] = {str(i): name for i, name in INSTRUMENTS.items()}
     names[""] = "measured on a flown sortie"
     return "\n".join(
@@ -147,7 +147,7 @@ def _tally(rows: Sequence[Row]) -> str:
     )
 
 
-def _differences(ours: Sequence[Row], theirs: Sequence[Row], where: Path) -> str:
+def _differences(ours: Sequence[ClaimRow], theirs: Sequence[ClaimRow], where: Path) -> str:
     """Which claims came out otherwise in another report."""
     judged = {(r.id, r.instrument): r.verdict for r in theirs}
     lines = [
@@ -161,8 +161,8 @@ def _differences(ours: Sequence[Row], theirs: Sequence[Row], where: Path) -> str
     return "\n".join([first + (", but:" if lines else ""), *lines])
 
 
-def _coloured(row: Row) -> str:
-    colour = COLOURS.get(Verdict(row.verdict), "dim")
+def _coloured(row: ClaimRow) -> str:
+    colour = COLOURS.get(ClaimVerdict(row.verdict), "dim")
     return f"[{colour}]{row.verdict}[/{colour}]" + (f", {row.size}" if row.size and row.rule != "exact" else "")
 
 

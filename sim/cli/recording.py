@@ -40,7 +40,7 @@ def evaluate(
     save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
 ) -> None:
     """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
-    from sortie.perception.evaluation.condition import Condition
+    from sortie.perception.evaluation.condition import Sharing
     from sortie.perception.evaluation.matched import FLOOR
     from sortie.perception.recordings.instrument import evaluate_recording
 
@@ -48,7 +48,7 @@ def evaluate(
     try:
         if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
             raise ValueError(f"tau is {tau:g}, must be {FLOOR:g} to 1")
-        asked = None if conditions is None else [Condition.parse(label) for label in conditions.split()]
+        asked = None if conditions is None else [Sharing.parse(label) for label in conditions.split()]
         with bars() as bar:
             found = evaluate_recording(
                 path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None

@@ -12,7 +12,7 @@ from sortie.sim.cli.console import out, stages, user_errors
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
 
 if TYPE_CHECKING:
-    from sortie.perception.study.measure import Row
+    from sortie.perception.study.measure import StudyRow
 
 study = typer.Typer(
     no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
@@ -52,11 +52,11 @@ def study_run(
     workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
 ) -> None:
     """Measure every network that has weights, and write the rows."""
-    from sortie.perception.study.measure import Row, to_table
+    from sortie.perception.study.measure import StudyRow, to_table
     from sortie.perception.study.plan import read_plan
     from sortie.perception.study.run import SHIPPED, measure
 
-    plan, rows = read_plan(), list[Row]()
+    plan, rows = read_plan(), list[StudyRow]()
     with user_errors(), stages() as progress:
         cores = workers or os.cpu_count() or 1
         for job, some in measure(
@@ -103,14 +103,14 @@ def study_report(
             section = report.short(plan, rows, link)
             put_between(readme, section, report.BEGIN, report.END)
             out.print(f"the study's sentences in [bold]{readme}[/bold] written")
-    for line in report.answers(plan, report.Found(rows)):
+    for line in report.answers(plan, report.StudyRows(rows)):
         out.print(line)
     if not drawn:
         out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
     out.print(f"kept in [bold]{out_dir}[/bold]")
 
 
-def _read_rows(path: Path) -> list[Row]:
+def _read_rows(path: Path) -> list[StudyRow]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -12,7 +12,7 @@ from sortie.sim.cli.console import out, stages, user_errors
 from sortie.sim.folders import ensure_files
 
 
-class Exchange(StrEnum):
+class ExchangeForm(StrEnum):
     rectified = "rectified"
     signed = "signed"
 
@@ -43,7 +43,9 @@ def train(
     cell_dropout: Annotated[float, typer.Option(help="Part of the links whose cells are thinned.", min=0, max=1)] = 0.0,
     unsent: Annotated[Unsent, typer.Option(help="What a dropped cell counts as in training.")] = Unsent.masked,
     fusion: Annotated[str, typer.Option(help="Fusion method, see `sortie list fusions`.")] = "disconet",
-    exchange: Annotated[Exchange, typer.Option(help="Features after or before the last ReLU.")] = Exchange.rectified,
+    exchange: Annotated[
+        ExchangeForm, typer.Option(help="Features after or before the last ReLU.")
+    ] = ExchangeForm.rectified,
     decoder: Annotated[Decoder, typer.Option(help="The head's trunk.")] = Decoder.shallow,
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,

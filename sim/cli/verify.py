@@ -19,12 +19,11 @@ from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import PLANE, Verdict, prove
+from sortie.policies.verification.proof import PLANE, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.reading.load import dump, loads
-from sortie.scenarios.schema import Policy as PolicySection
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.folders import RunError, write_text
@@ -145,7 +144,7 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
 
 
 def _counterexamples(
-    decide: Policy, section: PolicySection, checks: Sequence[Check], verdicts: Sequence[Verdict]
+    decide: Policy, section: PolicySection, checks: Sequence[Check], verdicts: Sequence[ProofVerdict]
 ) -> Iterator[tuple[str, FleetView, Scenario]]:
     """Of everything that failed and has one: what failed, the view and the scenario."""
     shown = functools.partial(replay_scenario, policy=section.name, params=section.params)

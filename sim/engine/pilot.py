@@ -29,8 +29,7 @@ from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
 from sortie.policies.verification.shield import MARK, checked, enforce
 from sortie.policies.verification.views import ViewError, from_json
-from sortie.scenarios.schema import Policy as PolicySection
-from sortie.scenarios.schema import PolicyChange
+from sortie.scenarios.schema import PolicyChange, PolicySection
 from sortie.sim.engine.world import at, with_frame
 from sortie.sim.results.record import DECISIONS_OF, Recorder
 
@@ -46,7 +45,7 @@ class Named(NamedTuple):
     """What it puts on every link and frame before payloads."""
 
 
-class Plan(NamedTuple):
+class PolicyPlan(NamedTuple):
     """What a scenario says of the policies, resolved and checked before anything flies."""
 
     first: Named
@@ -63,7 +62,7 @@ class Plan(NamedTuple):
         return any(viewpoint_of(policy.decide) is not None for policy in policies)
 
 
-def plan_of(section: PolicySection, first: Named | None = None) -> Plan:
+def plan_of(section: PolicySection, first: Named | None = None) -> PolicyPlan:
     """A scenario's policies; `first` flies instead of them all, with the scenario's invariants and shield.
 
     Raises:
@@ -83,7 +82,7 @@ def plan_of(section: PolicySection, first: Named | None = None) -> Plan:
     for k, (_, drone, view) in enumerate(replays):
         if view.ego != drone:
             raise PolicyError(f"policy.replays.{k}.view: its ego is {view.ego}, must be drone {drone}")
-    return Plan(first or named(section.name, section.params), changes, commands, rules, section.shield, replays)
+    return PolicyPlan(first or named(section.name, section.params), changes, commands, rules, section.shield, replays)
 
 
 def named(name: str, params: Mapping[str, object]) -> Named:
@@ -127,7 +126,7 @@ class Pilot:
     """One drone's policy in flight."""
 
     def __init__(
-        self, drone: int, plan: Plan, audit: Audit, wish: Callable[[int, Reposition | None], None] | None = None
+        self, drone: int, plan: PolicyPlan, audit: Audit, wish: Callable[[int, Reposition | None], None] | None = None
     ) -> None:
         """Args: `wish` takes where the drone asks to look from; None where no policy of the plan does."""
         self.drone, self.policy, self._wish = drone, plan.first, wish
@@ -238,7 +237,7 @@ class Pilot:
 
 
 def schedule_policies(
-    env: simpy.Environment, plan: Plan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
+    env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
 ) -> None:
     """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
     two changes at one instant the later in the list comes last."""

@@ -31,7 +31,7 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.mission import MissionPlan
-from sortie.sim.engine.pilot import Audit, Named, Pilot, Plan, named, plan_of, schedule_policies
+from sortie.sim.engine.pilot import Audit, Named, Pilot, PolicyPlan, named, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.transport import Ether
 from sortie.sim.engine.world import World, route_bounds
@@ -216,7 +216,7 @@ def _air_totals(air: Air) -> dict[str, float]:
     return {**counters, "medium_busy_fraction": air.utilisation}
 
 
-def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Plan]:
+def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, PolicyPlan]:
     """The policy's name in the record, and who decides when.
 
     The scenario's parameters and changes go with the scenario's own policy only; its invariants and shield with all.

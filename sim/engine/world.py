@@ -17,7 +17,7 @@ from sortie.fleet.agent import Agent, Platform, Task
 from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
-from sortie.fleet.flight.motion import Motion
+from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.perception.scene.scene_model import SceneModel
@@ -62,7 +62,7 @@ class World:
         self,
         env: simpy.Environment,
         scenario: Scenario,
-        motion: Motion,
+        motion: Trajectories,
         batteries: FleetBatteries,
         air: Air,
         scene: SceneModel,
@@ -118,7 +118,7 @@ class World:
                 if self.on_second is not None:
                     self.on_second(env.now)
 
-    def reroute(self, motion: Motion) -> None:
+    def reroute(self, motion: Trajectories) -> None:
         """From the frame that begins on the fleet flies another way; what was flown before must be the same."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
@@ -259,7 +259,7 @@ def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
     return scene.cars_near(capture.t_s, x_m, y_m, radius_m)
 
 
-def route_bounds(motion: Motion) -> tuple[float, float, float, float]:
+def route_bounds(motion: Trajectories) -> tuple[float, float, float, float]:
     """x_min, y_min, x_max, y_max of everything flown, ENU."""
     low = motion.position_m.min(axis=(0, 1))
     high = motion.position_m.max(axis=(0, 1))

@@ -33,7 +33,7 @@ from sortie.fleet.messages.wire import (
 )
 from sortie.perception.scene.traffic import TARGET_ID
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sortie.sim.export.topics import CONTEXT, Kind, Topic
+from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import replacing
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
@@ -179,7 +179,7 @@ def _messages(record: SortieRecord, make: SimpleNamespace, begin_ns: int) -> Ite
     for t_s, d in descriptors(record):
         yield Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, encode_descriptor(d))
     for t_s, order in directives(record):
-        topic = Topic(Kind.DIRECTIVE, order.source, order.destination)
+        topic = Topic(TopicKind.DIRECTIVE, order.source, order.destination)
         yield Message(t_s, topic.name, DIRECTIVE_NAME, encode_directive(order))
 
     def header(t_s: float, frame: str) -> Any:

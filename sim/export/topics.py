@@ -22,7 +22,7 @@ from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME
 BYTES_NAME = "std_msgs/msg/UInt8MultiArray"
 
 
-class Kind(StrEnum):
+class TopicKind(StrEnum):
     """What a topic carries."""
 
     CONTEXT = "context"
@@ -33,21 +33,21 @@ class Kind(StrEnum):
     @property
     def ros_type(self) -> str:
         """The ROS 2 name of its messages' type."""
-        return {Kind.CONTEXT: DESCRIPTOR_NAME, Kind.DIRECTIVE: DIRECTIVE_NAME}.get(self, BYTES_NAME)
+        return {TopicKind.CONTEXT: DESCRIPTOR_NAME, TopicKind.DIRECTIVE: DIRECTIVE_NAME}.get(self, BYTES_NAME)
 
     @property
     def reliable(self) -> bool:
         """Small things that must arrive go reliably, the frequent and the large best effort."""
-        return self in (Kind.DIRECTIVE, Kind.COMPACT)
+        return self in (TopicKind.DIRECTIVE, TopicKind.COMPACT)
 
 
-PAYLOADS = (Kind.FEATURES, Kind.COMPACT)
+PAYLOADS = (TopicKind.FEATURES, TopicKind.COMPACT)
 
 
 class Topic(NamedTuple):
     """One topic; a link's where it has a source and a destination."""
 
-    kind: Kind
+    kind: TopicKind
     source: int | None = None
     destination: int | None = None
 
@@ -64,7 +64,7 @@ class Topic(NamedTuple):
         return f"rt{self.name}"
 
 
-CONTEXT = Topic(Kind.CONTEXT)
+CONTEXT = Topic(TopicKind.CONTEXT)
 
 
 def links(drones: int) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ from collections import Counter
 
 from sortie.fleet.messages.auth import Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
-from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic, links
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind, links
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
 from sortie.sim.live.messages import unpack_bytes
 from sortie.sim.live.node import opened
@@ -22,8 +22,8 @@ class Bench:
 
     def __init__(self, domain: int, drones: int) -> None:
         self._bus = Bus(domain)
-        depths = {Kind.CONTEXT: MAX_DEPTH, Kind.DIRECTIVE: MAX_DEPTH}
-        topics = [CONTEXT, *(Topic(kind, *link) for link in links(drones) for kind in (Kind.DIRECTIVE, *PAYLOADS))]
+        depths = {TopicKind.CONTEXT: MAX_DEPTH, TopicKind.DIRECTIVE: MAX_DEPTH}
+        topics = [CONTEXT, *(Topic(kind, *link) for link in links(drones) for kind in (TopicKind.DIRECTIVE, *PAYLOADS))]
         self._readers = [self._bus.reader(topic, depths.get(topic.kind, PAYLOAD_DEPTH)) for topic in topics]
         self.counts: dict[Topic, Count] = dict.fromkeys(topics, Count())
         """By topic: CDR as serialised, payloads without what their message puts in front of them."""
@@ -52,7 +52,7 @@ class Bench:
         for reader in self._readers:
             self._take(reader)
 
-    def of(self, kind: Kind) -> Count:
+    def of(self, kind: TopicKind) -> Count:
         """All topics of a kind together."""
         of_kind = [c for topic, c in self.counts.items() if topic.kind == kind]
         return Count(sum(c.samples for c in of_kind), sum(c.bytes for c in of_kind))
@@ -61,13 +61,13 @@ class Bench:
         topic = reader.topic
         for cdr in reader.take():
             self.counts[topic] = self.counts[topic].plus(_size(cdr, topic.kind))
-            if topic.kind == Kind.CONTEXT:
+            if topic.kind == TopicKind.CONTEXT:
                 descriptor = opened(cdr)
                 if isinstance(descriptor, Opened):
                     self.heard[descriptor.descriptor.agent_id] += 1
 
 
-def _size(cdr: bytes, kind: Kind) -> int:
+def _size(cdr: bytes, kind: TopicKind) -> int:
     """As `Bench.counts` counts; what is no payload counts as it came."""
     try:
         return len(unpack_bytes(cdr)) if kind in PAYLOADS else len(cdr)
@@ -75,7 +75,7 @@ def _size(cdr: bytes, kind: Kind) -> int:
         return len(cdr)
 
 
-class Fleet:
+class FleetReports:
     """What the drones reported, put together."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from sortie.sim.export.topics import Kind, Topic
+from sortie.sim.export.topics import Topic, TopicKind
 from sortie.sim.live.messages import dds_type
 
 LOOPBACK = """\
@@ -110,7 +110,7 @@ def _domain(number: int) -> Domain | None:
         return None
 
 
-def _qos(kind: Kind, depth: int) -> Qos:
+def _qos(kind: TopicKind, depth: int) -> Qos:
     """ROS 2 speaks plain CDR (XCDR1); readers and writers agree on reliability, depth is each one's own."""
     return Qos(
         Policy.Reliability.Reliable(max_blocking_time=0) if kind.reliable else Policy.Reliability.BestEffort,

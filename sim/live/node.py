@@ -27,10 +27,10 @@ from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
 from sortie.scenarios.streams import stream
-from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
-from sortie.sim.live.reports import Count, HealthChange, News, Order, Report
+from sortie.sim.live.reports import Count, HealthChange, NewDirective, News, Report
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
@@ -41,9 +41,9 @@ class Link:
 
     def __init__(self, bus: Bus, me: int, peer: int) -> None:
         self.peer = peer
-        self.directive = bus.writer(Topic(Kind.DIRECTIVE, me, peer))
+        self.directive = bus.writer(Topic(TopicKind.DIRECTIVE, me, peer))
         self.payload = {kind: bus.writer(Topic(kind, me, peer)) for kind in PAYLOADS}
-        self.ordered = bus.reader(Topic(Kind.DIRECTIVE, me, peer))
+        self.ordered = bus.reader(Topic(TopicKind.DIRECTIVE, me, peer))
         self.incoming = [bus.reader(Topic(kind, peer, me)) for kind in PAYLOADS]
 
     @property
@@ -93,7 +93,7 @@ class LiveNode:
         self._published = self._heard = self._lost = 0
         self._late_s = 0.0
         self._refused: Counter[str] = Counter()
-        self._sent = dict.fromkeys((Kind.DIRECTIVE, *PAYLOADS), Count())
+        self._sent = dict.fromkeys((TopicKind.DIRECTIVE, *PAYLOADS), Count())
         self._received = dict.fromkeys(PAYLOADS, Count())
         self._new = News()
         self._began_cpu_s = 0.0
@@ -161,10 +161,10 @@ class LiveNode:
         stamp_ns = round((capture.t_s + self.agent.clock_skew_s) * 1e9)
         header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)
         content = (header + encode_directive(directive)).ljust(payload.size_bytes, b"\0")
-        self._write(peer, Kind.COMPACT if payload.reliable else Kind.FEATURES, content)
+        self._write(peer, TopicKind.COMPACT if payload.reliable else TopicKind.FEATURES, content)
 
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
-        self._write(peer, Kind.FEATURES, bytes(size_bytes))
+        self._write(peer, TopicKind.FEATURES, bytes(size_bytes))
 
     # --- sortie.fleet.agent.AgentLog --------------------------------------------------------------------
 
@@ -174,7 +174,7 @@ class LiveNode:
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
         rung = enforced.representation.name.lower()
-        self._new.orders.append(Order(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
+        self._new.orders.append(NewDirective(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
 
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:
         """Trust is off here."""
@@ -231,10 +231,10 @@ class LiveNode:
         self._links[peer] = Link(self._bus, self.drone, peer)
 
     def _direct(self, directive: Directive) -> None:
-        self._sent[Kind.DIRECTIVE] = self._sent[Kind.DIRECTIVE].plus(DIRECTIVE_BYTES)
+        self._sent[TopicKind.DIRECTIVE] = self._sent[TopicKind.DIRECTIVE].plus(DIRECTIVE_BYTES)
         self._links[directive.destination].directive.write(encode_directive(directive))
 
-    def _write(self, peer: int, kind: Kind, content: bytes) -> None:
+    def _write(self, peer: int, kind: TopicKind, content: bytes) -> None:
         self._sent[kind] = self._sent[kind].plus(len(content))
         self._links[peer].payload[kind].write(pack_bytes(content))
 

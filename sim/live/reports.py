@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from sortie.fleet.staleness import LinkHealth
-from sortie.sim.export.topics import Kind
+from sortie.sim.export.topics import TopicKind
 
 
 class HealthChange(NamedTuple):
@@ -20,7 +20,7 @@ class HealthChange(NamedTuple):
     """Of the peer's latest descriptor."""
 
 
-class Order(NamedTuple):
+class NewDirective(NamedTuple):
     """A directive that a policy node published for the first time: what a link carries changed."""
 
     t_s: float
@@ -59,7 +59,7 @@ class News:
     data_age_s: list[float] = field(default_factory=list)
     """Age of each payload's capture when it came in."""
     health: list[HealthChange] = field(default_factory=list)
-    orders: list[Order] = field(default_factory=list)
+    orders: list[NewDirective] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
 
 
@@ -80,8 +80,8 @@ class Report:
     """Descriptors, directives and payloads that were not what they claimed to be, by reason."""
     late_s: float
     """From a frame's begin until its descriptor was published, at most; a tenth of a frame is meant."""
-    sent: dict[Kind, Count]
-    received: dict[Kind, Count]
+    sent: dict[TopicKind, Count]
+    received: dict[TopicKind, Count]
     new: News
 
 

@@ -12,9 +12,9 @@ from sortie.fleet.staleness import LinkHealth
 from sortie.perception.evaluation.claims import OVERHEAD
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.pilot import named
-from sortie.sim.export.topics import CONTEXT, PAYLOADS, Kind, Topic
-from sortie.sim.live.bench import Bench, Fleet
-from sortie.sim.live.reports import HealthChange, Notice, Order
+from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
+from sortie.sim.live.bench import Bench, FleetReports
+from sortie.sim.live.reports import HealthChange, NewDirective, Notice
 from sortie.sim.studies.plane_cost import machine
 
 PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
@@ -103,7 +103,7 @@ class LiveResult:
     noticed: list[Noticed]
     health: list[HealthChange]
     """Fresh, degraded, detached: by drone and peer, as time goes."""
-    orders: list[Order]
+    orders: list[NewDirective]
     notices: list[Notice]
 
     def as_json(self) -> dict[str, Any]:
@@ -118,7 +118,7 @@ class LiveResult:
 def summary(
     scenario: Scenario,
     bench: Bench,
-    fleet: Fleet,
+    fleet: FleetReports,
     *,
     begin_s: float,
     flown_s: float,
@@ -130,7 +130,7 @@ def summary(
     decide_ms = np.array([ns for new in fleet.news for ns in new.decide_ns]) / 1e6
     data_age_ms = np.array([s for new in fleet.news for s in new.data_age_s]) * 1e3
     health = sorted(c for new in fleet.news for c in new.health)
-    context, directives = bench.of(Kind.CONTEXT), bench.of(Kind.DIRECTIVE)
+    context, directives = bench.of(TopicKind.CONTEXT), bench.of(TopicKind.DIRECTIVE)
     data_bytes = sum(bench.of(kind).bytes for kind in PAYLOADS)
     context_bytes = context.bytes + directives.bytes
     each = [
@@ -199,12 +199,12 @@ def _percentile(values: np.ndarray, percent: float) -> float | None:
     return float(np.percentile(values, percent)) if len(values) else None
 
 
-def _topics(bench: Bench, fleet: Fleet, flown_s: float) -> Iterator[TopicRate]:
-    for kind in Kind:
-        topic = CONTEXT if kind == Kind.CONTEXT else Topic(kind, 0, 1)
+def _topics(bench: Bench, fleet: FleetReports, flown_s: float) -> Iterator[TopicRate]:
+    for kind in TopicKind:
+        topic = CONTEXT if kind == TopicKind.CONTEXT else Topic(kind, 0, 1)
         name = topic.name.replace("drone_0", "drone_*").replace("drone_1", "drone_*")
         count = bench.of(kind)
-        if kind == Kind.CONTEXT:
+        if kind == TopicKind.CONTEXT:
             sent = sum(r.published for r in fleet.last.values())
         else:
             sent = sum(r.sent[kind].samples for r in fleet.last.values())

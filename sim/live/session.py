@@ -16,7 +16,7 @@ from multiprocessing.process import BaseProcess
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError
-from sortie.sim.live.bench import Bench, Fleet
+from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.context import traces
 from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
@@ -77,7 +77,7 @@ def fly_live(
         scenario.model_copy(update={"duration_s": end_s}), lambda t_s: tell("flying for the context", t_s, end_s)
     )
     drones = scenario.fleet.drones
-    bench, fleet = Bench(domain, drones), Fleet()
+    bench, fleet = Bench(domain, drones), FleetReports()
     flown: list[_Drone] = []
     lost: list[Lost] = []
     t_s = begin_s
@@ -194,7 +194,7 @@ def _meet(flown: list[_Drone], tell: Progress) -> None:
     tell("starting the processes", len(flown), len(flown))
 
 
-def _collect(flown: list[_Drone], fleet: Fleet, lost: list[Lost], t_s: float) -> None:
+def _collect(flown: list[_Drone], fleet: FleetReports, lost: list[Lost], t_s: float) -> None:
     """Take every report that is there; a pipe that closes before its drone came home is a drone that was lost."""
     for number, drone in enumerate(flown):
         while not drone.over and drone.pipe.poll():

@@ -26,7 +26,7 @@ _CROSS = np.stack([[-d, d] for d in _DIAGONALS])
 """The four diagonals of a cube [strip, end, 3]: a cross from wherever one looks."""
 
 
-class Links:
+class LinkArrows:
     """Draws the links of one sortie; `begin` once, then `add` with the tables in order of time."""
 
     def __init__(self, canvas: Canvas, n: int, rate_hz: float) -> None:

@@ -51,7 +51,7 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class DrawnPayload:
     """A feature payload that reached its receiver."""
 
     t_s: float
@@ -61,14 +61,14 @@ class Arrival:
     """Of its bytes that arrived; below 1 where tiles were lost."""
 
 
-class Received:
+class ReceivedCells:
     """Draws what was received in one sortie; `begin` once, then `add` with the tables in order of time."""
 
     def __init__(self, canvas: Canvas, n: int) -> None:
         self._canvas, self._n = canvas, n
         self._next_s = STEP_S
         self._regions: dict[Link, list[tuple[float, Disc | None]]] = defaultdict(list)
-        self._arrivals: dict[Link, deque[Arrival]] = defaultdict(deque)
+        self._arrivals: dict[Link, deque[DrawnPayload]] = defaultdict(deque)
         self._pose_t_s: Floats = np.zeros(0)
         self._poses: Floats = np.zeros((0, n, 3))
         self._shown: set[str] = set()
@@ -112,7 +112,7 @@ class Received:
             if what == "features" and fate in ("delivered", "partial"):
                 region = self._region(sender, receiver, sent)
                 share = arrived / size if fate == "partial" else 1.0
-                self._arrivals[receiver, sender].append(Arrival(done, captured, region, share))
+                self._arrivals[receiver, sender].append(DrawnPayload(done, captured, region, share))
 
     def _region(self, sender: int, receiver: int, t_s: float) -> Disc | None:
         """The region of the directive in force when a payload was handed to the radio."""
@@ -124,7 +124,7 @@ class Received:
         waiting, path = self._arrivals[ego, peer], f"world/received/{ego}/{peer}"
         regions: list[Floats] = []
         squares: list[Floats] = []
-        latest: Arrival | None = None
+        latest: DrawnPayload | None = None
         for step_s in steps:
             while waiting and waiting[0].t_s < step_s:
                 latest = waiting.popleft()

@@ -24,8 +24,8 @@ from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
-from sortie.sim.playback.links import Links
-from sortie.sim.playback.received import Received
+from sortie.sim.playback.links import LinkArrows
+from sortie.sim.playback.received import ReceivedCells
 from sortie.sim.results.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
@@ -43,7 +43,7 @@ class Drawing:
         self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
         self._rate_hz, self._has_target = scenario.context.rate_hz, scenario.mission.target is not None
         n = self._n
-        self._links, self._received = Links(canvas, n, scenario.context.rate_hz), Received(canvas, n)
+        self._links, self._received = LinkArrows(canvas, n, scenario.context.rate_hz), ReceivedCells(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
         self._frames = 0
         self._resting: dict[int, Floats] = {}

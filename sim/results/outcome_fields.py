@@ -77,7 +77,7 @@ Transition = TypedDict(
 )
 
 
-class Phase(TypedDict):
+class PhaseOutcome(TypedDict):
     phase: Annotated[str, "The mission's phase."]
     begin_s: Annotated[float, "From when."]
     end_s: Annotated[float, "Until when, exclusive."]
@@ -126,7 +126,7 @@ class Outcome(TypedDict):
         float | None, "Changes of what a link carries, per link and minute; links that change alike count each."
     ]
     transitions: Annotated[list[Transition], "Each change of what links carry."]
-    phases: Annotated[list[Phase], "By mission phase."]
+    phases: Annotated[list[PhaseOutcome], "By mission phase."]
     distrusted_by: Annotated[
         dict[str, int], "For each drone that anyone came to doubt (`fleet/trust.py`), how many did."
     ]

@@ -13,7 +13,7 @@ from sortie.perception.metrics.ap import average_precision
 from sortie.policies.registry import POLICIES, parameters, resolve
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.schema.conditions import Context, Contexts
+from sortie.scenarios.schema.conditions import Condition, Contexts
 from sortie.sim.engine.sortie import DetectorOf, run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import matched, outcome
@@ -81,7 +81,7 @@ def fly_all(
     return cells
 
 
-def scenario_of(contexts: Contexts, context: Context, policy: str) -> Scenario:
+def scenario_of(contexts: Contexts, context: Condition, policy: str) -> Scenario:
     """A context's scenario under a policy, within the context's budget."""
     scenario = load(contexts.base, [*contexts.set, *context.set, f"policy.name={policy}", "policy.params={}"])
     function = resolve(policy)
@@ -91,7 +91,7 @@ def scenario_of(contexts: Contexts, context: Context, policy: str) -> Scenario:
 
 
 def _fly(
-    policy: str, context: Context, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorOf
+    policy: str, context: Condition, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorOf
 ) -> Cell:
     frames, results = [], []
     for scenario, seed in zip(scenarios, seeds, strict=True):

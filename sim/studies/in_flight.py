@@ -17,7 +17,7 @@ from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.reading.load import load, load_contexts
 from sortie.scenarios.schema import Perception, Scenario
-from sortie.scenarios.schema.conditions import Context, Contexts
+from sortie.scenarios.schema.conditions import Condition, Contexts
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import both_matched
 from sortie.sim.studies.conditions import paired_interval, scenario_of
@@ -28,7 +28,7 @@ TOWNS_APART = 1000
 REGIONS = {"full_scene": "everywhere", "mission": "in the mission's disc"}
 
 
-class Asked:
+class BothDetectors:
     """The torch detector's boxes and the surrogate's guess of how many a drone would send, so that traffic is the surrogate's."""
 
     def __init__(self, torch: Detector, surrogate: Detector) -> None:
@@ -37,7 +37,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class ConditionAp:
     """AP@0.5 of one policy in one region of one context, by both."""
 
     policy: str
@@ -55,7 +55,7 @@ def flights(
     policies: Sequence[str] = POLICIES,
     progress: Callable[[str, int, int], None] | None = None,
     towns: int = 1,
-) -> Iterator[Level]:
+) -> Iterator[ConditionAp]:
     """Fly a scenario, or every context of a set with its first seed, under some policies.
 
     Args:
@@ -68,7 +68,7 @@ def flights(
     """
     contexts = load_contexts(name)
     if contexts is None:
-        contexts = Contexts(base=name, seeds=(load(name).seed,), contexts=(Context(name="sortie", rho=1.0),))
+        contexts = Contexts(base=name, seeds=(load(name).seed,), contexts=(Condition(name="sortie", rho=1.0),))
         planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
     else:
         planned = [[(p, scenario_of(contexts, c, p)) for p in policies] for c in contexts.contexts]
@@ -89,7 +89,7 @@ def flights(
         for (policy, region), (theirs, ours) in matched.items():
             torch = average_precision(theirs)
             if not np.isnan(torch):  # there is such a region, and there are cars in it
-                yield Level(policy, context.name, region, torch, average_precision(ours))
+                yield ConditionAp(policy, context.name, region, torch, average_precision(ours))
     if progress is not None:
         progress(f"{name} by both detectors", count, count)
 
@@ -119,7 +119,7 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
         asked = scene.made_of, config, seed, replication
         if not last or last[0][0] != asked:
             last[:] = [(asked, TorchDetector(scene, config, seed, weights, replication))]
-        return Asked(last[0][1], ours(scene, config, seed, replication))
+        return BothDetectors(last[0][1], ours(scene, config, seed, replication))
 
     return make
 
@@ -134,7 +134,7 @@ def _surrogate(calibration: Path | None) -> Constructor:
 
 
 @dataclass(frozen=True, slots=True)
-class Mean:
+class ConditionMean:
     """The mean over contexts of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, contexts
     resampled in pairs, of the torch detector's and of the difference; NaN for a single one."""
 
@@ -145,7 +145,7 @@ class Mean:
     error: tuple[float, float, float]
 
 
-def means(levels: Sequence[Level]) -> Iterator[Mean]:
+def means(levels: Sequence[ConditionAp]) -> Iterator[ConditionMean]:
     """Of every policy, then of every policy against every earlier one."""
     policies = list(dict.fromkeys(v.policy for v in levels))
     for region in REGIONS:
@@ -162,11 +162,11 @@ def means(levels: Sequence[Level]) -> Iterator[Mean]:
                     yield _mean(f"{p} − {earlier}", region, its - theirs)
 
 
-def _table(levels: Iterable[Level]) -> np.ndarray:
+def _table(levels: Iterable[ConditionAp]) -> np.ndarray:
     return np.array([(v.torch, v.surrogate) for v in levels])
 
 
-def _mean(what: str, region: str, both: np.ndarray) -> Mean:
+def _mean(what: str, region: str, both: np.ndarray) -> ConditionMean:
     error = both[:, 1] - both[:, 0]
     torch, off = ((float(v.mean()), *paired_interval(v)) for v in (both[:, 0], error))
-    return Mean(what, region, torch, float(both[:, 1].mean()), off)
+    return ConditionMean(what, region, torch, float(both[:, 1].mean()), off)

@@ -16,8 +16,8 @@ from sortie.perception.evaluation import figure_frame, figures, report, rows
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.paper import bench_frames, camera_views, measure
 from sortie.perception.evaluation.picture import PAPER_BUDGETS, Picture, picture
-from sortie.perception.evaluation.results import Asked
-from sortie.perception.evaluation.rows import Point, Row
+from sortie.perception.evaluation.results import TableSettings
+from sortie.perception.evaluation.rows import ClaimRow, Point
 from sortie.perception.evaluation.sensitivity import Varied, sensitivity
 from sortie.sim.engine.sortie import VERSION
 from sortie.sim.folders import ensure_folder, put_between, replacing
@@ -37,11 +37,11 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class PaperSettings:
     """One making of the report."""
 
     weights: Path
-    asked: Asked
+    asked: TableSettings
     frames: int | None = None
     """None: all of the test split."""
     seed: int = 0
@@ -55,17 +55,17 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class PaperResult:
     """What the report is made of."""
 
-    rows: Sequence[Row]
+    rows: Sequence[ClaimRow]
     points: Sequence[Point]
     varied: Sequence[Varied]
     facts: dict[str, Any]
     picture: Picture | None
 
 
-def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None) -> Result:
+def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done, of: None) -> PaperResult:
     """Measure everything; what is finished is kept under `work`, so that a run that was cut off goes on.
 
     Raises:
@@ -107,10 +107,12 @@ def make(job: Job, work: Path, progress: Progress = lambda stage, done, of: None
         "wall_s": round(time.perf_counter() - wall_s, 1),
         "machine": machine(),
     }
-    return Result(table, points, varied, facts, seen)
+    return PaperResult(table, points, varied, facts, seen)
 
 
-def frame_picture(job: Job, work: Path, frame: int, ego: int = 0, budgets: Sequence[float] = PAPER_BUDGETS) -> Picture:
+def frame_picture(
+    job: PaperSettings, work: Path, frame: int, ego: int = 0, budgets: Sequence[float] = PAPER_BUDGETS
+) -> Picture:
     """One frame of the test split as the paper's data figure has it.
 
     Raises:
@@ -131,7 +133,7 @@ def ensure_writable(path: Path) -> None:
     ensure_folder(path, TABLE, "report", {REPORT, TABLE, POINTS, VARIED, *FIGURES})
 
 
-def write(result: Result, path: Path) -> list[Path]:
+def write(result: PaperResult, path: Path) -> list[Path]:
     """Write the report's folder whole, an older one replaced; returns its files. Without matplotlib, no figures.
 
     Raises:
@@ -148,7 +150,7 @@ def write(result: Result, path: Path) -> list[Path]:
     return sorted(path.iterdir())
 
 
-def put_into_readme(readme: Path, result_rows: Sequence[Row], facts: dict[str, Any], link: str) -> None:
+def put_into_readme(readme: Path, result_rows: Sequence[ClaimRow], facts: dict[str, Any], link: str) -> None:
     """Write the README's section anew, under a temporary name first.
 
     Raises:
@@ -157,7 +159,7 @@ def put_into_readme(readme: Path, result_rows: Sequence[Row], facts: dict[str, A
     put_between(readme, report.short(result_rows, facts, link), report.BEGIN, report.END)
 
 
-def _draw(result: Result, folder: Path) -> list[str]:
+def _draw(result: PaperResult, folder: Path) -> list[str]:
     drawings = {
         "frontier.png": figures.frontier(result.points),
         "peers.png": figures.peer_selection(result.points),

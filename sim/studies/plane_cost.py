@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.fleet.messages.wire import descriptor_bytes, encode_directive
-from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.policies.contract import Directive, FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load
@@ -32,7 +32,7 @@ PHASE_CHANGE_S, LINK_DROP_S, TIRED, CUT_OFF = 45.0, 60.0, 1, 2
 LADDER = [("features", 10.0), ("features", 5.0), ("detections", 2.0)]
 
 
-def measure_plane(progress: Callable[[float], None] | None = None) -> dict[str, Measured]:
+def measure_plane(progress: Callable[[float], None] | None = None) -> dict[str, MeasuredValue]:
     """Fly the replay once without a detector (traffic needs none) and measure everything that it answers."""
     scenario = load(SCENARIO, ["perception.detector=none"])
     views: list[FleetView] = []
@@ -46,7 +46,7 @@ def measure_plane(progress: Callable[[float], None] | None = None) -> dict[str, 
     return {**rates(record), **transitions(record), **latency(decide, views, scenario)}
 
 
-def rates(record: SortieRecord) -> dict[str, Measured]:
+def rates(record: SortieRecord) -> dict[str, MeasuredValue]:
     """Bytes a second of both planes: as the paper counts them with this project's encoders, and as flown."""
     scenario, sent = record.scenario, record.tables["transmissions"]
     counted = PAPER_AGENTS * PAPER_HZ * descriptor_bytes(5) + PAPER_DIRECTIVES_HZ * len(
@@ -60,29 +60,29 @@ def rates(record: SortieRecord) -> dict[str, Measured]:
     signed = ", 28 B of authentication each" if scenario.context.authentication else ""
     flown = f"{scenario.fleet.drones} drones{signed}; directives are sent when they change"
     return {
-        "descriptor_bytes": Measured(float(descriptor_bytes(5)), note="encoded, four peers"),
-        "counted_kb_per_s": Measured(counted / 1e3, note="encoded sizes at the paper's rates"),
-        "context_kb_per_s": Measured(context / scenario.duration_s / 1e3, note=flown),
-        "data_mb_per_s": Measured(
+        "descriptor_bytes": MeasuredValue(float(descriptor_bytes(5)), note="encoded, four peers"),
+        "counted_kb_per_s": MeasuredValue(counted / 1e3, note="encoded sizes at the paper's rates"),
+        "context_kb_per_s": MeasuredValue(context / scenario.duration_s / 1e3, note=flown),
+        "data_mb_per_s": MeasuredValue(
             data / scenario.duration_s / 1e6,
             note=f"offered to the radio; {early:.0f} MB/s before the region. The paper's gates publish on one machine",
         ),
-        "context_percent": Measured(100.0 * context / data, note="of the data plane as offered"),
+        "context_percent": MeasuredValue(100.0 * context / data, note="of the data plane as offered"),
     }
 
 
-def transitions(record: SortieRecord) -> dict[str, Measured]:
+def transitions(record: SortieRecord) -> dict[str, MeasuredValue]:
     """What the phase change, the battery and the link drop did, from the record's tables."""
     sent, directives = record.tables["transmissions"], record.tables["directives"]
     features = sent.filter(pc.equal(sent["representation"], "features"))
     before = _mean_cells(features, 0.0, PHASE_CHANGE_S)
     after = _mean_cells(features, PHASE_CHANGE_S + 1.0, record.scenario.duration_s)
     return {
-        "roi_shrinks": Measured(before / after, note=f"{before:.0f} cells a payload, then {after:.0f}"),
-        "battery_rungs": Measured(
+        "roi_shrinks": MeasuredValue(before / after, note=f"{before:.0f} cells a payload, then {after:.0f}"),
+        "battery_rungs": MeasuredValue(
             float(rungs_met(_of(directives, TIRED))), note="features at 10 and 5 Hz, detections at 2 Hz"
         ),
-        "link_drop_s": Measured(
+        "link_drop_s": MeasuredValue(
             without_features_s(_of(directives, CUT_OFF), LINK_DROP_S), note="the last of its links"
         ),
     }
@@ -109,7 +109,7 @@ def without_features_s(directives: pa.Table, since_s: float) -> float:
     return float("nan") if not carries or "features" in carries.values() else max(0.0, last_s - since_s)
 
 
-def latency(decide: Policy, views: Sequence[FleetView], scenario: Scenario) -> dict[str, Measured]:
+def latency(decide: Policy, views: Sequence[FleetView], scenario: Scenario) -> dict[str, MeasuredValue]:
     """CPU time of one tick of the policy for the whole fleet, over the views that were flown.
 
     The paper's policy node decides for all drones at each tick; here every drone decides for itself, so that a tick
@@ -132,14 +132,14 @@ def latency(decide: Policy, views: Sequence[FleetView], scenario: Scenario) -> d
     p50, p99 = (float(v) for v in np.percentile(took_ns, [50, 99]) / 1e6)
     note = f"CPU time of {n} drones' decisions, {len(ticks)} ticks, {machine()}"
     return {
-        "policy_ms_p50": Measured(p50, note=note),
-        "policy_ms_p99": Measured(p99, note=note),
-        "deadline_over_p50": Measured(PAPER_DEADLINE_MS / p50),
-        **({"x86_policy_ms_p50": Measured(p50, note=note)} if _on_x86() else {}),
+        "policy_ms_p50": MeasuredValue(p50, note=note),
+        "policy_ms_p99": MeasuredValue(p99, note=note),
+        "deadline_over_p50": MeasuredValue(PAPER_DEADLINE_MS / p50),
+        **({"x86_policy_ms_p50": MeasuredValue(p50, note=note)} if _on_x86() else {}),
     }
 
 
-def measured_live(path: Path) -> dict[str, Measured]:
+def measured_live(path: Path) -> dict[str, MeasuredValue]:
     """What a live flight measured of the claims that take real processes on a real bus; the file is `sortie live --out`'s.
 
     Raises:
@@ -150,10 +150,10 @@ def measured_live(path: Path) -> dict[str, Measured]:
         note = (
             f"{told['drones']} processes on Cyclone DDS, {told['policy']}, {told['flown_s']:.0f} s, {told['machine']}"
         )
-        core = Measured(
+        core = MeasuredValue(
             float(told["drones_cpu_percent"]), note=f"{note}; the bench took {told['bench_cpu_percent']:.0f} %"
         )
-        data = Measured(float(told["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
+        data = MeasuredValue(float(told["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from error
     except (KeyError, TypeError, ValueError) as error:

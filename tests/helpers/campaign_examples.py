@@ -11,9 +11,9 @@ import pyarrow as pa
 import pytest
 
 from sortie.scenarios.reading.campaign import load_campaign
-from sortie.sim.campaign.plan import Plan, make_plan
-from sortie.sim.campaign.rows import Rows
-from sortie.sim.campaign.work import Result, Task, task_key
+from sortie.sim.campaign.plan import CampaignPlan, make_plan
+from sortie.sim.campaign.rows import CampaignRows
+from sortie.sim.campaign.work import RunResult, Task, task_key
 
 CLUSTER = pytest.mark.filterwarnings(
     "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
@@ -48,7 +48,7 @@ def write(folder: Path, text: str = CAMPAIGN, base: str = BASE) -> Path:
     return path
 
 
-def plan(folder: Path, text: str = CAMPAIGN, base: str = BASE) -> Plan:
+def plan(folder: Path, text: str = CAMPAIGN, base: str = BASE) -> CampaignPlan:
     """The plan of a campaign."""
     return make_plan(load_campaign(write(folder, text, base)))
 
@@ -66,7 +66,7 @@ class Pretended:
     def __init__(self, order: Sequence[int] | None = None, stop_after: int | None = None) -> None:
         self.order, self.stop_after, self.flown = order, stop_after, list[int]()
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         todo = list(tasks)
         if self.order is not None:
             todo = [todo[i] for i in self.order if i < len(todo)]
@@ -77,18 +77,18 @@ class Pretended:
             yield [pretend(run, task, code)]
 
 
-def pretend(run: int, task: str, code: str) -> Result:
+def pretend(run: int, task: str, code: str) -> RunResult:
     """A row made of the task."""
     asked, key = json.loads(task), task_key(task, code)
     scenario = asked["scenario"]
     value = scenario["fleet"]["battery"]["initial_soc"] + 10 * (scenario["policy"]["name"] == "worked")
-    return Result(run, key, "done", "", key[:16], (value, float(asked["replication"])))
+    return RunResult(run, key, "done", "", key[:16], (value, float(asked["replication"])))
 
 
 __all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "table_bytes", "write"]
 
 
-def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> Rows:
+def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> CampaignRows:
     """A campaign whose metric is a function of (fields' values, policy number)."""
     p = plan(tmp_path, text)
     columns: dict[str, list[object]] = {}
@@ -100,4 +100,4 @@ def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_
         for name, v in row.items():
             columns.setdefault(name, []).append(v)
     table = pa.table(columns)
-    return Rows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))
+    return CampaignRows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))

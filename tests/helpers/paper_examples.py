@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import Condition
+from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.contract import Exchange, Floats
 from sortie.perception.evaluation.measures import Region
-from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.perception.geometry import CELLS, FULL
 
 DRAWS = 400
@@ -23,28 +23,28 @@ class Made:
     """Scores by label (`best-2@0.02`) and region; what is not written down is `default(condition, region)`."""
 
     known: Mapping[tuple[str, str], float]
-    default: Callable[[Condition, str], float] = lambda condition, region: 0.3
+    default: Callable[[Sharing, str], float] = lambda condition, region: 0.3
     noise: float = 0.005
-    bytes_of: Callable[[Condition], float] = lambda condition: 1e6 * condition.rho
+    bytes_of: Callable[[Sharing], float] = lambda condition: 1e6 * condition.rho
 
-    def ap(self, condition: Condition, region: Region) -> float:
+    def ap(self, condition: Sharing, region: Region) -> float:
         return self.known.get((condition.label, region), self.default(condition, region))
 
-    def draws(self, condition: Condition, region: Region) -> NDArray[np.float64]:
+    def draws(self, condition: Sharing, region: Region) -> NDArray[np.float64]:
         return self.ap(condition, region) + self.noise * self._rng(condition, region).standard_normal(DRAWS)
 
-    def halves(self, condition: Condition, region: Region, *, resampled: bool) -> NDArray[np.float64]:
+    def halves(self, condition: Sharing, region: Region, *, resampled: bool) -> NDArray[np.float64]:
         wide = 2.0 * self.noise if resampled else self.noise
         return self.ap(condition, region) + wide * self._rng(condition, region).standard_normal((DRAWS, 2))
 
-    def fleet_frame_bytes(self, condition: Condition) -> Sequence[float]:
+    def fleet_frame_bytes(self, condition: Sharing) -> Sequence[float]:
         return [self.bytes_of(condition)] * 3
 
-    def _rng(self, condition: Condition, region: str) -> np.random.Generator:
+    def _rng(self, condition: Sharing, region: str) -> np.random.Generator:
         return np.random.default_rng(zlib.crc32(f"{replace(condition, unsent='zero').label}/{region}".encode()))
 
 
-def papers_world(condition: Condition, region: str) -> float:
+def papers_world(condition: Sharing, region: str) -> float:
     """APs as the paper prints them, the rest filled in by its sentences."""
     if region == "mission":
         special = {
@@ -61,9 +61,9 @@ def papers_world(condition: Condition, region: str) -> float:
 
 
 ELSEWHERE = {
-    "descriptor_bytes": Measured(180.0),
-    "policy_ms_p50": Measured(0.08, note="a machine"),
-    "x86_policy_ms_p50": Measured(0.08, note="a machine"),
+    "descriptor_bytes": MeasuredValue(180.0),
+    "policy_ms_p50": MeasuredValue(0.08, note="a machine"),
+    "x86_policy_ms_p50": MeasuredValue(0.08, note="a machine"),
 }
 FACTS = {
     "command": "sortie paper", "frames": 3, "scenes": 3, "seed": 0, "weights": "made", "fingerprint": "0123456789abcdef",

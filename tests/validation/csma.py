@@ -37,7 +37,7 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class CsmaRun:
     """What came of it, over `elapsed_s`."""
 
     elapsed_s: float
@@ -68,7 +68,7 @@ def run(
     *,
     goes_on_at_once: bool = True,
     collision_tail_s: float = DIFS_S,
-) -> Run:
+) -> CsmaRun:
     """Let saturated senders contend.
 
     Args:
@@ -119,4 +119,4 @@ def run(
             elapsed_s += collision_tail_s
             window[sends] = np.minimum(2 * window[sends], CW_MAX + 1)
         counter[sends] = rng.integers(0, window[sends]) + (0 if goes_on_at_once else 1)
-    return Run(elapsed_s, attempts, collided, bits, air_s)
+    return CsmaRun(elapsed_s, attempts, collided, bits, air_s)

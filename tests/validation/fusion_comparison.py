@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
@@ -27,7 +27,7 @@ from sortie.perception.network.model import CarNet
 from sortie.perception.types import Boxes
 
 TAU = 0.1
-STARVED = Condition(0.05, unsent="masked")
+STARVED = Sharing(0.05, unsent="masked")
 SHARING = (FULL_SHARING, STARVED)
 
 

@@ -12,7 +12,7 @@ from sortie.radio.mac.contention import CW_MIN, DIFS_S, SIFS_S, SLOT_S, contenti
 CASES = [(1, 86.0, ACK_S), (64, 360.3, BLOCK_ACK_S)]
 
 
-def _both(frames: int, rate_mbps: float, ack_s: float, n: int, **rules: object) -> tuple[float, csma.Run]:
+def _both(frames: int, rate_mbps: float, ack_s: float, n: int, **rules: object) -> tuple[float, csma.CsmaRun]:
     one = frames_exchanges(frames, 1538, 1538, rate_mbps, frames, ack_s)
     turn = csma.Turn(one.ppdu_s, ack_s, frames, 12_000.0)
     ran = csma.run([turn] * n, 8_000, np.random.default_rng(n), **rules)

@@ -8,7 +8,7 @@ import simpy
 
 from sortie.radio.mac.airtime import BLOCK_ACK_S, Exchanges
 from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S
-from sortie.radio.mac.jobs import GroupFrame, Job
+from sortie.radio.mac.jobs import AirJob, GroupFrame
 from sortie.radio.mac.medium import Medium
 from sortie.scenarios.schema import Radio
 
@@ -29,10 +29,10 @@ def test_unequal_senders_share_as_the_medium_shares() -> None:
     around_s = SIFS_S + BLOCK_ACK_S + DIFS_S + SLOT_S
     asked = [Exchanges(1000, 1000 * s, 1000 * (s + around_s)) for s in (4e-3, 0.5e-3)]
     env = simpy.Environment()
-    medium = Medium[Job, GroupFrame](
+    medium = Medium[AirJob, GroupFrame](
         env, 2, lambda job, _: job.demand(asked[job.sender]), lambda *_: None, lambda *_: None
     )
-    jobs = [Job(i, i, 10.0) for i in range(2)]
+    jobs = [AirJob(i, i, 10.0) for i in range(2)]
     for job in jobs:
         medium.submit(job)
     env.run(until=0.2)

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sortie.fleet.flight.formation import slots
-from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, Motion, MotionError, attitude, body_rates, fly
+from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, MotionError, Trajectories, attitude, body_rates, fly
 from sortie.scenarios.schema import Fleet, Formation, Route
-from sortie.scenarios.schema import Motion as MotionConfig
+from sortie.scenarios.schema import Trajectories as MotionConfig
 
 CALM = MotionConfig(
     wind_mps=(0, 0), gust_sigma_mps=0, pose_jitter_m=0, pose_error_m=0, heading_error_deg=0
@@ -19,7 +19,7 @@ CALM = MotionConfig(
 TOUR = Route(waypoints_m=((0, 0), (150, 0), (150, 100), (0, 100)))
 
 
-def tour(**changes: object) -> Motion:
+def tour(**changes: object) -> Trajectories:
     return fly(Fleet(route=TOUR).model_copy(update=changes), 60.0, 0.1, seed=3)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sortie.fleet.flight.displaced import displaced
-from sortie.fleet.flight.motion import Motion, MotionError, fly
+from sortie.fleet.flight.motion import MotionError, Trajectories, fly
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.flight.viewpoints import (
     LEAST_MOVE_M,
@@ -165,7 +165,7 @@ def test_a_fence_that_the_formation_leaves_is_no_fence_to_fly_in() -> None:
         course_and_bounds(fleet_with(viewpoints={"fence_m": [-100, -100, 30, 100]}))
 
 
-def flown_with_moves(**changed: object) -> tuple[Fleet, Motion, Motion, list[Plan], Course]:
+def flown_with_moves(**changed: object) -> tuple[Fleet, Trajectories, Trajectories, list[Plan], Course]:
     fleet = fleet_with(**changed)
     base = fly(fleet, 30.0, FRAME_S, seed=3)
     course, bounds = course_of(fleet, np.asarray(base.time_s)), bounds_of(fleet)

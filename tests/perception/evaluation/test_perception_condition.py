@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 
 conditions = st.one_of(
     st.just(SINGLE),
     st.builds(
-        Condition,
+        Sharing,
         st.floats(0, 1),
         st.sampled_from(["all-4", "best-1", "best-2", "best-4", "worst-2", "worst-3", "random-2", "random-4"]),
         st.sampled_from(["uniform", "overlap"]),
@@ -21,15 +21,15 @@ conditions = st.one_of(
 
 
 @given(conditions)
-def test_a_label_names_its_condition(condition: Condition) -> None:
-    assert Condition.parse(condition.label) == condition
+def test_a_label_names_its_condition(condition: Sharing) -> None:
+    assert Sharing.parse(condition.label) == condition
 
 
 def test_labels_are_short() -> None:
     assert SINGLE.label == "single"
     assert FULL_SHARING.label == "all-4@1"
-    assert Condition(0.02, "best-2").label == "best-2@0.02"
-    assert Condition(0.1, "all-4", "overlap", "norm", "masked", True).label == "all-4@0.1,overlap,norm,masked,roi"
+    assert Sharing(0.02, "best-2").label == "best-2@0.02"
+    assert Sharing(0.1, "all-4", "overlap", "norm", "masked", True).label == "all-4@0.1,overlap,norm,masked,roi"
 
 
 @pytest.mark.parametrize(
@@ -47,17 +47,17 @@ def test_labels_are_short() -> None:
 )
 def test_what_a_condition_refuses(knobs: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Condition(**knobs)
+        Sharing(**knobs)
 
 
 @pytest.mark.parametrize("label", ["", "best-2", "best-2@x", "best-2@0.1,loud", "best-2@7"])
 def test_what_is_no_label(label: str) -> None:
     with pytest.raises(ValueError, match="must be like best-2@0\\.02,masked"):
-        Condition.parse(label)
+        Sharing.parse(label)
 
 
 def test_conditions_that_differ_in_nothing() -> None:
-    parse = Condition.parse
+    parse = Sharing.parse
     assert parse("best-4@0.1").plain() == parse("worst-4@0.1").plain() == parse("all-4@0.1")
     assert parse("best-2@0.1").plain() == parse("best-2@0.1")
     assert parse("all-4@1,overlap,norm,roi").plain() == FULL_SHARING

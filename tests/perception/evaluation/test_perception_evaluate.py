@@ -10,14 +10,14 @@ import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
 from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
 from sortie.perception.evaluation.scores import Bootstrap
 from sortie.perception.metrics.ap import CONVENTIONS, match, suppress
 from sortie.perception.types import Boxes
 
-BEST = Condition(0.1, "best-2", roi=True)
+BEST = Sharing(0.1, "best-2", roi=True)
 THREE = (SINGLE, BEST, FULL_SHARING)
 EVERYWHERE = ("full", "mission", "ego")
 
@@ -170,12 +170,12 @@ def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluati
 
 def test_what_differs_in_nothing_is_asked_once(frames: MadeFrames, whole: Evaluation) -> None:
     instrument = MadeInstrument()
-    twins = (*THREE, Condition(0.1, "best-4"), Condition(0.1, "worst-4"), Condition(1.0, cells_by="norm"), SINGLE)
+    twins = (*THREE, Sharing(0.1, "best-4"), Sharing(0.1, "worst-4"), Sharing(1.0, cells_by="norm"), SINGLE)
     found = evaluate(instrument, frames, twins)
     assert instrument.asked == 4 * 25
     assert found.conditions == twins[:-1]
-    assert found.ap(Condition(1.0, cells_by="norm")) == whole.ap(FULL_SHARING)
-    assert found.cells[Condition(0.1, "worst-4")].tolist() == [1638] * 25
+    assert found.ap(Sharing(1.0, cells_by="norm")) == whole.ap(FULL_SHARING)
+    assert found.cells[Sharing(0.1, "worst-4")].tolist() == [1638] * 25
 
 
 def test_frames_in_another_order_are_the_same_frames(frames: MadeFrames, whole: Evaluation) -> None:
@@ -228,7 +228,7 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: E
     assert rest.looked == [3, 4], "three frames were kept"
 
     more = MadeInstrument()
-    wider = evaluate(more, frames, (*THREE, Condition(0.02)), regions=EVERYWHERE, store=tmp_path)
+    wider = evaluate(more, frames, (*THREE, Sharing(0.02)), regions=EVERYWHERE, store=tmp_path)
     assert more.asked == 25, "only the new condition"
     assert wider.ap(BEST) == whole.ap(BEST)
     again = MadeInstrument()
@@ -283,7 +283,7 @@ def test_what_is_not_an_evaluation(tmp_path: Path) -> None:
         ({"egos": 0}, "egos is 0, must be"),
         ({"regions": ["half"]}, "region is 'half', must be full or mission or ego"),
         ({"convention": "coco"}, "convention is 'coco', must be rotated or opencood or uav3d"),
-        ({"conditions": [Condition(0.1, "best-5")]}, "peers is 'best-5', must fit a fleet with 4 peers"),
+        ({"conditions": [Sharing(0.1, "best-5")]}, "peers is 'best-5', must fit a fleet with 4 peers"),
     ],
 )
 def test_what_evaluate_refuses(frames: MadeFrames, knobs: dict, message: str) -> None:

@@ -12,7 +12,7 @@ from harness_examples import MadeFrames, made_frames
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument, fingerprint
@@ -132,7 +132,7 @@ def test_a_fingerprint_is_of_weights_and_configuration(tmp_path: Path) -> None:
 def test_from_images_to_ap(frames: Seen) -> None:
     """The whole way, with threads and without."""
     instrument = CarNetInstrument(network("disconet"))
-    conditions = (SINGLE, Condition(0.02, "best-2", roi=True), FULL_SHARING)
+    conditions = (SINGLE, Sharing(0.02, "best-2", roi=True), FULL_SHARING)
     threads = torch.get_num_threads()
     one = evaluate(instrument, frames, conditions, regions=("full", "ego"), egos=2)
     two = evaluate(instrument, frames, conditions, regions=("full", "ego"), egos=2, workers=2)

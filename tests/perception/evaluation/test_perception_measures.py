@@ -9,12 +9,12 @@ import pytest
 from paper_examples import Made, papers_world
 
 from sortie.perception.evaluation.claims import CLAIMS, POLICIES, all_4, conditions, two
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.measures import (
+    ApOf,
     Contrast,
     Crossover,
     Kept,
-    Level,
     MeanLevel,
     Oracle,
     Peak,
@@ -39,8 +39,8 @@ def test_a_contrast_is_the_paired_difference_in_points() -> None:
 
 def test_p_is_the_level_at_which_zero_leaves_the_interval() -> None:
     close = Made({("best-2@0.02", "full"): 0.300, ("worst-2@0.02", "full"): 0.303}, noise=0.004)
-    got = Contrast((Condition(0.02, "best-2"),), (Condition(0.02, "worst-2"),)).measure(close)
-    draws = close.draws(Condition(0.02, "best-2"), "full") - close.draws(Condition(0.02, "worst-2"), "full")
+    got = Contrast((Sharing(0.02, "best-2"),), (Sharing(0.02, "worst-2"),)).measure(close)
+    draws = close.draws(Sharing(0.02, "best-2"), "full") - close.draws(Sharing(0.02, "worst-2"), "full")
     assert got.p == pytest.approx(2 * (np.count_nonzero(draws >= 0) + 1) / 401)
     assert got.significant == (got.p < 0.05)
 
@@ -152,17 +152,17 @@ def test_matched_bytes_are_compared_at_the_same_budget() -> None:
 
 
 def test_a_level_has_an_interval_and_no_test() -> None:
-    got = Level(FULL_SHARING).measure(PAPER)
+    got = ApOf(FULL_SHARING).measure(PAPER)
     assert got.value == 0.371
     assert got.p is None
 
 
 def test_unsent_cells_concern_conditions_that_leave_some() -> None:
-    assert under(Condition(0.1), "masked") == Condition(0.1, unsent="masked")
+    assert under(Sharing(0.1), "masked") == Sharing(0.1, unsent="masked")
     assert under(FULL_SHARING, "masked") == FULL_SHARING
     assert under(SINGLE, "masked", "norm") == SINGLE
-    assert under(Condition(0.1), "zero", "norm") == Condition(0.1, cells_by="norm")
-    assert under(Condition(1.0, "best-2"), "masked").unsent == "masked", "a peer sends all it has, not all is sent"
+    assert under(Sharing(0.1), "zero", "norm") == Sharing(0.1, cells_by="norm")
+    assert under(Sharing(1.0, "best-2"), "masked").unsent == "masked", "a peer sends all it has, not all is sent"
 
 
 def test_the_claims_need_few_conditions_and_have_ids_of_their_own() -> None:

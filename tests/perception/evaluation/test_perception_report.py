@@ -14,22 +14,22 @@ from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 
 from sortie.perception.evaluation import figures, report, rows
 from sortie.perception.evaluation.claims import CLAIMS, SECTIONS
-from sortie.perception.evaluation.rows import Row
+from sortie.perception.evaluation.rows import ClaimRow
 from sortie.perception.evaluation.scores import split
-from sortie.perception.evaluation.verdict import Measured
+from sortie.perception.evaluation.verdict import MeasuredValue
 
 
 @pytest.fixture(scope="module")
-def table() -> list[Row]:
+def table() -> list[ClaimRow]:
     weaker = Made({}, lambda c, r: papers_world(c, r) + (0.1 if c.rho < 0.1 and c.rule == "all" else 0.0))
     return rows.judge({"zero": Made({}, papers_world), "masked": weaker}, ELSEWHERE)
 
 
-def of(table: list[Row], claim: str, instrument: str = "zero") -> Row:
+def of(table: list[ClaimRow], claim: str, instrument: str = "zero") -> ClaimRow:
     return next(r for r in table if (r.id, r.instrument) == (claim, instrument))
 
 
-def test_the_papers_own_world_reproduces_the_paper(table: list[Row]) -> None:
+def test_the_papers_own_world_reproduces_the_paper(table: list[ClaimRow]) -> None:
     judged = {r.id: r.verdict for r in table if r.instrument == "zero" and r.verdict != "not comparable"}
     # The made draws are narrower than the paper's, so that its n.s. differences of +2.1 and +3.1 are significant here,
     # and full sharing weighs 1 MB.
@@ -38,7 +38,7 @@ def test_the_papers_own_world_reproduces_the_paper(table: list[Row]) -> None:
     assert of(table, "flip.0.05", "masked").verdict == "opposite"
 
 
-def test_every_claim_has_a_row_an_instrument_and_a_verdict(table: list[Row]) -> None:
+def test_every_claim_has_a_row_an_instrument_and_a_verdict(table: list[ClaimRow]) -> None:
     assert list(dict.fromkeys(r.id for r in table)) == [c.id for c in CLAIMS]
     assert {r.instrument for r in table if r.section != "Overhead of the context plane"} == {"zero", "masked"}
     assert {r.instrument for r in table if r.section == "Overhead of the context plane"} == {""}
@@ -46,7 +46,7 @@ def test_every_claim_has_a_row_an_instrument_and_a_verdict(table: list[Row]) -> 
     assert of(table, "plane.core", "").verdict == "not measurable here"
 
 
-def test_q_is_adjusted_over_the_differences_of_one_instrument(table: list[Row]) -> None:
+def test_q_is_adjusted_over_the_differences_of_one_instrument(table: list[ClaimRow]) -> None:
     tested = [r for r in table if r.instrument == "masked" and r.p is not None]
     p = np.sort([r.p or 0.0 for r in tested])
     m = len(p)
@@ -55,7 +55,7 @@ def test_q_is_adjusted_over_the_differences_of_one_instrument(table: list[Row]) 
     assert all(r.q is None for r in table if r.p is None)
 
 
-def test_how_many_verdicts_differ_by_chance(table: list[Row]) -> None:
+def test_how_many_verdicts_differ_by_chance(table: list[ClaimRow]) -> None:
     """Against drawing two tables of the same truth, again and again."""
     gain, none = of(table, "gain"), of(table, "peers.worst-best")
     sure = replace(gain, value=18.0, low=17.0, high=19.0)
@@ -67,17 +67,17 @@ def test_how_many_verdicts_differ_by_chance(table: list[Row]) -> None:
     assert rows.differ_by_chance([sure, edge, nothing]) == pytest.approx(0.595, abs=0.01)
     rng = np.random.default_rng(0)
 
-    def judged(row: Row) -> str:
+    def judged(row: ClaimRow) -> str:
         claim = next(c for c in CLAIMS if c.id == row.id)
         d = rng.normal(0.0, 2.0 / 1.96)
-        return str(claim.rule(claim.paper, Measured(row.value + d, row.low + d, row.high + d)).verdict)  # type: ignore[operator]
+        return str(claim.rule(claim.paper, MeasuredValue(row.value + d, row.low + d, row.high + d)).verdict)  # type: ignore[operator]
 
     drawn = sum(judged(r) != judged(r) for r in (edge, nothing) for _ in range(4000)) / 4000
     assert rows.differ_by_chance([edge, nothing]) == pytest.approx(drawn, abs=0.03)
     assert rows.differ_by_chance([of(table, "full"), of(table, "plane.descriptor", "")]) == 0.0
 
 
-def test_rows_are_the_same_after_parquet(table: list[Row], tmp_path: Path) -> None:
+def test_rows_are_the_same_after_parquet(table: list[ClaimRow], tmp_path: Path) -> None:
     pq.write_table(rows.to_table(table, FACTS), tmp_path / "paper.parquet")
     assert rows.read(tmp_path / "paper.parquet") == (table, FACTS)
 
@@ -106,7 +106,7 @@ def test_figures_read_well(figure: tuple[float, float, float, str], text: str) -
     assert report.figure(*figure) == text
 
 
-def test_what_the_paper_says_and_what_we_say(table: list[Row]) -> None:
+def test_what_the_paper_says_and_what_we_say(table: list[ClaimRow]) -> None:
     assert report.papers(of(table, "peers.worst-best")) == "+0.8 [−0.8, +2.3] n.s."
     assert report.papers(of(table, "allocation.0.1")) == "n.s."
     assert report.papers(of(table, "starved")) == "(−5.4)"
@@ -118,7 +118,7 @@ def test_what_the_paper_says_and_what_we_say(table: list[Row]) -> None:
     assert report.ours(replace(of(table, "plane.share", ""), value=0.0465)) == "0.05 %"
 
 
-def test_the_report_has_every_claim_and_section(table: list[Row]) -> None:
+def test_the_report_has_every_claim_and_section(table: list[ClaimRow]) -> None:
     text = report.report(table, FACTS, [("frontier.png", "The curve")])
     assert all(f"| {c.says} |" in text for c in CLAIMS)
     assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == list(SECTIONS)
@@ -129,21 +129,21 @@ def test_the_report_has_every_claim_and_section(table: list[Row]) -> None:
             assert line.endswith("|")
 
 
-def test_tables_are_rectangular(table: list[Row]) -> None:
+def test_tables_are_rectangular(table: list[ClaimRow]) -> None:
     for text in (report.report(table, FACTS), report.short(table, FACTS, "docs/paper/README.md")):
         for block in text.split("\n\n"):
             widths = {line.count("|") for line in block.splitlines() if line.startswith("|")}
             assert len(widths) <= 1, block
 
 
-def test_one_instrument_alone_makes_a_table_too(table: list[Row]) -> None:
+def test_one_instrument_alone_makes_a_table_too(table: list[ClaimRow]) -> None:
     alone = [r for r in table if r.instrument != "masked"]
     assert "masked fusion |" not in report.report(alone, FACTS)
     masked = [r for r in table if r.instrument != "zero"]
     assert f"| {report.ours(of(table, 'flip.0.05', 'masked'))} |" in report.short(masked, FACTS, "x")
 
 
-def test_the_readmes_section_replaces_what_was_between_the_markers(table: list[Row]) -> None:
+def test_the_readmes_section_replaces_what_was_between_the_markers(table: list[ClaimRow]) -> None:
     section = report.short(table, FACTS, "docs/paper/README.md")
     before = f"# Title\n\n{report.BEGIN}\nold\n{report.END}\n\nmore\n"
     after = report.put_into(before, section)
@@ -154,7 +154,7 @@ def test_the_readmes_section_replaces_what_was_between_the_markers(table: list[R
             report.put_into(broken, section)
 
 
-def test_figures_are_drawn_and_equal_ones_are_equal_files(table: list[Row], tmp_path: Path) -> None:
+def test_figures_are_drawn_and_equal_ones_are_equal_files(table: list[ClaimRow], tmp_path: Path) -> None:
     points = rows.points({"zero": Made({}, papers_world)})
     assert len(points) == 2 * 23
     for name in ("a.png", "b.png"):

@@ -10,10 +10,10 @@ from paper_examples import ELSEWHERE, FACTS, MadeInstrument, made_frames
 
 from sortie.perception.benchmark.dataset import SIZES
 from sortie.perception.evaluation import report, rows
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Condition
+from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.measures import under
 from sortie.perception.evaluation.paper import bench_frames, measure
-from sortie.perception.evaluation.results import Asked, Found
+from sortie.perception.evaluation.results import TableResults, TableSettings
 from sortie.perception.evaluation.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
 from sortie.perception.metrics.ap import average_precision
 
@@ -21,19 +21,19 @@ N = 6
 
 
 @pytest.fixture(scope="module")
-def found() -> Found:
-    return measure(MadeInstrument(), made_frames(N), Asked(draws=100))
+def found() -> TableResults:
+    return measure(MadeInstrument(), made_frames(N), TableSettings(draws=100))
 
 
-def test_scores_are_the_evaluations_at_the_threshold(found: Found) -> None:
-    c = Condition(0.1, unsent="masked")
+def test_scores_are_the_evaluations_at_the_threshold(found: TableResults) -> None:
+    c = Sharing(0.1, unsent="masked")
     by_hand = average_precision([m.at(0.1) for m in found.evaluation.matched(c)])
-    assert found.scores("masked").ap(Condition(0.1), "full") == pytest.approx(by_hand)
-    assert found.scores("zero").ap(Condition(0.1), "full") != pytest.approx(by_hand)
-    assert found.scores("zero", tau=0.99).ap(Condition(0.1), "full") == 0.0
+    assert found.scores("masked").ap(Sharing(0.1), "full") == pytest.approx(by_hand)
+    assert found.scores("zero").ap(Sharing(0.1), "full") != pytest.approx(by_hand)
+    assert found.scores("zero", tau=0.99).ap(Sharing(0.1), "full") == 0.0
 
 
-def test_a_draw_is_the_ap_of_its_frames(found: Found) -> None:
+def test_a_draw_is_the_ap_of_its_frames(found: TableResults) -> None:
     scores = found.scores("zero")
     weights = scores._once("resamples", N)
     draws = scores.draws(FULL_SHARING, "full")
@@ -45,7 +45,7 @@ def test_a_draw_is_the_ap_of_its_frames(found: Found) -> None:
         assert draws[draw] == pytest.approx(average_precision(drawn))
 
 
-def test_halves_are_the_aps_of_their_frames(found: Found) -> None:
+def test_halves_are_the_aps_of_their_frames(found: TableResults) -> None:
     scores = found.scores("zero")
     first = scores.halves(SINGLE, "full", resampled=False)[3, 0]
     member = scores._once("half 0 False", N)[3] > 0
@@ -54,13 +54,13 @@ def test_halves_are_the_aps_of_their_frames(found: Found) -> None:
     assert first == pytest.approx(average_precision(drawn))
 
 
-def test_bytes_are_those_of_all_egos(found: Found) -> None:
+def test_bytes_are_those_of_all_egos(found: TableResults) -> None:
     assert found.scores("masked").fleet_frame_bytes(FULL_SHARING) == [20 * 4096 * 160] * N
-    assert found.scores("masked").fleet_frame_bytes(Condition(0.1)) == [5 * 1638 * 160] * N
+    assert found.scores("masked").fleet_frame_bytes(Sharing(0.1)) == [5 * 1638 * 160] * N
     assert found.scores("zero").fleet_frame_bytes(SINGLE) == [0] * N
 
 
-def test_the_disc_may_lie_around_the_ego(found: Found) -> None:
+def test_the_disc_may_lie_around_the_ego(found: TableResults) -> None:
     e = found.evaluation.at(0.1)
     for disc in DISCS:
         got = found.scores("zero", disc=disc).ap(FULL_SHARING, "mission")
@@ -76,14 +76,14 @@ def test_a_second_run_takes_what_is_finished(tmp_path: Path) -> None:
             Counts.looked += 1
             return super().look(frames, frame)
 
-    first = measure(Counts(), made_frames(3), Asked(("zero",)), store=tmp_path)
+    first = measure(Counts(), made_frames(3), TableSettings(("zero",)), store=tmp_path)
     assert Counts.looked == 3
-    again = measure(Counts(), made_frames(3), Asked(("zero",)), store=tmp_path)
+    again = measure(Counts(), made_frames(3), TableSettings(("zero",)), store=tmp_path)
     assert Counts.looked == 3
     assert again.scores("zero").ap(SINGLE, "full") == first.scores("zero").ap(SINGLE, "full")
 
 
-def test_the_table_and_its_sensitivity_from_made_frames(found: Found) -> None:
+def test_the_table_and_its_sensitivity_from_made_frames(found: TableResults) -> None:
     table = rows.judge(found.all_scores(), ELSEWHERE)
     assert next(r for r in table if r.id == "bytes.full").verdict == "reproduced"
     varied = sensitivity(found)
@@ -115,11 +115,11 @@ def test_the_table_and_its_sensitivity_from_made_frames(found: Found) -> None:
 )
 def test_what_cannot_be_asked_is_named(field: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Asked(**field)  # type: ignore[arg-type]
+        TableSettings(**field)  # type: ignore[arg-type]
 
 
 def test_conditions_are_put_under_the_instrument() -> None:
-    assert under(Condition(0.1), "masked", "norm") == Condition(0.1, unsent="masked", cells_by="norm")
+    assert under(Sharing(0.1), "masked", "norm") == Sharing(0.1, unsent="masked", cells_by="norm")
 
 
 def test_frames_left_out_are_the_whole_test_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

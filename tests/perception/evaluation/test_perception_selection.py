@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sortie.perception import budget
 from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import Condition
+from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.geometry import FULL, SMALL
 from sortie.policies.geometry import circle_overlap
 
@@ -48,10 +48,10 @@ def test_overlap_equals_shapely_discs_and_the_policies(fleet: tuple) -> None:
 def test_best_worst_and_all_in_a_cross() -> None:
     overlap = selection.footprint_overlap(CROSS, RADII)
     # drone 1 is at the tip: the centre is nearest, the opposite tip farthest, equal ones go by id
-    assert selection.choose(Condition(0.1, "best-2"), 1, overlap[1]) == (0, 2)
-    assert selection.choose(Condition(0.1, "worst-2"), 1, overlap[1]) == (4, 3)
-    assert selection.choose(Condition(0.1, "all-4"), 1, overlap[1]) == (0, 2, 4, 3)
-    assert selection.choose(Condition(0.0, "none"), 1, overlap[1]) == ()
+    assert selection.choose(Sharing(0.1, "best-2"), 1, overlap[1]) == (0, 2)
+    assert selection.choose(Sharing(0.1, "worst-2"), 1, overlap[1]) == (4, 3)
+    assert selection.choose(Sharing(0.1, "all-4"), 1, overlap[1]) == (0, 2, 4, 3)
+    assert selection.choose(Sharing(0.0, "none"), 1, overlap[1]) == ()
 
 
 @given(st.lists(st.floats(0, 1), min_size=5, max_size=5), st.integers(0, 4), st.integers(1, 4))
@@ -59,7 +59,7 @@ def test_best_and_worst_are_brute_forces(overlap: list[float], ego: int, k: int)
     row = np.array(overlap)
     peers = [i for i in range(5) if i != ego]
     by_sum = {sum(sorted(overlap[i] for i in c)) for c in itertools.combinations(peers, k)}
-    chosen = {rule: selection.choose(Condition(0.1, f"{rule}-{k}"), ego, row) for rule in ("best", "worst", "random")}
+    chosen = {rule: selection.choose(Sharing(0.1, f"{rule}-{k}"), ego, row) for rule in ("best", "worst", "random")}
     assert sum(sorted(overlap[i] for i in chosen["best"])) == max(by_sum)
     assert sum(sorted(overlap[i] for i in chosen["worst"])) == min(by_sum)
     for some in chosen.values():
@@ -69,7 +69,7 @@ def test_best_and_worst_are_brute_forces(overlap: list[float], ego: int, k: int)
 
 
 def test_random_peers_are_the_frames_own_and_even() -> None:
-    overlap, condition = selection.footprint_overlap(CROSS, RADII), Condition(0.1, "random-2")
+    overlap, condition = selection.footprint_overlap(CROSS, RADII), Sharing(0.1, "random-2")
     draws = [selection.choose(condition, 0, overlap[0], (7, n)) for n in range(3000)]
     assert draws[5] == selection.choose(condition, 0, overlap[0], (7, 5))
     pairs = [draws.count(pair) for pair in itertools.combinations((1, 2, 3, 4), 2)]
@@ -83,7 +83,7 @@ def test_random_peers_are_the_frames_own_and_even() -> None:
 @pytest.mark.parametrize("peers", ["best-5", "all-3", "all-5"])
 def test_a_condition_that_does_not_fit_the_fleet(peers: str) -> None:
     with pytest.raises(ValueError, match=f"peers is '{peers}', must fit a fleet with 4 peers"):
-        selection.choose(Condition(0.1, peers), 0, np.ones(5))
+        selection.choose(Sharing(0.1, peers), 0, np.ones(5))
 
 
 @pytest.mark.parametrize(

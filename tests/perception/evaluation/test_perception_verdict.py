@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.perception.evaluation import verdict
-from sortie.perception.evaluation.verdict import HALF_AN_ORDER, Judgement, Measured, Paper, Size, Verdict
+from sortie.perception.evaluation.verdict import HALF_AN_ORDER, ClaimVerdict, Judgement, MeasuredValue, Paper, Size
 
 UP, DOWN, NOTHING = Paper(4.8, 3.8, 5.8), Paper(-4.8, -5.8, -3.8), Paper(0.8, -0.8, 2.3, significant=False)
-R, N, O, X = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.OPPOSITE, Verdict.NOT_MEASURABLE  # noqa: E741
+R, N, O, X = ClaimVerdict.REPRODUCED, ClaimVerdict.NOT_REPRODUCED, ClaimVerdict.OPPOSITE, ClaimVerdict.NOT_MEASURABLE  # noqa: E741
 
 
-def m(value: float, low: float, high: float) -> Measured:
-    return Measured(value, low, high, 0.5)
+def m(value: float, low: float, high: float) -> MeasuredValue:
+    return MeasuredValue(value, low, high, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -44,12 +44,12 @@ def m(value: float, low: float, high: float) -> Measured:
         (Paper(significant=False), m(1.0, -1.0, 2.0), Judgement(R)),  # no value in the paper
         (Paper(significant=False), m(1.0, 0.5, 2.0), Judgement(N)),
         (UP, None, Judgement(X)),
-        (UP, Measured(4.8), Judgement(X)),
+        (UP, MeasuredValue(4.8), Judgement(X)),
         (UP, m(math.nan, math.nan, math.nan), Judgement(X)),
     ],
 )
 def test_a_difference_is_judged_by_sign_and_significance(
-    paper: Paper, ours: Measured | None, expected: Judgement
+    paper: Paper, ours: MeasuredValue | None, expected: Judgement
 ) -> None:
     assert verdict.contrast(paper, ours) == expected
 
@@ -64,7 +64,9 @@ def test_a_difference_is_judged_by_sign_and_significance(
         (m(2.0, 1.8, 2.2), N),
     ],
 )
-def test_where_the_paper_finds_none_a_difference_within_half_a_point_is_none(ours: Measured, expected: Verdict) -> None:
+def test_where_the_paper_finds_none_a_difference_within_half_a_point_is_none(
+    ours: MeasuredValue, expected: ClaimVerdict
+) -> None:
     for paper in (NOTHING, Paper(significant=False)):
         assert verdict.contrast(paper, ours).verdict == expected
     assert verdict.contrast(UP, ours).verdict == (R if ours.value > 0 else O)
@@ -94,16 +96,16 @@ def test_the_papers_own_figures_reproduce_it(value: float, wide: float) -> None:
         (m(70.0, 51.0, 80.0), Judgement(R, Size.SMALLER)),
         (m(55.0, 50.0, 60.0), Judgement(N, Size.SMALLER)),
         (m(40.0, 30.0, 49.9), Judgement(O, Size.SMALLER)),
-        (Measured(70.0), Judgement(X)),
+        (MeasuredValue(70.0), Judgement(X)),
         (None, Judgement(X)),
     ],
 )
-def test_most_is_more_than_a_half(ours: Measured | None, expected: Judgement) -> None:
+def test_most_is_more_than_a_half(ours: MeasuredValue | None, expected: Judgement) -> None:
     assert verdict.most(Paper(89.0), ours) == expected
 
 
 def test_absolute_levels_are_not_compared() -> None:
-    assert verdict.level(Paper(0.371), m(0.371, 0.35, 0.39)) == Judgement(Verdict.NOT_COMPARABLE)
+    assert verdict.level(Paper(0.371), m(0.371, 0.35, 0.39)) == Judgement(ClaimVerdict.NOT_COMPARABLE)
     assert verdict.level(Paper(0.371), None) == Judgement(X)
 
 
@@ -111,8 +113,8 @@ def test_absolute_levels_are_not_compared() -> None:
     ("value", "expected"),
     [(10.08, R), (10.05, R), (10.149, R), (10.151, N), (9.9, N), (math.nan, X)],
 )
-def test_what_follows_by_counting_has_to_round_to_the_print(value: float, expected: Verdict) -> None:
-    assert verdict.exact(Paper(10.1), Measured(value)).verdict == expected
+def test_what_follows_by_counting_has_to_round_to_the_print(value: float, expected: ClaimVerdict) -> None:
+    assert verdict.exact(Paper(10.1), MeasuredValue(value)).verdict == expected
     assert verdict.exact(Paper(10.1), None).verdict == X
 
 
@@ -127,9 +129,9 @@ def test_what_follows_by_counting_has_to_round_to_the_print(value: float, expect
     ],
 )
 def test_quantities_are_judged_to_half_an_order_of_magnitude(
-    times: float, most: Verdict, least: Verdict, order: Verdict
+    times: float, most: ClaimVerdict, least: ClaimVerdict, order: ClaimVerdict
 ) -> None:
-    paper, ours = Paper(0.1), Measured(0.1 * times)
+    paper, ours = Paper(0.1), MeasuredValue(0.1 * times)
     assert verdict.at_most(paper, ours).verdict == most
     assert verdict.at_least(paper, ours).verdict == least
     assert verdict.same_order(paper, ours).verdict == order
@@ -137,7 +139,7 @@ def test_quantities_are_judged_to_half_an_order_of_magnitude(
 
 def test_a_quantity_that_is_not_there_is_not_measurable() -> None:
     for rule in (verdict.at_most, verdict.at_least, verdict.same_order):
-        assert [rule(Paper(9.0), o).verdict for o in (None, Measured(math.nan), Measured(0.0))] == [X, X, X]
+        assert [rule(Paper(9.0), o).verdict for o in (None, MeasuredValue(math.nan), MeasuredValue(0.0))] == [X, X, X]
 
 
 @pytest.mark.parametrize(
@@ -151,5 +153,5 @@ def test_a_quantity_that_is_not_there_is_not_measurable() -> None:
     ],
 )
 def test_a_place_is_reproduced_inside_the_papers_bracket(value: float, expected: Judgement) -> None:
-    assert verdict.same_place(Paper(low=5.0, high=10.0), Measured(value)) == expected
+    assert verdict.same_place(Paper(low=5.0, high=10.0), MeasuredValue(value)) == expected
     assert verdict.same_place(Paper(low=5.0, high=10.0), None) == Judgement(X)

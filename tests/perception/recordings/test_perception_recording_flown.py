@@ -14,7 +14,7 @@ from places import ROOT
 from recording_examples import small
 
 from sortie.perception.detectors import DETECTORS, make_detector
-from sortie.perception.evaluation.condition import SINGLE, Condition
+from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.recordings.detector import RecordedDetector
@@ -78,7 +78,7 @@ def test_a_peers_box_arrives_with_the_cell_of_its_centre(tmp_path: Path) -> None
 def test_the_harness_evaluates_a_recording_with_its_own_bytes(tmp_path: Path) -> None:
     """Each drone knows one of two cars: alone AP is 1/2, a single cell of the right peer makes it 1."""
     path = small(tmp_path / "r.npz")
-    found = evaluate_recording(path, [SINGLE, Condition(1 / 4096, "all-1"), Condition(1.0, "all-1")])
+    found = evaluate_recording(path, [SINGLE, Sharing(1 / 4096, "all-1"), Sharing(1.0, "all-1")])
     few, full = found.conditions[1:]
     assert found.ap(SINGLE) == pytest.approx(0.5)
     assert found.ap(few) == pytest.approx(1.0)

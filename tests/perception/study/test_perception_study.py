@@ -11,16 +11,18 @@ import pyarrow.parquet as pq
 import pytest
 
 from sortie.perception.metrics.ap import Matched
-from sortie.perception.study.measure import Row, from_table, optimal_f1, threshold, to_table
+from sortie.perception.study.measure import StudyRow, from_table, optimal_f1, threshold, to_table
 from sortie.perception.study.plan import PLAN, read_plan
-from sortie.perception.study.report import Found, View, answers, flips, on_frames, report, sign
+from sortie.perception.study.report import FixedSettings, StudyRows, answers, flips, on_frames, report, sign
 from sortie.perception.study.run import SHIPPED, train_job, weights_of
 
 BUDGETS = (0.02, 0.05, 0.1, 0.25)
-ONE = Row("full", 0, "default", "zero", "confidence", "model", 0.1, "contrast", 0.02, 1.0, 0.5, 1.5, 80)
+ONE = StudyRow("full", 0, "default", "zero", "confidence", "model", 0.1, "contrast", 0.02, 1.0, 0.5, 1.5, 80)
 
 
-def rows_with(contrasts: tuple[float, float, float, float], half_width: float = 1.0, **changes: object) -> list[Row]:
+def rows_with(
+    contrasts: tuple[float, float, float, float], half_width: float = 1.0, **changes: object
+) -> list[StudyRow]:
     """One network's rows: these contrasts by budget, the rest plain."""
     base = replace(ONE, **changes)  # type: ignore[arg-type]
     out = [replace(base, quantity="gain", rho=math.nan, value=18.0, low=16.0, high=20.0)]
@@ -54,7 +56,7 @@ def test_a_study_says_on_how_many_frames_it_stands() -> None:
 def test_a_flip_is_two_first_and_four_later_both_significant(
     contrasts: tuple[float, float, float, float], half_width: float, there: bool
 ) -> None:
-    assert flips(Found(rows_with(contrasts, half_width)), View("full", 0), BUDGETS) is there
+    assert flips(StudyRows(rows_with(contrasts, half_width)), FixedSettings("full", 0), BUDGETS) is there
 
 
 def test_a_sign_needs_an_interval_without_zero() -> None:
@@ -82,7 +84,7 @@ def test_the_report_tells_of_a_flip_where_there_is_one_and_names_what_is_missing
     assert "▼ −4.8 [−5.8, −3.8]" in text
     assert "Not trained yet" in text
     assert "deep-0" in text.partition("Not trained yet")[2]
-    quiet = "\n".join(answers(plan, Found(rows_with((-2, -2, -2, -2)))))
+    quiet = "\n".join(answers(plan, StudyRows(rows_with((-2, -2, -2, -2)))))
     assert "No network shows the flip" in quiet
     assert "appears nowhere" in quiet
 

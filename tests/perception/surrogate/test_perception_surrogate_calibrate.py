@@ -13,11 +13,11 @@ import pytest
 from sortie.perception.scene.traffic import TARGET_ID, TargetPath
 from sortie.perception.surrogate import collect as collecting
 from sortie.perception.surrogate.calibrate import calibrate
-from sortie.perception.surrogate.collect import Asked, captures_of, collect, read
+from sortie.perception.surrogate.collect import DetectorRuns, captures_of, collect, read
 from sortie.perception.surrogate.features import square
 from sortie.perception.surrogate.judge import IN_DISC, judge
 from sortie.perception.surrogate.model import SHIPPED, load
-from sortie.perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Job, draw_target, moment, scene_model
+from sortie.perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Question, draw_target, moment, scene_model
 from sortie.perception.types import Boxes, Capture
 
 STREET = MANNERS.index("street")
@@ -104,7 +104,7 @@ class Told:
 
     def __init__(self, *_: object) -> None: ...
 
-    def ask(self, job: Job) -> Boxes:
+    def ask(self, job: Question) -> Boxes:
         Told.asked += 1
         drones = [job.ego, *(s.capture for s in job.shares)]
         rows = np.array([(*d.position_m[:2], 4.5, 1.9, 0.0, 1 / (1 + k)) for k, d in enumerate(drones)])
@@ -165,7 +165,7 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
     cars: list[int] = []
     inside: list[int] = []
 
-    def answered(scene: int) -> Asked:
+    def answered(scene: int) -> DetectorRuns:
         jobs = moment(0, "held-out", scene, STREET)
         truths = truth_of(scene, jobs)
         for t, j in zip(truths, jobs, strict=True):
@@ -173,7 +173,7 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
                 cars.append(len(t))
                 inside.append(len(t.inside(j.disc)))
         boxes = [t.inside(j.disc) for t, j in zip(truths, jobs, strict=True)]
-        return Asked("held-out", scene, jobs, boxes, {})
+        return DetectorRuns("held-out", scene, jobs, boxes, {})
 
     parameters = load(SHIPPED)
     verdict = judge(parameters, [answered(s) for s in range(3)])
@@ -184,7 +184,7 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
     assert all(o.torch == 0.0 and not o.significant for o in verdict.orders)
 
 
-def truth_of(scene: int, jobs: Sequence[Job]) -> list[Boxes]:
+def truth_of(scene: int, jobs: Sequence[Question]) -> list[Boxes]:
     from sortie.perception.geometry import FULL
     from sortie.perception.network.detector import ground_truth
 

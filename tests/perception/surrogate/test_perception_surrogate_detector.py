@@ -19,12 +19,12 @@ from sortie.perception.surrogate.draws import Luck
 from sortie.perception.surrogate.exchange import (
     ALARM_COVARIATES,
     FUSED_COVARIATES,
-    Exchange,
+    FeatureShares,
     alarm_covariates,
     covariates,
     pair,
 )
-from sortie.perception.surrogate.features import Eyes, Fleet
+from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.hashing import uniform
 from sortie.perception.surrogate.rows import claim
 from sortie.perception.types import Boxes, Capture, Share
@@ -104,7 +104,7 @@ def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
 ) -> None:
     eyes, luck = Eyes(scene), Luck(3, 0, 7, Eyes(scene).traffic.count, detector.parameters.alike)
     fleet = cross(10.0, 20.0, 0.3)
-    every, two = eyes.look(Fleet.of(fleet)), eyes.look(Fleet.of(fleet[1:3]))
+    every, two = eyes.look(CaptureColumns.of(fleet)), eyes.look(CaptureColumns.of(fleet[1:3]))
     a, b = luck.of(fleet, every), luck.of(fleet[1:3], two)
     mine = np.isin(every.capture, (1, 2))
     for name in ("look", "rank", "find", "residual"):
@@ -117,7 +117,7 @@ def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, par
     eyes = Eyes(scene)
     luck = Luck(3, 0, 7, eyes.traffic.count, np.full(4, part, np.float32))
     fleet = [c for t in TIMES for c in cross(10.0, 20.0, 0.3, t_s=float(t))]
-    looks = eyes.look(Fleet.of(fleet))
+    looks = eyes.look(CaptureColumns.of(fleet))
     drawn = luck.of(fleet, looks)
     cars = [looks.car == c for c in np.unique(looks.car) if (looks.car == c).sum() > 5]
     for values in (drawn.look, drawn.find[:, 0], drawn.residual):
@@ -128,7 +128,7 @@ def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, par
 
 def test_which_cars_are_hard_is_the_towns_and_the_rest_the_sorties(scene: SceneModel) -> None:
     eyes, fleet = Eyes(scene), cross(10.0, 20.0, 0.3)
-    looks, half = eyes.look(Fleet.of(fleet)), np.full(4, 0.5, np.float32)
+    looks, half = eyes.look(CaptureColumns.of(fleet)), np.full(4, 0.5, np.float32)
     a, b, other = (Luck(*key, eyes.traffic.count, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8)))
     own = a.look == b.look
     assert own.mean() == pytest.approx(0.5, abs=0.15)
@@ -170,7 +170,7 @@ def test_a_larger_budget_sends_every_cell_that_a_smaller_one_sent(
 
 def cells_of(fleet: list[Capture], rho: float) -> np.ndarray:
     jobs = shared(fleet, rho)
-    return Exchange.of(jobs, {c: i for i, c in enumerate(fleet)}).cells
+    return FeatureShares.of(jobs, {c: i for i, c in enumerate(fleet)}).cells
 
 
 def test_cells_of_a_disc_are_its_area_and_counted_where_it_leaves_the_map() -> None:
@@ -178,25 +178,25 @@ def test_cells_of_a_disc_are_its_area_and_counted_where_it_leaves_the_map() -> N
     column = {c: i for i, c in enumerate(fleet)}
     inside = [(fleet[0], [Share(fleet[1], "features", 1.0, (20.0, 0.0, 32.0), 1.0)])]
     rim = [(fleet[0], [Share(fleet[1], "features", 1.0, (20.0 + 102.4, 0.0, 32.0), 1.0)])]
-    assert Exchange.of(inside, column).allowed[0, 0] == pytest.approx(np.pi * 10**2)
-    assert Exchange.of(rim, column).allowed[0, 0] == pytest.approx(np.pi * 10**2 / 2, rel=0.05)
+    assert FeatureShares.of(inside, column).allowed[0, 0] == pytest.approx(np.pi * 10**2)
+    assert FeatureShares.of(rim, column).allowed[0, 0] == pytest.approx(np.pi * 10**2 / 2, rel=0.05)
 
 
 def test_an_old_share_of_a_moving_car_lies_behind_it() -> None:
     scene = SceneModel(EMPTY, Target(waypoints_m=((-40.0, 0.0), (40.0, 0.0)), speed_mps=8.0), BOUNDS)
     ego, late = capture(0.0, 0.0, t_s=5.0), capture(5.0, 5.0, drone=1, t_s=4.6)
     jobs = [(ego, [Share(late, "features", 1.0, None, 1.0)])]
-    fleet = Fleet.of([ego, late])
-    pairs = pair(Exchange.of(jobs, {ego: 0, late: 1}), Eyes(scene).look(fleet), fleet)
+    fleet = CaptureColumns.of([ego, late])
+    pairs = pair(FeatureShares.of(jobs, {ego: 0, late: 1}), Eyes(scene).look(fleet), fleet)
     np.testing.assert_allclose(pairs.shift_m[0, 0], (-8.0 * 0.4, 0.0), atol=1e-4)
 
 
 def test_heading_errors_shift_what_a_peer_sends_by_its_range() -> None:
     scene = SceneModel(EMPTY, Target(waypoints_m=((60.0, 0.0),)), BOUNDS)
     ego, peer = capture(0.0, 0.0), capture(0.0, 0.0, drone=1, est=(0.0, 0.0, 60.0, 0.01))
-    fleet = Fleet.of([ego, peer])
+    fleet = CaptureColumns.of([ego, peer])
     jobs = [(ego, [Share(peer, "features", 1.0, None, 1.0)])]
-    pairs = pair(Exchange.of(jobs, {ego: 0, peer: 1}), Eyes(scene).look(fleet), fleet)
+    pairs = pair(FeatureShares.of(jobs, {ego: 0, peer: 1}), Eyes(scene).look(fleet), fleet)
     np.testing.assert_allclose(pairs.shift_m[0, 0], (60 * (np.cos(0.01) - 1), 60 * np.sin(0.01)), atol=1e-4)
 
 
@@ -285,7 +285,7 @@ def test_boxes_of_a_car_lie_off_to_the_same_side_of_it_whoever_looks(
     for town in range(4):
         scene = SceneModel(Scene(seed=town), None, (-60, -60, 60, 60))
         eyes = Eyes(scene)
-        looks = eyes.look(Fleet.of(fleet))
+        looks = eyes.look(CaptureColumns.of(fleet))
         some = SurrogateDetector.of(scene, Perception(), planted, 0)
         sides: dict[int, list[np.ndarray]] = {}
         for k, boxes in enumerate(some.detect([(c, ()) for c in fleet])):
@@ -327,8 +327,8 @@ def test_what_false_alarms_hang_on_is_what_was_asked_for_and_how_far_cars_have_d
     given: list[tuple[float, tuple[float, float, float] | None]] = [(1.0, None), (0.5, None), (1.0, (0.0, 0.0, 32.0))]
     jobs = [(ego, [Share(p, "features", *g, 1.0) for p, g in zip(peers, given, strict=True)]), (peers[0], [])]
     captures = [ego, *peers]
-    fleet = Fleet.of(captures)
-    exchange = Exchange.of(jobs, {c: i for i, c in enumerate(captures)})
+    fleet = CaptureColumns.of(captures)
+    exchange = FeatureShares.of(jobs, {c: i for i, c in enumerate(captures)})
     x = alarm_covariates(exchange, Eyes(scene).look(fleet), fleet, np.zeros(2, bool), scene.config)
     told = dict(zip(ALARM_COVARIATES, x.T.tolist(), strict=True))
     disc = np.pi * 10**2 / 4096
@@ -348,10 +348,12 @@ def test_senders_are_counted_by_head_and_by_weight(weights: tuple[float, ...], m
     scene = SceneModel(EMPTY, Target(waypoints_m=((10.0, 0.0),)), BOUNDS)
     captures = [capture(0.0, 0.0), *(capture(5.0, 5.0 * k, drone=k + 1) for k in range(4))]
     fleet, shares = (
-        Fleet.of(captures),
+        CaptureColumns.of(captures),
         [Share(p, "features", 1.0, None, w) for p, w in zip(captures[1:], weights, strict=True)],
     )
-    exchange = Exchange.of([(captures[0], [s for s in shares if s.weight > 0])], {c: i for i, c in enumerate(captures)})
+    exchange = FeatureShares.of(
+        [(captures[0], [s for s in shares if s.weight > 0])], {c: i for i, c in enumerate(captures)}
+    )
     looks = Eyes(scene).look(fleet)
     pairs = pair(exchange, looks, fleet)
     sent = np.array([[k != 1 for k, w in enumerate(weights) if w > 0]])
@@ -370,8 +372,8 @@ def test_older_maps_than_any_that_was_fitted_give_no_more_false_alarms_than_the_
         ego = capture(10.0, 20.0, t_s=70.0)
         peers = [capture(10.0, 5.0 * k, drone=k + 1, t_s=70.0 - age_s) for k in range(4)]
         jobs = [(ego, [Share(p, "features", 0.25, None, 1.0) for p in peers])]
-        fleet = Fleet.of([ego, *peers])
-        exchange = Exchange.of(jobs, {c: i for i, c in enumerate([ego, *peers])})
+        fleet = CaptureColumns.of([ego, *peers])
+        exchange = FeatureShares.of(jobs, {c: i for i, c in enumerate([ego, *peers])})
         x = alarm_covariates(exchange, Eyes(scene).look(fleet), fleet, np.zeros(1, bool), scene.config)
         return detector.parameters.alarm_rates(x)
 

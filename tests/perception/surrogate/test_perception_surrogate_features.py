@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, Eyes, Fleet, axes
+from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, CaptureColumns, Eyes, axes
 from sortie.perception.surrogate.line_of_sight import NEAR_M, RES_M, Kerbs, next_of
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene, Target
@@ -24,7 +24,7 @@ def capture(t_s: float, drone: int = 0) -> Capture:
 def test_the_next_car_is_the_nearest_of_all_parked_driving_or_the_target(style: str) -> None:
     scene = SceneModel(Scene(style=style, parked_density=0.5, moving_cars_per_km=14), TARGET, (-60, -20, 200, 20))
     captures = [capture(t, d) for t in (0.0, 3.7, 20.0) for d in range(2)]
-    looks, seen = Eyes(scene).look(Fleet.of(captures)), set()
+    looks, seen = Eyes(scene).look(CaptureColumns.of(captures)), set()
     for k, (of, here, yaw) in enumerate(zip(looks.capture, looks.world_m, looks.yaw_rad, strict=True)):
         cars = scene.cars_at(captures[of].t_s)
         away = np.stack([cars.x_m, cars.y_m], axis=1) - here
@@ -45,7 +45,7 @@ def test_the_next_car_is_the_nearest_of_all_parked_driving_or_the_target(style: 
 
 def test_a_car_that_is_alone_has_none_next_to_it() -> None:
     scene = SceneModel(Scene(parked_density=0.0, moving_cars_per_km=0), TARGET, (-60, -20, 200, 20))
-    covariates = Eyes(scene).look(Fleet.of([capture(4.0)])).covariates
+    covariates = Eyes(scene).look(CaptureColumns.of([capture(4.0)])).covariates
     assert len(covariates) == 1
     assert not covariates[:, [COLUMN[n] for n in ("next", "next_along", "next_across")]].any()
 

@@ -11,23 +11,23 @@ from surrogate_examples import asked
 
 from sortie.perception.surrogate.levels import BOUNDS, group_of, level, longer
 from sortie.perception.surrogate.model import KINDS, SHIPPED, load
-from sortie.perception.surrogate.plan import Job
+from sortie.perception.surrogate.plan import Question
 from sortie.perception.types import Share
 
 EGO, ASKEW = capture(0.0, 0.0), capture(0.0, 0.0, yaw=0.5)
 PEER, OLD = capture(10.0, 0.0, drone=1), capture(10.0, 0.0, drone=1, t_s=4.8)
 
 
-def job(rho: float, ego: object = EGO, **other: object) -> Job:
+def job(rho: float, ego: object = EGO, **other: object) -> Question:
     share = Share(PEER, "features", rho, None, 1.0)._replace(**other)  # type: ignore[arg-type]
-    return Job(ego, (share, share), "masked", "confidence", "")  # type: ignore[arg-type]
+    return Question(ego, (share, share), "masked", "confidence", "")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("asked_for", "group"),
     [
-        (Job(EGO, (), "masked", "confidence", ""), 1),
-        (Job(ASKEW, (), "masked", "confidence", ""), 0),
+        (Question(EGO, (), "masked", "confidence", ""), 1),
+        (Question(ASKEW, (), "masked", "confidence", ""), 0),
         (job(0.01), 3),
         (job(0.01, ASKEW), 2),
         (job(0.015), 3),
@@ -44,7 +44,9 @@ def job(rho: float, ego: object = EGO, **other: object) -> Job:
         (replace(job(0.5), cells_by="norm"), None),
     ],
 )
-def test_plain_jobs_are_told_by_how_much_is_sent_and_how_the_drone_flies(asked_for: Job, group: int | None) -> None:
+def test_plain_jobs_are_told_by_how_much_is_sent_and_how_the_drone_flies(
+    asked_for: Question, group: int | None
+) -> None:
     assert group_of(asked_for) == group
 
 

@@ -17,8 +17,8 @@ from scipy.special import expit
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.draws import BANDS
-from sortie.perception.surrogate.exchange import FUSED_COVARIATES, Exchange, covariates, pair
-from sortie.perception.surrogate.features import LOOK_COVARIATES, Eyes, Fleet
+from sortie.perception.surrogate.exchange import FUSED_COVARIATES, FeatureShares, covariates, pair
+from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Eyes
 from sortie.perception.surrogate.fit import BANDS as QUANTILES
 from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
 from sortie.perception.surrogate.line_of_sight import CAR_TOP_M, HeightField
@@ -174,9 +174,11 @@ def test_surer_drones_find_more(parameters: Parameters) -> None:
 
 def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
     """Of the cars about a cross of drones, alone: were they found weakly, and were they found surely."""
-    fleet = Fleet.of(cross(10.0, 20.0, 0.3))
+    fleet = CaptureColumns.of(cross(10.0, 20.0, 0.3))
     looks = Eyes(SceneModel(Scene(), None, (-50, -50, 50, 50))).look(fleet)
-    alone = Exchange.of([(c, ()) for c in cross(10.0, 20.0, 0.3)], {c: i for i, c in enumerate(cross(10.0, 20.0, 0.3))})
+    alone = FeatureShares.of(
+        [(c, ()) for c in cross(10.0, 20.0, 0.3)], {c: i for i, c in enumerate(cross(10.0, 20.0, 0.3))}
+    )
     pairs = pair(alone, looks, fleet)
     n = len(pairs.row)
     none = np.zeros((n, 0), np.float32)

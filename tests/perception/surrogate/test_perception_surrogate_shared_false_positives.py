@@ -9,7 +9,7 @@ from surrogate_examples import asked
 
 from sortie.perception.surrogate.correlation import seen_by_several
 from sortie.perception.surrogate.detector import SurrogateDetector
-from sortie.perception.surrogate.features import Fleet
+from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.surrogate.shared_false_positives import Mirages, in_common
@@ -17,8 +17,8 @@ from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception
 
 
-def fleet(*at: tuple[float, float]) -> Fleet:
-    return Fleet.of([capture(x, y, yaw=0.3, drone=k) for k, (x, y) in enumerate(at)])
+def fleet(*at: tuple[float, float]) -> CaptureColumns:
+    return CaptureColumns.of([capture(x, y, yaw=0.3, drone=k) for k, (x, y) in enumerate(at)])
 
 
 def test_as_many_things_lie_in_a_square_as_are_expected_there() -> None:

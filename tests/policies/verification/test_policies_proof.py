@@ -12,7 +12,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
 from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import Verdict, complaint_on, property_of, prove
+from sortie.policies.verification.proof import ProofVerdict, complaint_on, property_of, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import from_json, to_json
 
@@ -20,7 +20,7 @@ Decide = Callable[[FleetView], Sequence[Directive]]
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
 
 
-def last(policy: Decide, line: str, drones: int = 3) -> Verdict:
+def last(policy: Decide, line: str, drones: int = 3) -> ProofVerdict:
     return prove(policy, parse(line), max_drones=drones)[-1]
 
 

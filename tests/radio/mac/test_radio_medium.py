@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sortie.radio.mac.airtime import Exchanges
 from sortie.radio.mac.contention import DIFS_S, SLOT_S, contention
-from sortie.radio.mac.jobs import End, GroupFrame, Job
+from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 from sortie.radio.mac.medium import AIFS_CONTEXT_S, Medium
 
 ONE_MS = Exchanges(4, 0.9e-3, 1e-3)
@@ -27,21 +27,21 @@ class Bench:
         self.demands: dict[int, Exchanges] = {}
         self.medium = Medium(self.env, n_drones, self._begin, self._end, self._group_end)
 
-    def _begin(self, job: Job, now_s: float) -> None:
+    def _begin(self, job: AirJob, now_s: float) -> None:
         job.demand(self.demands[job.number])
 
-    def _end(self, job: Job, how: End, now_s: float) -> None:
+    def _end(self, job: AirJob, how: End, now_s: float) -> None:
         self.log.append((now_s, job.number, how))
 
     def _group_end(self, frame: GroupFrame, collided: bool) -> None:
         self.heard.append((self.env.now, frame.sender, collided))
 
-    def job(self, sender: int, demand: Exchanges = ONE_MS, deadline_s: float = inf) -> Job:
-        job = Job(len(self.demands), sender, self.env.now + deadline_s)
+    def job(self, sender: int, demand: Exchanges = ONE_MS, deadline_s: float = inf) -> AirJob:
+        job = AirJob(len(self.demands), sender, self.env.now + deadline_s)
         self.demands[job.number] = demand
         return job
 
-    def submit(self, sender: int, demand: Exchanges = ONE_MS, deadline_s: float = inf) -> Job:
+    def submit(self, sender: int, demand: Exchanges = ONE_MS, deadline_s: float = inf) -> AirJob:
         job = self.job(sender, demand, deadline_s)
         self.medium.submit(job)
         return job
@@ -244,7 +244,7 @@ arrivals = st.lists(
 @given(arrivals, st.floats(1e-3, 60e-3))
 def test_work_is_conserved_and_shares_are_equal(traffic: list, stop_s: float) -> None:
     b = Bench()
-    jobs: list[Job] = []
+    jobs: list[AirJob] = []
     granted: list[float] = []
 
     def play() -> simpy.events.ProcessGenerator:

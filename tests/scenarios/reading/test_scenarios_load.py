@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import sortie.scenarios.reading.load as loader
 from sortie.scenarios.reading.load import ScenarioError, dump, library, load, loads
-from sortie.scenarios.schema import Policy, Scenario
+from sortie.scenarios.schema import PolicySection, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
 PARSERS = {"python": yaml.SafeLoader, "libyaml": getattr(yaml, "CSafeLoader", None)}
@@ -341,7 +341,7 @@ LOOK_ALIKES = [
 
 @pytest.mark.parametrize("text", LOOK_ALIKES)
 def test_text_that_looks_like_something_else_comes_back_as_text(text: str) -> None:
-    scenario = Scenario(name="a", description=text, policy=Policy(params={"v": text, "k" + text: 1}))
+    scenario = Scenario(name="a", description=text, policy=PolicySection(params={"v": text, "k" + text: 1}))
     assert loads(dump(scenario)) == scenario
 
 

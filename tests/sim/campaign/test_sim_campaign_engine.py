@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from sortie.sim.campaign import engine as engines
 from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import Dask, InProcess, open_engine
-from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.rows import find_row
-from sortie.sim.campaign.store import Store
+from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
 from sortie.sim.cli.console import user_errors
@@ -175,7 +175,7 @@ def test_batches_are_about_a_second_long() -> None:
 def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
     p = plan(tmp_path)
     with pytest.raises(RunError, match=r"this worker runs Sortie 0.1.0\+[0-9a-f]+, the campaign is of other"):
-        run_campaign(Plan({**p.spec, "code": "other"}), tmp_path / "a", InProcess())
+        run_campaign(CampaignPlan({**p.spec, "code": "other"}), tmp_path / "a", InProcess())
 
 
 def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_failed_runs_are_flown_again_on_the_command_line(tmp_path: Path) -> None
 def test_any_run_of_a_campaign_that_broke_off_can_be_flown(tmp_path: Path) -> None:
     """One whose row waits in the journal is held against it; one that was not flown has nothing to be held against."""
     p, folder = plan(tmp_path), tmp_path / "a"
-    store = Store(folder, p)
+    store = CampaignStore(folder, p)
     store.add(fly_batch(p.code, [(run, p.task(run)) for run in (0, 3)])[0])
     store.close()
     for run, said in (

@@ -12,7 +12,7 @@ from campaign_examples import BASE, CAMPAIGN, plan, write
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import ScenarioError
-from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.work import number, unpack
 from sortie.sim.folders import RunError
 
@@ -81,7 +81,7 @@ def test_whatever_reaches_the_worker_changes_the_key(tmp_path: Path, old: str, n
 def test_the_base_the_code_and_a_policys_file_change_the_key(tmp_path: Path) -> None:
     before = plan(tmp_path)
     assert plan(tmp_path, base=BASE.replace("0.5", "0.6")).key(0) != before.key(0)
-    assert Plan({**before.spec, "code": "other"}).key(0) != before.key(0)
+    assert CampaignPlan({**before.spec, "code": "other"}).key(0) != before.key(0)
     policy = tmp_path / "mine.py"
     text = CAMPAIGN.replace("worked", f"{policy}:decide")
     policy.write_text("def decide(view):\n    return []\n")
@@ -92,7 +92,7 @@ def test_the_base_the_code_and_a_policys_file_change_the_key(tmp_path: Path) -> 
 
 def test_the_plan_survives_its_json(tmp_path: Path) -> None:
     p = plan(tmp_path)
-    again = Plan(json.loads(json.dumps(p.spec)))
+    again = CampaignPlan(json.loads(json.dumps(p.spec)))
     assert again.digest == p.digest
     assert [again.task(r) for r in range(p.runs)] == [p.task(r) for r in range(p.runs)]
 

@@ -14,15 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.schema.campaign import Sample
+from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import Rows, figures, find_row, judged, read_rows, sign
+from sortie.sim.campaign.rows import CampaignRows, figures, find_row, judged, read_rows, sign
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
-from sortie.sim.campaign.statistics import Mean, estimate, paired, t_interval
+from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
 from sortie.sim.campaign.winners import contexts, rule, winner
-from sortie.sim.campaign.work import Result
+from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
 TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
@@ -34,7 +34,7 @@ ONE_METRIC = TWO.replace("[bytes.data_sent, energy_j.total]", "[bytes.data_sent]
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40))
 def test_running_means_are_numpys(values: list[float]) -> None:
-    mean = Mean()
+    mean = RunningMean()
     for v in values:
         mean.add(v)
     assert mean.mean == pytest.approx(np.mean(values), abs=1e-9)
@@ -46,7 +46,7 @@ def test_intervals_are_students() -> None:
     low, high = stats.t.interval(0.95, 22, values.mean(), stats.sem(values))
     found = estimate(values)
     assert (found.low, found.high) == pytest.approx((low, high))
-    assert math.isinf(t_interval(Mean()))
+    assert math.isinf(t_interval(RunningMean()))
     assert estimate([math.nan, 3.0]).count == 1
 
 
@@ -91,7 +91,7 @@ def test_where_nothing_flips_no_rule_gains(tmp_path: Path) -> None:
 
 def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
     """Ishigami and Homma 1990, a = 7, b = 0.1: S = 0.3139, 0.4424, 0; ST = 0.5576, 0.4424, 0.2437."""
-    x = 2 * math.pi * design(Sample(method="saltelli", count=2048), 3, seed=0) - math.pi
+    x = 2 * math.pi * design(SampledField(method="saltelli", count=2048), 3, seed=0) - math.pi
     y = np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
     figures = _saltelli(3, y)
     assert figures[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.03)
@@ -99,7 +99,7 @@ def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
 
 
 def test_morris_of_a_plane_is_its_slopes() -> None:
-    x = design(Sample(method="morris", count=12), 3, seed=1)
+    x = design(SampledField(method="morris", count=12), 3, seed=1)
     assert x.shape == (48, 3)
     figures = _morris(x, x @ [3.0, -2.0, 0.0])
     assert figures[:, 0] == pytest.approx([3, 2, 0], abs=1e-9)
@@ -113,10 +113,10 @@ def test_rows_out_of_the_designs_order_are_refused(tmp_path: Path) -> None:
     assert found is not None
     assert found.figures[0, 2] == pytest.approx(1, abs=0.2)
     back = rows.table.take(pa.array(range(rows.table.num_rows - 1, -1, -1)))
-    shuffled = Rows(rows.plan, back, back["unit"].to_numpy(), rows.policy[::-1])
+    shuffled = CampaignRows(rows.plan, back, back["unit"].to_numpy(), rows.policy[::-1])
     with pytest.raises(RunError, match="the rows are not in the order of the design"):
         sensitivity(shuffled, "bytes.data_sent", 0)
-    other = Rows(plan(tmp_path, text.replace("seed: 5", "seed: 6")), rows.table, rows.unit, rows.policy)
+    other = CampaignRows(plan(tmp_path, text.replace("seed: 5", "seed: 6")), rows.table, rows.unit, rows.policy)
     with pytest.raises(RunError, match="is not the design's"):
         sensitivity(other, "bytes.data_sent", 0)
 
@@ -146,7 +146,7 @@ class Failing(Pretended):
     def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
         for rows in super().results(code, tasks):  # type: ignore[arg-type]
             yield [
-                Result(r.run, r.key, "failed", "ValueError: planted", "", (None, None)) if r.run == 3 else r
+                RunResult(r.run, r.key, "failed", "ValueError: planted", "", (None, None)) if r.run == 3 else r
                 for r in rows
             ]
 
@@ -191,7 +191,7 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     rows = rows_of(tmp_path, text, lambda fields, p: 1.0 + p)
     seen = rows.table.append_column("ap50.full_scene", pa.array([0.5] * rows.table.num_rows))
     none = pa.array([None] * rows.table.num_rows, pa.float64())
-    rows = Rows(rows.plan, seen.append_column("ap50.mission", none), rows.unit, rows.policy)
+    rows = CampaignRows(rows.plan, seen.append_column("ap50.mission", none), rows.unit, rows.policy)
     assert with_values(rows) == ["ap50.full_scene", "bytes.data_sent"]
     told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
     assert [line for line in told if "ap50.mission" in line] == [
@@ -206,7 +206,7 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     nothing = rows.table
     for metric in rows.plan.campaign.metrics:
         nothing = nothing.set_column(nothing.schema.get_field_index(metric), metric, none)
-    rows = Rows(rows.plan, nothing, rows.unit, rows.policy)
+    rows = CampaignRows(rows.plan, nothing, rows.unit, rows.policy)
     told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
     assert [line.split("\n")[1] for line in told if line.startswith("\n## ")] == ["## Metrics by policy", "## The rows"]
     assert not draw_varied(rows, tmp_path / "none.png")

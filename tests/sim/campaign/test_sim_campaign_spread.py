@@ -10,7 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.schema.campaign import Choice, Integers, LogNormal, Normal, Sample, Spread, Triangular, Uniform
+from sortie.scenarios.schema.campaign import (
+    Choice,
+    Integers,
+    LogNormal,
+    Normal,
+    SampledField,
+    Spread,
+    Triangular,
+    Uniform,
+)
 from sortie.sim.campaign.spread import design, quantile
 
 U = st.floats(0.001, 0.999)
@@ -53,11 +62,11 @@ def test_choices_and_integers_come_as_often_as_they_should() -> None:
 
 @pytest.mark.parametrize("method", ["latin_hypercube", "sobol"])
 def test_even_designs_have_one_draw_in_every_slice(method: str) -> None:
-    points = design(Sample(method=method, count=64), 3, seed=2)  # type: ignore[arg-type]
+    points = design(SampledField(method=method, count=64), 3, seed=2)  # type: ignore[arg-type]
     for column in points.T:
         assert sorted((column * 64).astype(int).tolist()) == list(range(64))
 
 
 def test_a_random_design_grows_at_its_end() -> None:
-    short, longer = (design(Sample(method="random", count=n), 2, seed=3) for n in (5, 9))
+    short, longer = (design(SampledField(method="random", count=n), 2, seed=3) for n in (5, 9))
     assert np.array_equal(short, longer[:5])

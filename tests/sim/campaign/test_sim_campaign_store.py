@@ -22,14 +22,14 @@ from campaign_examples import BASE, CAMPAIGN, Pretended, plan, pretend, table_by
 
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.parts import BrokenPartError, read_part
-from sortie.sim.campaign.plan import Plan
+from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.rows import find_row, read_rows
-from sortie.sim.campaign.store import Store
-from sortie.sim.campaign.work import Result, Task
+from sortie.sim.campaign.store import CampaignStore
+from sortie.sim.campaign.work import RunResult, Task
 from sortie.sim.folders import RunError
 
 
-def flown(p: Plan, folder: Path, **how: object) -> dict[str, bytes]:
+def flown(p: CampaignPlan, folder: Path, **how: object) -> dict[str, bytes]:
     run_campaign(p, folder, Pretended(**how))  # type: ignore[arg-type]
     return table_bytes(folder)
 
@@ -67,7 +67,7 @@ def test_a_damaged_journal_costs_its_own_rows_alone(tmp_path: Path, harm: str) -
         journal.write_bytes(b"".join(lines[:4]) + lines[4].replace(b"done", b"dome"))
     elif harm == "foreign":  # a row of another key, whole in itself
         other = plan(tmp_path, CAMPAIGN.replace("seed: 5", "seed: 6"))
-        store = Store(tmp_path / "other", other)
+        store = CampaignStore(tmp_path / "other", other)
         store.add([pretend(4, other.task(4), other.code)])
         store.close()
         journal.write_bytes(b"".join(lines[:4]) + (tmp_path / "other" / "journal" / "00000.jsonl").read_bytes())
@@ -109,7 +109,7 @@ def no_file_beyond(size_b: int) -> Iterator[None]:
 
 def test_a_short_write_is_not_counted_and_leaves_no_torn_line(tmp_path: Path) -> None:
     p, folder = plan(tmp_path), tmp_path / "a"
-    store, journal = Store(folder, p), folder / "journal" / "00000.jsonl"
+    store, journal = CampaignStore(folder, p), folder / "journal" / "00000.jsonl"
     rows = [pretend(run, p.task(run), p.code) for run in range(12)]
     store.add(rows[:2])
     size = journal.stat().st_size
@@ -122,7 +122,7 @@ def test_a_short_write_is_not_counted_and_leaves_no_torn_line(tmp_path: Path) ->
     store.add(rows[4:])  # behind a torn line they would not be read again
     assert store.finished == 10
     store.close()
-    store = Store(folder, p)
+    store = CampaignStore(folder, p)
     assert (store.finished, list(store.missing([0]))[:3]) == (10, [2, 3, 12])
     store.close()
 
@@ -212,7 +212,7 @@ FAILED = [2, 29, 30, 41]
 class Failing(Pretended):
     """Some of its runs fail."""
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[Result]]:
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         for (row,) in super().results(code, tasks):
             failed = row.run in FAILED
             yield [
@@ -220,7 +220,7 @@ class Failing(Pretended):
             ]
 
 
-def with_failures(p: Plan, folder: Path, stop_after: int | None = None) -> None:
+def with_failures(p: CampaignPlan, folder: Path, stop_after: int | None = None) -> None:
     """A campaign some of whose runs failed."""
     with suppress(KeyboardInterrupt):
         run_campaign(p, folder, Failing(stop_after=stop_after))
@@ -284,7 +284,7 @@ def test_a_retry_that_is_killed_at_any_moment_loses_nothing(tmp_path: Path, monk
 
 def test_a_late_answer_for_a_run_that_is_finished_is_not_counted_twice(tmp_path: Path) -> None:
     p = plan(tmp_path)
-    store = Store(tmp_path / "a", p)
+    store = CampaignStore(tmp_path / "a", p)
     row = pretend(3, p.task(3), p.code)
     store.add([row])
     store.add([row, row])
@@ -305,7 +305,7 @@ def test_folders_of_others_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"holds results of another campaign, its base.duration_s differs"):
         run_campaign(plan(tmp_path, base=BASE.replace("0.5", "0.6")), folder, Pretended())
     with pytest.raises(RunError, match=r"a: holds results of Sortie 0.1.0\+[0-9a-f]+, this is other; name another"):
-        run_campaign(Plan({**p.spec, "code": "other"}), folder, Pretended())
+        run_campaign(CampaignPlan({**p.spec, "code": "other"}), folder, Pretended())
     assert table_bytes(folder) == before
     manifest = json.loads((folder / "campaign.json").read_text())
     manifest["spec"]["format"] = 0
@@ -320,11 +320,11 @@ def test_folders_of_others_are_refused(tmp_path: Path) -> None:
 
 def test_two_drivers_do_not_share_a_folder(tmp_path: Path) -> None:
     p = plan(tmp_path)
-    store = Store(tmp_path / "a", p)
+    store = CampaignStore(tmp_path / "a", p)
     with pytest.raises(RunError, match="a: another driver is at work there"):
-        Store(tmp_path / "a", p)
+        CampaignStore(tmp_path / "a", p)
     store.close()
-    Store(tmp_path / "a", p).close()
+    CampaignStore(tmp_path / "a", p).close()
 
 
 def test_it_stops_when_enough_is_known_whoever_finished_first(tmp_path: Path) -> None:

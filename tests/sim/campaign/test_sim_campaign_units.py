@@ -11,9 +11,9 @@ import pytest
 from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
 
 from sortie.sim.campaign.drive import run_campaign
-from sortie.sim.campaign.rows import Rows, read_rows
+from sortie.sim.campaign.rows import CampaignRows, read_rows
 from sortie.sim.campaign.winners import winner
-from sortie.sim.campaign.work import Result
+from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
 
@@ -58,7 +58,7 @@ def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
         status[run], values[run] = "failed", math.nan
     table = rows.table.set_column(rows.table.schema.get_field_index("status"), "status", pa.array(status))
     table = table.set_column(table.schema.get_field_index("bytes.data_sent"), "bytes.data_sent", pa.array(values))
-    left = Rows(rows.plan, table, rows.unit, rows.policy)
+    left = CampaignRows(rows.plan, table, rows.unit, rows.policy)
     assert left.by_unit("bytes.data_sent").tolist() == [[30, 31]] * 5, "the other policy's mean of draw 1, too"
     assert [len(side) for side in left.pair("bytes.data_sent", 0, 1)] == [5, 5]
     assert left.lost().sum(axis=0).tolist() == [1, 0]
@@ -77,10 +77,10 @@ def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path
             for rows in super().results(code, tasks):  # type: ignore[arg-type]
                 yield [self.one(r) for r in rows]
 
-        def one(self, r: Result) -> Result:
+        def one(self, r: RunResult) -> RunResult:
             unit, policy = p.at(r.run).cell // 2, r.run % 2
             if policy == 1 and unit in hard:
-                return Result(r.run, r.key, "failed", "ValueError: too hard", "", (None, None))
+                return RunResult(r.run, r.key, "failed", "ValueError: too hard", "", (None, None))
             return r._replace(values=(100.0 * (unit in hard) + policy, 0.0))
 
     run_campaign(p, folder, Picky())  # type: ignore[arg-type]
@@ -101,7 +101,7 @@ def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> 
         def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
             for rows in super().results(code, tasks):  # type: ignore[arg-type]
                 yield [
-                    Result(r.run, r.key, "failed", "ValueError: broken", "", (None, None)) if r.run % 2 else r
+                    RunResult(r.run, r.key, "failed", "ValueError: broken", "", (None, None)) if r.run % 2 else r
                     for r in rows
                 ]
 

@@ -23,7 +23,7 @@ from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_d
 from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.sim.cli.app import app
-from sortie.sim.export.topics import BYTES_NAME, CONTEXT, Kind, Topic, links
+from sortie.sim.export.topics import BYTES_NAME, CONTEXT, Topic, TopicKind, links
 from sortie.sim.folders import RunError
 from sortie.sim.live import messages
 from sortie.sim.live.bus import LOOPBACK, Bus
@@ -76,7 +76,7 @@ def test_types_made_of_msg_files_are_those_written_by_hand(ros_name: str, by_han
 
 def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
     bus = Bus(DOMAIN)
-    topic = Topic(Kind.COMPACT, 0, 1)
+    topic = Topic(TopicKind.COMPACT, 0, 1)
     reader, writer = bus.reader(topic, 4), Bus(DOMAIN).writer(topic)
     while not writer.listeners:
         time.sleep(0.01)
@@ -90,7 +90,7 @@ def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
 
 def test_a_reader_that_is_found_while_they_are_counted_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The binding's list of them asks how many there are, makes room for so many, and asks again."""
-    bus, topic = Bus(DOMAIN), Topic(Kind.COMPACT, 0, 2)
+    bus, topic = Bus(DOMAIN), Topic(TopicKind.COMPACT, 0, 2)
     writer = bus.writer(topic)
     said = iter([1, 2])
     monkeypatch.setattr(type(writer._writer), "_get_matched_subscriptions", lambda *_: next(said))
@@ -136,7 +136,7 @@ def test_a_payload_that_is_none_is_refused(cdr: bytes) -> None:
 
 def test_topics_are_named_as_ros_2_names_them() -> None:
     assert CONTEXT.dds_name == "rt/fleet/context"
-    assert Topic(Kind.DIRECTIVE, 0, 12).dds_name == "rt/drone_0/to_drone_12/directive"
+    assert Topic(TopicKind.DIRECTIVE, 0, 12).dds_name == "rt/drone_0/to_drone_12/directive"
     assert dds_name(DESCRIPTOR_NAME) == "sortie_msgs::msg::dds_::ContextDescriptor_"
     assert links(3) == [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
 
@@ -261,10 +261,10 @@ def test_nobody_is_left_behind(flown: Flown) -> None:
 
 def test_the_bench_counts_every_topic(flown: Flown) -> None:
     result = flown.result
-    by_kind = dict(zip(Kind, result.topics, strict=True))
-    assert by_kind[Kind.CONTEXT].type == DESCRIPTOR_NAME
-    assert by_kind[Kind.FEATURES].mean_bytes == pytest.approx(flown.peer["payload_bytes"][0])
-    assert by_kind[Kind.DIRECTIVE].mean_bytes == 36
+    by_kind = dict(zip(TopicKind, result.topics, strict=True))
+    assert by_kind[TopicKind.CONTEXT].type == DESCRIPTOR_NAME
+    assert by_kind[TopicKind.FEATURES].mean_bytes == pytest.approx(flown.peer["payload_bytes"][0])
+    assert by_kind[TopicKind.DIRECTIVE].mean_bytes == 36
     assert result.data_bytes_per_s > 0
     assert result.decisions > 0
     assert result.drones_cpu_percent > 0

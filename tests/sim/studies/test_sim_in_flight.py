@@ -17,11 +17,11 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import accuracy, both_matched
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.in_flight import Level, flights, means, torch_answers
+from sortie.sim.studies.in_flight import ConditionAp, flights, means, torch_answers
 
 
-def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[Level]:
-    return [Level(policy, f"c{k}", region, a, b) for k, (a, b) in enumerate(zip(torch, surrogate, strict=True))]
+def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[ConditionAp]:
+    return [ConditionAp(policy, f"c{k}", region, a, b) for k, (a, b) in enumerate(zip(torch, surrogate, strict=True))]
 
 
 def test_means_and_gains_by_hand() -> None:

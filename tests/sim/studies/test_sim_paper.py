@@ -125,9 +125,9 @@ VARIED = [
 
 
 @pytest.fixture(scope="module")
-def result() -> paper.Result:
+def result() -> paper.PaperResult:
     scores = {"zero": Made({}, papers_world), "masked": Made({}, papers_world)}
-    return paper.Result(rows.judge(scores, ELSEWHERE), rows.points(scores), VARIED, dict(FACTS), made_picture())
+    return paper.PaperResult(rows.judge(scores, ELSEWHERE), rows.points(scores), VARIED, dict(FACTS), made_picture())
 
 
 def made_picture() -> Picture:
@@ -151,7 +151,7 @@ def made_picture() -> Picture:
 
 
 def test_the_report_is_written_whole_and_an_older_one_replaced(
-    result: paper.Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    result: paper.PaperResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "docs" / "paper"
     files = paper.write(result, out)
@@ -168,7 +168,7 @@ def test_the_report_is_written_whole_and_an_older_one_replaced(
 
 
 def test_a_report_that_dies_while_it_is_written_leaves_the_older_one(
-    result: paper.Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    result: paper.PaperResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "paper"
     monkeypatch.setattr(paper.figures, "available", lambda: False)
@@ -186,7 +186,7 @@ def test_a_report_that_dies_while_it_is_written_leaves_the_older_one(
 
 
 def test_without_matplotlib_there_are_tables_alone(
-    result: paper.Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    result: paper.PaperResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(paper.figures, "available", lambda: False)
     files = paper.write(result, tmp_path / "paper")
@@ -210,7 +210,7 @@ def test_a_folder_that_is_no_report_is_not_replaced(tmp_path: Path) -> None:
         paper.ensure_writable(report)
 
 
-def test_a_readme_without_the_markers_says_so(result: paper.Result, tmp_path: Path) -> None:
+def test_a_readme_without_the_markers_says_so(result: paper.PaperResult, tmp_path: Path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text("# Nothing\n")
     with pytest.raises(RunError, match=r"README\.md: must hold <!-- paper:begin --> and <!-- paper:end --> once each"):
