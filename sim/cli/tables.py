@@ -192,7 +192,7 @@ def training_table(result: Any) -> Table:
 
 def profile_table(profiler: cProfile.Profile, result: dict[str, Any]) -> Table:
     """Share of the wall time spent in each room's own code and in libraries, profiler's overhead included."""
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     spent: dict[str, float] = {}
     for (file, _, _), (_, _, own_s, _, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
         path = Path(file)

@@ -15,11 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import csma
 import numpy as np
 import simpy
 from scipy import stats
 
-from sortie.radio import Air, csma
+from sortie.radio import Air
 from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, two_ray_loss_db
 from sortie.radio.channel.shadowing import ShadowField

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import csma
 import numpy as np
 import pytest
 
-from sortie.radio import csma
 from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frames_exchanges
 from sortie.radio.mac.contention import CW_MIN, DIFS_S, SIFS_S, SLOT_S, contention
 

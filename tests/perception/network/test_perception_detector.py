@@ -14,7 +14,8 @@ from sortie.perception.detectors import make_detector
 from sortie.perception.joining import told
 from sortie.perception.metrics.ap import match
 from sortie.perception.network.detector import TorchDetector, ground_truth
-from sortie.perception.scene.scene_model import SceneModel, render
+from sortie.perception.scene import render
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene, Target
 

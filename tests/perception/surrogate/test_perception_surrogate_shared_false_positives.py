@@ -59,7 +59,7 @@ def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> N
 
 @pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
 def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
-    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
+    planted = replace(load(SHIPPED), mirages=np.array([part, chance, 0.4, 0.1], np.float32))
     found = seen_by_several(asked(planted, 40), planted.floor, 0)
     # how often another has it too: some stand so near a car that was missed that they are taken for it
     assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
@@ -72,7 +72,7 @@ def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float
 def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
     base, towns, seen = load(SHIPPED), range(30), dict[float, float]()
     for part in (0.0, 0.9):
-        planted = replace(base, shared_false_positives=np.array([part, 0.5, 0.5, 0.1], np.float32))
+        planted = replace(base, mirages=np.array([part, 0.5, 0.5, 0.1], np.float32))
         count = 0
         for town in towns:
             model = scene_model(0, "fit", town)

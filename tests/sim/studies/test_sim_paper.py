@@ -305,7 +305,7 @@ def test_two_frames_from_nothing_to_a_report_and_a_recording(
         "\n", " "
     )
     again, _ = rows.read(Path("again/paper.parquet"))
-    timed = {"plane_cost.median", "plane_cost.p99", "plane_cost.deadline", "plane_cost.x86.median"}
+    timed = {"plane.median", "plane.p99", "plane.deadline", "plane.x86.median"}
     assert [r for r in again if r.id not in timed] == [r for r in first if r.id not in timed]
     assert command("paper", "--frame", "1", "--work", "work", "--out", "out") == 0
     assert Path("work/frames/seed0_frame1_ego0.rrd").stat().st_size > 10_000
