@@ -26,7 +26,8 @@ from pettingzoo import ParallelEnv
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.sortie import VERSION, run_sortie
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.identity import code_version
 from sortie.sim.results.outcome import matched
 from sortie.sim.results.record import SortieRecord
 
@@ -276,7 +277,7 @@ class _Flight:
         """AP of its fusions in the second, less what it sent and spent."""
         new = {**self._new, "mission": self._mission}
         fusions = new["fusions"].filter(pc.equal(new["fusions"]["drone"], drone))
-        record = SortieRecord(self._scenario, "", 0, 0, VERSION, {**new, "fusions": fusions}, {})
+        record = SortieRecord(self._scenario, "", 0, 0, code_version(), {**new, "fusions": fusions}, {})
         frames = list(matched(record, mission=True).values()) or list(matched(record, mission=False).values())
         ap = average_precision(frames) if frames else 0.0
         sent = new["transmissions"]

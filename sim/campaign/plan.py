@@ -17,22 +17,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.perception.surrogate.model import SHIPPED
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.campaign import Study, as_node, extremes
 from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.reading.nodes import ScenarioError, assign, plain
-from sortie.scenarios.schema import Perception, Scenario
+from sortie.scenarios.schema import Perception
 from sortie.scenarios.schema.campaign import PARAMS, Campaign
 from sortie.scenarios.traces import located
-from sortie.sim.campaign.code import code_version, file_digest
 from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
 from sortie.sim.campaign.work import task_key
 from sortie.sim.engine.pilot import named
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
+from sortie.sim.identity import code_version, file_digest
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.outcome_fields import check_number, open_keys
 
@@ -200,7 +199,7 @@ def make_plan(study: Study) -> CampaignPlan:
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
-            "files": _files(base, [file for some in reading for file in named_files(some)]),
+            "files": _files([file for some in reading for file in named_files(some)]),
             "code": code_version(),
         }
     )
@@ -234,14 +233,9 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
     return {name: section[name] for name in ("name", "params", "changes", "commands")}
 
 
-def _files(base: Scenario, named: list[str]) -> dict[str, str]:
+def _files(named: list[str]) -> dict[str, str]:
     """Digests of the files that runs read beside the code, by path."""
     paths = [Path(name) for name in named]
-    config = base.perception
-    if config.detector == "surrogate" and config.weights is None:
-        paths.append(SHIPPED)
-    if config.detector == "torch" and config.weights is None:
-        paths += sorted((SHIPPED.parents[2] / "weights").glob("*.safetensors"))
     found = {}
     for path in paths:
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]

@@ -19,10 +19,10 @@ from pydantic import ValidationError
 
 from sortie.perception.network.memory import keep_freed
 from sortie.scenarios.schema import Scenario
-from sortie.sim.campaign.code import code_version, file_digest
 from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
+from sortie.sim.identity import code_version, file_digest
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 

@@ -37,8 +37,8 @@ from sortie.sim.cli import (
     view,
 )
 from sortie.sim.cli.console import err, out
-from sortie.sim.engine.sortie import VERSION
 from sortie.sim.folders import RunError
+from sortie.sim.identity import code_version
 
 
 class _Commands(TyperGroup):
@@ -89,5 +89,5 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _version(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     if version:
-        out.print(VERSION)
+        out.print(code_version())
         raise typer.Exit

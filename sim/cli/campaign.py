@@ -98,11 +98,11 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     Raises:
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
-    from sortie.sim.campaign.code import code_version
     from sortie.sim.campaign.parts import read_plan
     from sortie.sim.campaign.rows import find_row
     from sortie.sim.campaign.work import unpack
     from sortie.sim.folders import RunError
+    from sortie.sim.identity import code_version
 
     if folder is None or run is None:
         raise RunError("--from-campaign DIR and --run ID go together")

@@ -7,7 +7,6 @@ import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from typing import Protocol
 
 import pyarrow as pa
@@ -35,9 +34,9 @@ from sortie.sim.engine.pilot import Audit, Named, Pilot, PolicyPlan, named, plan
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.transport import Ether
 from sortie.sim.engine.world import World, route_bounds
+from sortie.sim.identity import code_version
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
-VERSION = version("sortie-sim")
 KEY_ID = 1
 PHASE_SHARE, PHASE_S = 0.1, 0.01
 """Drones act within the first tenth of a frame, and within its first 10 ms, each at its own moment: clocks disciplined,
@@ -203,7 +202,7 @@ def run_sortie(
         policy=name,
         seed=seed,
         replication=replication,
-        version=VERSION,
+        version=code_version(),
         tables=tables,
         totals={**notes.totals(), **audit.totals(), **_air_totals(air)},
         calibration=detector.calibration if isinstance(detector, DetectsMany) else None,

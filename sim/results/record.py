@@ -23,6 +23,7 @@ from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
 from sortie.policies.contract import Descriptor, Directive, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
+from sortie.sim.identity import release_of
 
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
@@ -110,6 +111,7 @@ class SortieRecord:
     seed: int
     replication: int
     version: str
+    """Of the code that made it, as `sortie.sim.identity.code_version`."""
     tables: Mapping[str, pa.Table]
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""
@@ -120,8 +122,11 @@ class SortieRecord:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over version, policy, seed and every table's values; equal records have equal fingerprints."""
-        digest = hashlib.sha256(f"{self.version}/{self.policy}/{self.seed}/{self.replication}".encode())
+        """SHA-256 over release, policy, seed and every table's values; equal records have equal fingerprints.
+
+        The code's digest stays out of it: a change of code that leaves every value as it was leaves the fingerprint too.
+        """
+        digest = hashlib.sha256(f"{release_of(self.version)}/{self.policy}/{self.seed}/{self.replication}".encode())
         for name in sorted(self.tables):
             digest.update(name.encode())
             for column in self.tables[name].column_names:

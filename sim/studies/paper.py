@@ -19,8 +19,8 @@ from sortie.perception.evaluation.picture import PAPER_BUDGETS, Picture, picture
 from sortie.perception.evaluation.results import TableSettings
 from sortie.perception.evaluation.rows import ClaimRow, Point
 from sortie.perception.evaluation.sensitivity import Varied, sensitivity
-from sortie.sim.engine.sortie import VERSION
 from sortie.sim.folders import ensure_folder, put_between, replacing
+from sortie.sim.identity import RELEASE
 from sortie.sim.studies.plane_cost import machine, measure_plane, measured_live
 
 REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
@@ -92,7 +92,7 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     progress("verdicts", 1, 1)
     facts = {
         "command": job.command,
-        "version": VERSION,
+        "version": RELEASE,
         "seed": job.seed,
         "frames": len(frames.scene),
         "scenes": len(set(frames.scene.tolist())),
