@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from sortie.scenarios.errors import SortieError
 
-class InputError(ValueError):
+
+class InputError(SortieError):
     """A file or setting that perception was given is not as it must be; the message names it, the value and the bound."""

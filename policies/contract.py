@@ -17,6 +17,8 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from sortie.scenarios.errors import SortieError
+
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
 COVERAGE_CELL_M = 12.8
@@ -198,7 +200,7 @@ def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPoli
     return mark
 
 
-class PolicyError(ValueError):
+class PolicyError(SortieError):
     """A policy broke its contract; the message names the directive, the field and the bound."""
 
 

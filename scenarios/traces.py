@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from sortie.scenarios.errors import SortieError
+
 Array = npt.NDArray[np.float64]
 Bounds = tuple[float, float]
 
@@ -24,7 +26,7 @@ SHIPPED = Path(__file__).parent / "library" / "traces"
 """The library's traces, which scenarios name by their path below it."""
 
 
-class TraceError(ValueError):
+class TraceError(SortieError):
     """A trace is not as it must be; the message names the file, the column, the row and the bound."""
 
 

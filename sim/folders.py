@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sortie.perception.evaluation.report import put_into
+from sortie.scenarios.errors import SortieError
 
 
-class RunError(ValueError):
+class RunError(SortieError):
     """What a user asked of files or folders and cannot be done; the message names the path."""
 
 

@@ -20,6 +20,7 @@ from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.flight.noise import LAGS, gauss_markov, smooth
 from sortie.fleet.flight.route import frame_path
 from sortie.scenarios import schema
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.streams import stream
 
 Array = npt.NDArray[np.float64]
@@ -32,7 +33,7 @@ ESTIMATE_TIME_S = 10.0
 """Correlation time of the errors of the position and heading estimates."""
 
 
-class MotionError(ValueError):
+class MotionError(SortieError):
     """The motion asked for cannot be flown; the message names the drone, the time and the settings."""
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from sortie.fleet.flight.frames import swap_attitude, swap_enu_ned, to_xyzw
 from sortie.fleet.logs.dataflash import Column, RawLog, is_dataflash, read_dataflash
 from sortie.fleet.logs.ulog import is_ulog, read_ulog
+from sortie.scenarios.errors import SortieError
 
 Array = npt.NDArray[np.float64]
 Table = Mapping[str, Column]
@@ -32,7 +33,7 @@ BACK_S = 0.5
 """A clock that steps back by more has been restarted."""
 
 
-class LogError(ValueError):
+class LogError(SortieError):
     """A file is no flight log, or holds nothing to fly; the message names it."""
 
 

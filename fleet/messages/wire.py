@@ -23,6 +23,7 @@ from sortie.policies.contract import (
     Representation,
     TaskPhase,
 )
+from sortie.scenarios.errors import SortieError
 
 MAX_DESCRIPTOR_BYTES = 1024
 COVERAGE_BYTES = 64
@@ -55,7 +56,7 @@ MIN_DESCRIPTOR_BYTES = _descriptor_layout(0, 0).size
 DIRECTIVE_BYTES = _DIRECTIVE.size
 
 
-class DescriptorTooLarge(ValueError):
+class DescriptorTooLarge(SortieError):
     """A descriptor that would pass 1 KB; the message names the field."""
 
 

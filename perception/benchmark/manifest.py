@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.difficulty import Split
+from sortie.scenarios.errors import SortieError
 
 MANIFEST = "manifest.json"
 COLUMNS = ("images", "true_pose", "est_pose", "cars")
 """Arrays of a scene's file."""
 
 
-class BenchmarkError(ValueError):
+class BenchmarkError(SortieError):
     """A benchmark on disk is missing, broken, or not what it says; the message names the file."""
 
 

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from sortie.scenarios.errors import SortieError
+
 _NOW = {
     "numpy._core.multiarray": "numpy.core.multiarray",  # numpy 2
     "numpy._core.numeric": "numpy.core.numeric",
@@ -24,7 +26,7 @@ _NOW = {
 _KINDS = re.compile(r"b1|[iu][1248]|f[248]|[US]\d{1,6}")
 
 
-class UnpickleError(ValueError):
+class UnpickleError(SortieError):
     """A pickle that is broken or holds more than data; the message names the file and what was refused."""
 
 

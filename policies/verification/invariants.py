@@ -20,11 +20,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
+from sortie.scenarios.errors import SortieError
 
 Kind = Literal["number", "truth"]
 
 
-class InvariantError(ValueError):
+class InvariantError(SortieError):
     """An invariant's text is not one; the message names the line and what it stumbled over."""
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
@@ -21,7 +22,7 @@ _SPECIAL_AGE_PERIODS = (0.0, 1.0, 3.0, 3.1, 10.0, 10.1, 600.0)
 _PERIODS_S = (0.1, 0.2, 1.0)
 
 
-class ViewError(ValueError):
+class ViewError(SortieError):
     """A view's file is not one; the message names the field."""
 
 

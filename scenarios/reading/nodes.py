@@ -6,12 +6,14 @@ import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from sortie.scenarios.errors import SortieError
+
 Scalar = str | int | float | bool | None
 Path = tuple[str | int, ...]
 """Where a value stands in a scenario: ("events", 0, "at_s"), written events.0.at_s."""
 
 
-class ScenarioError(ValueError):
+class ScenarioError(SortieError):
     """What is wrong with a scenario, in one line: `FILE:LINE: field.path: what, the value, the bound`."""
 
     def __init__(self, line: str) -> None:

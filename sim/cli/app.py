@@ -10,12 +10,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from sortie.fleet.flight.motion import MotionError
-from sortie.fleet.messages.wire import DescriptorTooLarge
-from sortie.perception.errors import InputError
-from sortie.policies.contract import PolicyError
-from sortie.scenarios.reading.load import ScenarioError
-from sortie.scenarios.traces import TraceError
+from sortie.scenarios.errors import SortieError
 from sortie.sim.cli import (
     bench,
     calibrate,
@@ -37,7 +32,6 @@ from sortie.sim.cli import (
     view,
 )
 from sortie.sim.cli.console import err, out
-from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 
 
@@ -73,15 +67,11 @@ for name, command in COMMANDS.items():
     app.command(name)(command)
 
 
-USER_ERRORS = (ScenarioError, PolicyError, MotionError, TraceError, DescriptorTooLarge, InputError, RunError)
-"""What a user can mend: one line and exit code 2, no traceback."""
-
-
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
     try:
         app()
-    except USER_ERRORS as error:
+    except SortieError as error:
         err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
 
