@@ -1,1 +1,76 @@
-"""Sortie simulates fleets of drones that share what they see: context, policy, real bytes and accuracy on one clock."""
+"""Sortie simulates fleets of drones that share what they see: context, policy, real bytes and accuracy on one clock.
+
+    import sortie
+
+    run = sortie.fly("track_target", {"duration_s": 20, "perception.detector": "surrogate"})
+    run.outcome["ap50"]["full_scene"]        # what the fleet saw
+    run.outcome["bytes"]["data_sent"]        # what it sent for it
+
+Everything here is loaded when it is first used. What is not in `__all__` is private and may change.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sortie._api import Campaign, Comparison, campaign, check, compare, env, fly, load, open_run
+    from sortie._run import Run
+    from sortie.policies.contract import (
+        Descriptor,
+        Directive,
+        Disc,
+        FleetView,
+        Policy,
+        PolicyError,
+        Reposition,
+        Representation,
+        TaskPhase,
+        looks_from,
+    )
+    from sortie.scenarios.errors import SortieError
+    from sortie.scenarios.reading.nodes import ScenarioError
+    from sortie.scenarios.schema import Scenario
+    from sortie.sim.folders import RunError
+
+    __version__: str
+
+__all__ = [
+    "load", "fly", "compare", "campaign", "check", "env", "open_run",
+    "Run", "Comparison", "Campaign", "Scenario",
+    "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition", "looks_from",
+    "SortieError", "ScenarioError", "PolicyError", "RunError",
+    "__version__",
+]  # fmt: skip
+
+_HOMES = {
+    "sortie._api": ("load", "fly", "compare", "campaign", "check", "env", "open_run", "Comparison", "Campaign"),
+    "sortie._run": ("Run",),
+    "sortie.policies.contract": (
+        "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition",
+        "looks_from", "PolicyError",
+    ),
+    "sortie.scenarios.errors": ("SortieError",),
+    "sortie.scenarios.reading.nodes": ("ScenarioError",),
+    "sortie.scenarios.schema": ("Scenario",),
+    "sortie.sim.folders": ("RunError",),
+}  # fmt: skip
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: Any = version("sortie-sim")
+    elif name in _HOME_OF:
+        value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    else:
+        raise AttributeError(f"module 'sortie' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

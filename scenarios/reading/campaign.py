@@ -13,7 +13,7 @@ from typing import Any
 
 from sortie.scenarios.reading.files import found_beside
 from sortie.scenarios.reading.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
-from sortie.scenarios.reading.nodes import Node, ScenarioError, assign, child, dotted, plain
+from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,
@@ -103,15 +103,6 @@ def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
     made = plain(node)
     assert isinstance(made, dict)  # noqa: S101
     return made
-
-
-def as_node(value: Any, source: str = "vary", line: int = 0) -> Node:
-    """A plain value as nodes that all say they stand at one place."""
-    if isinstance(value, dict):
-        return Node({key: as_node(v, source, line) for key, v in value.items()}, source, line)
-    if isinstance(value, list | tuple):
-        return Node([as_node(v, source, line) for v in value], source, line)
-    return Node(value, source, line, text=f"{value:g}" if isinstance(value, float) else str(value))
 
 
 def _relined(node: Node) -> Node:

@@ -12,7 +12,7 @@ import functools
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,11 +22,22 @@ from pydantic import BaseModel, ValidationError
 
 from sortie.scenarios.reading.explain import explain
 from sortie.scenarios.reading.files import found_beside
-from sortie.scenarios.reading.nodes import Issue, Node, Scalar, ScenarioError, assign, child, nearest, plain, problems
+from sortie.scenarios.reading.nodes import (
+    Issue,
+    Node,
+    Scalar,
+    ScenarioError,
+    as_node,
+    assign,
+    child,
+    nearest,
+    plain,
+    problems,
+)
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Contexts
 
-__all__ = ["ScenarioError", "dump", "library", "load", "loads"]
+__all__ = ["Overrides", "ScenarioError", "build", "dump", "library", "load", "loads"]
 
 Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 1_000_000
@@ -41,13 +52,17 @@ _LIBRARY = Path(__file__).parents[1] / "library"
 # --- public --------------------------------------------------------------------------------------
 
 
-def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+Overrides = Sequence[str] | Mapping[str, object]
+"""`key.path=value` as after `--set`, the value as YAML; or a map from key path to plain value. List entries by index."""
+
+
+def load(path_or_name: str | Path, overrides: Overrides = ()) -> Scenario:
     """Read a scenario from a file, or from the library by its bare name.
 
     Args:
         path_or_name: a path, or the name of a library file such as `track_target`. Files that it names are looked for
             from here, then from where it lies.
-        overrides: `key.path=value` as after `--set`; list entries by index, the value as YAML.
+        overrides: fields that differ from the file's.
 
     Raises:
         ScenarioError: one line that says which file, line and field, what is wrong and the bound.
@@ -56,14 +71,30 @@ def load(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     return found_beside(loads(text, source, overrides), Path(source).parent)
 
 
-def loads(text: str, source: str = "<text>", overrides: Sequence[str] = ()) -> Scenario:
+def loads(text: str, source: str = "<text>", overrides: Overrides = ()) -> Scenario:
     """Read a scenario from text; `source` stands for the file name in errors. Raises ScenarioError."""
-    root = tree(text, source)
+    return _scenario(tree(text, source), source, overrides)
+
+
+def build(sections: Mapping[str, object], overrides: Overrides = (), source: str = "scenario") -> Scenario:
+    """A scenario from plain sections, `{"name": "mine", "fleet": {"drones": 3}}`; `source` stands for the file name in errors.
+
+    Raises:
+        ScenarioError: one line that says which field, what is wrong and the bound.
+    """
+    return _scenario(as_node(sections, source), source, overrides)
+
+
+def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
     for key, what, command in _OTHERS:
         if child(root, key) is not None and child(root, "name") is None:
             raise ScenarioError(f"{source}: is {what}, not a scenario; its command is: {command} {source}")
-    for override in overrides:
-        root = _override(root, override)
+    if isinstance(overrides, Mapping):
+        for key, value in overrides.items():
+            root = _assigned(root, key, as_node(value, "overrides"), "overrides")
+    else:
+        for override in overrides:
+            root = _override(root, override)
     return validated(root, Scenario)
 
 
@@ -165,12 +196,17 @@ def _override(root: Node, override: str) -> Node:
     short = override if len(override) <= 80 else override[:77] + "..."
     source = f"--set {short}"
     key, equals, value = override.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
+    if not equals or not all(key.strip().split(".")):
         raise ScenarioError(f"{source}: must be key.path=value")
+    return _assigned(root, key, _read(value, source, line=0) or Node(None, source, 0), source)
+
+
+def _assigned(root: Node, key: object, new: Node, source: str) -> Node:
+    parts = key.strip().split(".") if isinstance(key, str) else []
+    if not all(parts) or not parts:
+        raise ScenarioError(f"{source}: {key!r} is no field, must be key.path")
     if len(parts) > MAX_DEPTH:
         raise ScenarioError(f"{source}: {len(parts)} levels deep, must be at most {MAX_DEPTH}")
-    new = _read(value, source, line=0) or Node(None, source, 0)
     return assign(root, parts, new)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -79,6 +80,23 @@ def plain(node: Node) -> object:
     if isinstance(node.value, Sequence) and not isinstance(node.value, str):
         return [plain(child) for child in node.value]
     return node.value
+
+
+def as_node(value: object, source: str = "vary", line: int = 0) -> Node:
+    """A plain value as nodes that all say they stand at one place; what is not plain has a problem that says so."""
+    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
+        value = value.item()  # a number of numpy's
+    if isinstance(value, Mapping):
+        if odd := [key for key in value if not isinstance(key, str)]:
+            return Node(None, source, line, problem=f"the key {odd[0]!r} is no text")
+        return Node({key: as_node(v, source, line) for key, v in value.items()}, source, line)
+    if isinstance(value, list | tuple):
+        return Node([as_node(v, source, line) for v in value], source, line)
+    if isinstance(value, float) and not math.isfinite(value):
+        return Node(None, source, line, problem=f"{value}, must be a finite number")
+    if value is None or isinstance(value, str | int | float):
+        return Node(value, source, line, text=f"{value:g}" if isinstance(value, float) else str(value))
+    return Node(None, source, line, problem=f"{value!r:.60}, must be a number, text, a list or a section")
 
 
 def child(node: Node, part: str | int) -> Node | None:

@@ -19,10 +19,10 @@ import numpy as np
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
-from sortie.scenarios.reading.campaign import Study, as_node, extremes
+from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
 from sortie.scenarios.reading.load import loads
-from sortie.scenarios.reading.nodes import ScenarioError, assign, plain
+from sortie.scenarios.reading.nodes import ScenarioError, as_node, assign, plain
 from sortie.scenarios.schema import Perception
 from sortie.scenarios.schema.campaign import PARAMS, Campaign
 from sortie.scenarios.traces import located

@@ -57,12 +57,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
     """A scenario file with expectations."""
-    if file_path.suffix in (".yaml", ".yml") and _is_scenario(file_path):
+    if file_path.suffix in (".yaml", ".yml") and is_scenario(file_path):
         return ScenarioFile.from_parent(parent, path=file_path)
     return None
 
 
-def _is_scenario(path: Path) -> bool:
+def is_scenario(path: Path) -> bool:
     from sortie.sim.check.golden import golden_path
 
     try:

@@ -13,7 +13,8 @@ from rich.table import Table
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.manifest import complaints, read
 from sortie.perception.geometry import Geometry
-from sortie.sim.cli.console import err, out, stages, user_errors
+from sortie.sim.cli.console import err, out, stages
+from sortie.sim.user_errors import user_errors
 
 app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
 

@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bar
 from typer.core import TyperGroup
 
-from sortie.sim.cli.console import err, out, user_errors
+from sortie.sim.cli.console import err, out
+from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.scenarios.schema import Scenario

@@ -18,6 +18,7 @@ from sortie.sim.cli.conditions import compare_contexts, refuse
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+from sortie.sim.studies.compare import Contender
 from sortie.sim.studies.compare import compare as compare_policies
 
 
@@ -48,14 +49,15 @@ def compare(
         return compare_contexts(contexts, chosen, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of contexts; for {scenario}: --set perception.detector=torch")
-    flown = [(p, loaded(scenario, set_, p)) for p in _split_policies(policies)]
+    flown = [Contender(p, loaded(scenario, set_, p)) for p in _split_policies(policies)]
     ensure_files(out_file, recording)
     ensure_between(readme, tables.COMPARE_BEGIN, tables.COMPARE_END)
     if own_fusion:
-        flown = [(p, _with_own_fusion(s)) for p, s in flown]
+        flown = [c._replace(scenario=_with_own_fusion(c.scenario)) for c in flown]
     with bars() as bar:
-        each = {label: bar(label, s.duration_s) for label, s in flown}
-        rows = compare_policies(flown, seed, progress=lambda label, t_s: each[label](t_s))
+        each = {c.label: bar(c.label, c.scenario.duration_s) for c in flown}
+        flown_seed = flown[0].scenario.seed if seed is None else seed
+        rows, _ = compare_policies(flown, [flown_seed], progress=lambda label, _, t_s: each[label](t_s))
     out.print(tables.comparison_table(rows))
     for line in tables.explanations(rows):
         out.print(line)
@@ -71,7 +73,7 @@ def compare(
     if recording is not None:
         from sortie.sim.playback.recording import save_comparison
 
-        save_comparison([(r.policy, r.record) for r in rows], recording)
+        save_comparison([(r.policy, r.record) for r in rows if r.record is not None], recording)
         out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: where they print, progress bars, and errors that are one line."""
+"""What the commands share: where they print, and progress bars."""
 
 from __future__ import annotations
 
@@ -8,12 +8,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sortie.sim.folders import RunError
-
 out = Console()
 err = Console(stderr=True, highlight=False)
-EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds"}
-"""Which extra brings a library that not everybody needs."""
 
 
 @contextmanager
@@ -41,20 +37,3 @@ def stages(prefix: str = "") -> Iterator[Callable[[str, int, int], None]]:
             known[stage](done)
 
         yield report
-
-
-@contextmanager
-def user_errors() -> Iterator[None]:
-    """A file, field or missing extra is the user's to mend: one line, no traceback."""
-    try:
-        yield
-    except ImportError as error:
-        name = (error.name or "").partition(".")[0]
-        if name not in EXTRAS:
-            raise
-        raise RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") from error
-    except OSError as error:
-        where = "" if error.filename is None else f"{error.filename}: "
-        raise RunError(f"{where}{error.strerror or error}") from error
-    except ValueError as error:
-        raise RunError(str(error)) from error

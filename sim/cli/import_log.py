@@ -14,8 +14,9 @@ import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.scenarios.reading.load import loads
-from sortie.sim.cli.console import out, user_errors
+from sortie.sim.cli.console import out
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
+from sortie.sim.user_errors import user_errors
 
 Array = np.ndarray[Any, Any]
 

@@ -11,9 +11,10 @@ import typer
 from rich.table import Table
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.cli.console import err, out, stages, user_errors
+from sortie.sim.cli.console import err, out, stages
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.policy_text import policy_overrides
+from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.sim.live.result import LiveResult

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sortie.sim.cli.console import out, stages, user_errors
+from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
+from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.perception.study.measure import StudyRow

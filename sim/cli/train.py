@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from sortie.sim.cli.console import out, stages, user_errors
+from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import ensure_files
+from sortie.sim.user_errors import user_errors
 
 
 class ExchangeForm(StrEnum):

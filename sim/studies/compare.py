@@ -1,56 +1,126 @@
-"""Policies side by side on one scenario: same seed, same scenes, same draws, paired intervals."""
+"""Policies side by side on one scenario: same seeds, same scenes, same draws, paired intervals."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import compare as bootstrap
+from sortie.policies.contract import Policy
 from sortie.policies.registry import resolve
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import matched, outcome
 from sortie.sim.results.record import SortieRecord
 
+AREAS = {"full_scene": False, "mission": True}
+"""Where AP is scored: its name in the outcome, and whether it is the mission's disc."""
+
+
+class Contender(NamedTuple):
+    """One of the policies that are compared."""
+
+    label: str
+    scenario: Scenario
+    """With this policy in it; otherwise alike among contenders."""
+    function: Policy | None = None
+    """Decides in place of the scenario's policy; None where the scenario names it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """One policy's sortie, and its accuracy against the first policy's."""
+    """One policy's sortie under one seed, and its accuracy against the first policy's."""
 
     policy: str
-    record: SortieRecord
     outcome: dict[str, Any]
     gain: dict[str, tuple[float, float, float] | None]
-    """AP@0.5 minus the first policy's and its 95 % interval, `full_scene` and `mission`; None where undefined."""
+    """AP@0.5 minus the first policy's and its 95 % interval over the sortie's instants, `full_scene` and `mission`;
+    None where it is not defined."""
+    record: SortieRecord | None
+    """None where several seeds were flown: their records would fill the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """One policy's AP@0.5 minus the first policy's, over all seeds."""
+
+    policy: str
+    metric: str
+    """`ap50.full_scene` or `ap50.mission`."""
+    gain: float
+    low: float
+    high: float
+    """The 95 % interval, by a paired bootstrap over what `over` names."""
+    over: str
+    """`instants of one sortie` or `sorties`: what was resampled, and so what the interval covers."""
+
+
+class PairedFusions:
+    """Fusions that the first policy and another one both scored, and what the bootstrap must not part."""
+
+    def __init__(self) -> None:
+        self._first: list[Matched] = []
+        self._other: list[Matched] = []
+        self._groups: list[int] = []
+
+    def add(self, first: Sequence[Matched], other: Sequence[Matched], groups: Sequence[int]) -> None:
+        """Add what the two sorties of one seed both scored."""
+        self._first += first
+        self._other += other
+        self._groups += groups
+
+    def gain(self) -> tuple[float, float, float] | None:
+        """AP of the other minus the first's with its interval; None where there was nothing to find."""
+        if not all(any(m.truths for m in arm) for arm in (self._first, self._other)):
+            return None
+        found = bootstrap(self._first, self._other, self._groups)
+        return found.delta, found.low, found.high
 
 
 def compare(
-    flown: Sequence[tuple[str, Scenario]],
-    seed: int | None = None,
+    contenders: Sequence[Contender],
+    seeds: Sequence[int],
     *,
-    progress: Callable[[str, float], None] | None = None,
-) -> list[Compared]:
-    """Fly a scenario under several policies on the same seed.
+    progress: Callable[[str, int, float], None] | None = None,
+) -> tuple[tuple[Compared, ...], tuple[Gain, ...]]:
+    """Fly a scenario under several policies on the same seeds.
 
     Args:
-        flown: label and scenario, alike but for their policy.
-        progress: called with the label and the simulated time.
+        progress: called with the label, the seed and the simulated time.
+
+    Returns:
+        One `Compared` a seed and policy, seed by seed; and the gains of every policy but the first over all seeds.
 
     Raises:
         PolicyError: an unknown policy or parameter, before anything is flown.
     """
-    for _, scenario in flown:
-        resolve(scenario.policy.name, scenario.policy.params)
-    rows: list[Compared] = []
-    for label, scenario in flown:
-        watch = None if progress is None else functools.partial(progress, label)
-        record = run_sortie(scenario, None, seed, progress=watch)
-        first = rows[0].record if rows else None
-        rows.append(Compared(label, record, outcome(record), _gain(record, first)))
-    return rows
+    for contender in contenders:
+        if contender.function is None:
+            resolve(contender.scenario.policy.name, contender.scenario.policy.params)
+    flown: list[Compared] = []
+    several = len(seeds) > 1
+    pairs = {(c.label, name): PairedFusions() for c in contenders[1:] for name in AREAS}
+    for k, seed in enumerate(seeds):
+        first: SortieRecord | None = None
+        for label, scenario, function in contenders:
+            watch = None if progress is None else functools.partial(progress, label, seed)
+            record = run_sortie(scenario, function, seed, progress=watch)
+            gains: dict[str, tuple[float, float, float] | None] = dict.fromkeys(AREAS)
+            if first is not None:
+                for name, mission in AREAS.items():
+                    theirs, ours, instants = pair_up([first], [record], mission=mission)
+                    here = PairedFusions()
+                    here.add(theirs, ours, instants)
+                    gains[name] = here.gain()
+                    pairs[label, name].add(theirs, ours, [k] * len(ours) if several else instants)
+            first = record if first is None else first
+            flown.append(Compared(label, outcome(record), gains, None if several else record))
+    over = "sorties" if several else "instants of one sortie"
+    found = {key: pair.gain() for key, pair in pairs.items()}
+    return tuple(flown), tuple(Gain(label, f"ap50.{name}", *g, over) for (label, name), g in found.items() if g)
 
 
 def pair_up(
@@ -82,15 +152,3 @@ def pair_up(
                 second.append(theirs[t_s, drone])
                 groups.append(k if whole_sorties else instants.setdefault((k, t_s), len(instants)))
     return first, second, groups
-
-
-def _gain(record: SortieRecord, first: SortieRecord | None) -> dict[str, tuple[float, float, float] | None]:
-    gains: dict[str, tuple[float, float, float] | None] = {"full_scene": None, "mission": None}
-    if first is None:
-        return gains
-    for name, mission in (("full_scene", False), ("mission", True)):
-        theirs, ours, groups = pair_up([first], [record], mission=mission)
-        if all(any(m.truths for m in arm) for arm in (theirs, ours)):  # where there was nothing to find there is no AP
-            d = bootstrap(theirs, ours, groups)
-            gains[name] = (d.delta, d.low, d.high)
-    return gains

@@ -21,8 +21,8 @@ from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
-from sortie.sim.cli.console import user_errors
 from sortie.sim.folders import RunError
+from sortie.sim.user_errors import user_errors
 
 pytest.importorskip("distributed")
 

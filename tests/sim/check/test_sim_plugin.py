@@ -19,7 +19,7 @@ from sortie.scenarios.reading.load import load
 from sortie.sim.check.checking import check_scenario
 from sortie.sim.check.expectations import check, limit
 from sortie.sim.check.golden import golden_path, moved, write_golden
-from sortie.sim.check.plugin import _is_scenario
+from sortie.sim.check.plugin import is_scenario
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -265,9 +265,9 @@ def test_a_golden_outcome_that_is_not_compared_is_skipped(tmp_path: Path) -> Non
 def test_a_scenario_is_told_from_other_yaml(tmp_path: Path, text: str, is_one: bool) -> None:
     path = tmp_path / "some.yaml"
     path.write_text(text, "utf-8")
-    assert _is_scenario(path) is is_one
+    assert is_scenario(path) is is_one
     golden_path(path).write_text("{}")
-    assert _is_scenario(path) is (is_one or text == "{name: x}")
+    assert is_scenario(path) is (is_one or text == "{name: x}")
 
 
 def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:

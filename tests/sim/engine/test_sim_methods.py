@@ -14,11 +14,13 @@ from sortie.policies.catalogue.prior import METHODS
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
-from sortie.sim.studies.compare import compare
+from sortie.sim.studies.compare import Contender, compare
 
 
 def test_every_method_flies_in_a_comparison() -> None:
-    rows = compare([(name, example(f"policy.name={name}", "policy.params={}", "duration_s=3")) for name in METHODS])
+    rows, _ = compare(
+        [Contender(name, example(f"policy.name={name}", "policy.params={}", "duration_s=3")) for name in METHODS], [1]
+    )
     sent = {r.policy: r.outcome["bytes"]["data_sent"] for r in rows}
     assert all(sent.values())
     assert sent["fixed-compression"] < sent["where2comm"] < sent["v2vnet"] == sent["disconet"]
@@ -35,7 +37,10 @@ def test_where_there_is_nothing_to_find_there_is_no_gain() -> None:
         "mission.phases=[{at_s: 0, phase: search}]",
     ]
     bare += [f"perception.scene.{name}=0" for name in ("parked_density", "moving_cars_per_km")]
-    rows = compare([(name, example(f"policy.name={name}", "policy.params={}", *bare)) for name in ("silence", "all-4")])
+    rows, _ = compare(
+        [Contender(name, example(f"policy.name={name}", "policy.params={}", *bare)) for name in ("silence", "all-4")],
+        [1],
+    )
     assert [r.outcome["ap50"]["scored_fusions"] for r in rows] == [20, 20]
     assert [r.gain for r in rows] == [{"full_scene": None, "mission": None}] * 2
 

@@ -9,7 +9,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import compare
+from sortie.sim.studies.compare import Contender, compare
 
 SHORT = ("duration_s=16", "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]", "policy.dwell_s=0.2")
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ def silent() -> SortieRecord:
 def test_cooperation_beats_single_drones_and_the_interval_says_so() -> None:
     """Full maps over a medium that is wide enough for them: sharing every cell gains over silence."""
     wide = ("policy.params={rho: 0.25}",)
-    rows = compare([("silence", scenario("silence")), ("all-4", scenario("all-4", *wide))])
+    rows, _ = compare([Contender("silence", scenario("silence")), Contender("all-4", scenario("all-4", *wide))], [1])
     gain, low, high = rows[1].gain["full_scene"] or (0.0, 0.0, 0.0)
     assert low > 0.0, f"gain {gain:.3f} [{low:.3f}, {high:.3f}]"
     assert rows[0].outcome["ap50"]["full_scene"] > 0.05

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from sortie.perception.recordings.recording import RecordingError
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.studies.compare import compare
+from sortie.sim.studies.compare import Contender, compare
 
 RECORDED = "perception.detector=recorded"
 SHORT = ("duration_s=2", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.2")
@@ -63,7 +63,7 @@ def test_sharing_gains_over_silence_on_a_recording(tmp_path: Path) -> None:
     flight = (*SHORT, RECORDED, f"perception.recording={path}")
     sharing = example(*flight, "policy.name=all-4", "policy.params={rho: 0.05}")
     silent = example(*flight, "policy.name=silence", "policy.params={}")
-    rows = compare([("silence", silent), ("all-4", sharing)])
+    rows, _ = compare([Contender("silence", silent), Contender("all-4", sharing)], [silent.seed])
     _, low, _ = rows[1].gain["full_scene"] or (0.0, 0.0, 0.0)
     assert low > 0.0
     assert rows[1].outcome["ap50"]["detector"] == "recorded"

@@ -1,0 +1,32 @@
+"""What a user can put right in files, fields and missing extras, as one error of one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sortie.scenarios.errors import SortieError
+from sortie.sim.folders import RunError
+
+EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds", "pettingzoo": "env",
+          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign"}  # fmt: skip
+"""Which extra brings a library that not everybody needs."""
+
+
+@contextmanager
+def user_errors() -> Iterator[None]:
+    """A file, field or missing extra is the user's to mend: one line, no traceback."""
+    try:
+        yield
+    except ImportError as error:
+        name = (error.name or "").partition(".")[0]
+        if name not in EXTRAS:
+            raise
+        raise RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") from error
+    except OSError as error:
+        where = "" if error.filename is None else f"{error.filename}: "
+        raise RunError(f"{where}{error.strerror or error}") from error
+    except SortieError:
+        raise
+    except ValueError as error:
+        raise RunError(str(error)) from error

@@ -1,0 +1,381 @@
+"""The public functions: load, fly, compare, campaign, check, env, open_run."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sortie._run import Run
+from sortie.policies.contract import Policy, PolicyError
+from sortie.scenarios.reading import load as reading
+from sortie.scenarios.reading.load import Overrides
+from sortie.scenarios.reading.nodes import ScenarioError
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.policy_text import policy_overrides
+from sortie.sim.user_errors import user_errors
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from sortie.sim.check.checking import Checked
+    from sortie.sim.engine.sortie import Observer
+    from sortie.sim.env import SortieEnv
+    from sortie.sim.studies.compare import Compared, Gain
+
+ScenarioLike = str | Path | Mapping[str, object] | Scenario
+"""A library scenario's name, a file, plain sections, or a scenario that was loaded before."""
+PolicyLike = str | Policy
+"""A name, `name(key=value)`, `path/to/file.py:function`, or any callable of one FleetView."""
+MAX_SEED = 2**63 - 1
+
+
+def load(scenario: ScenarioLike, overrides: Overrides = ()) -> Scenario:
+    """Read and check a scenario.
+
+    Args:
+        scenario: a library scenario's name (`sortie list scenarios` shows them), the path of a YAML file, plain
+            sections as a dict, or a `Scenario`.
+        overrides: fields that differ, `{"fleet.drones": 7}`, or a list of texts as after `--set`, `["fleet.drones=7"]`.
+
+    Returns:
+        A frozen `Scenario`, every default filled in. Units stand in the field names.
+
+    Raises:
+        ScenarioError: one line that names the file, the field, the value and what is allowed.
+
+    Example:
+        >>> sortie.load("track_target", {"fleet.drones": 7}).fleet.drones
+        7
+        >>> sortie.load({"name": "mine", "duration_s": 5}).frames
+        50
+    """
+    if isinstance(overrides, str) or not isinstance(overrides, Mapping | Sequence):
+        raise ScenarioError(f"overrides: {overrides!r}, must be a map or a list: {{'fleet.drones': 3}}")
+    if isinstance(scenario, str | os.PathLike):
+        return reading.load(os.fspath(scenario), overrides)
+    if isinstance(scenario, Scenario):
+        if not overrides:
+            return scenario
+        return reading.build(scenario.model_dump(mode="json", exclude_none=True), overrides, scenario.name)
+    if isinstance(scenario, Mapping):
+        return reading.build(scenario, overrides)
+    raise ScenarioError(f"scenario: {scenario!r}, must be a name, a path, a dict or a Scenario")
+
+
+def fly(
+    scenario: ScenarioLike,
+    overrides: Overrides = (),
+    *,
+    policy: PolicyLike | None = None,
+    seed: int | None = None,
+    replication: int = 0,
+    progress: Callable[[float], None] | None = None,
+    observer: Observer | None = None,
+) -> Run:
+    """Fly one sortie.
+
+    Args:
+        scenario, overrides: as `sortie.load` takes them.
+        policy: who decides; None takes the scenario's own. Another policy flies to the end: the scenario's changes of
+            policy and commands belong to its own.
+        seed: of every random draw; None takes the scenario's own.
+        replication: another draw of everything random under the same seed.
+        progress: called with the simulated time (s) once a simulated second.
+        observer: gets the new rows of the record once a simulated second.
+
+    Returns:
+        The `Run`. Equal scenario, policy, seed, replication and version give equal runs.
+
+    Raises:
+        ScenarioError, PolicyError: what is wrong, before anything flies; PolicyError also in flight, when the policy
+            fails or breaks its contract.
+
+    Example:
+        >>> short = {"duration_s": 2, "perception.detector": "none"}
+        >>> sortie.fly("track_target", short, policy="best-2(rho=0.1)").policy
+        'best-2(rho=0.1)'
+        >>> def quiet(view):
+        ...     return [sortie.Directive(view.ego, peer, reason="quiet") for peer in view.peers]
+        >>> sortie.fly("track_target", short, policy=quiet).outcome["bytes"]["data_sent"]
+        0
+    """
+    from sortie.sim.engine.sortie import run_sortie
+
+    chosen, function = _with_policy(load(scenario, overrides), policy)
+    _ensure_seed("seed", seed)
+    _ensure_seed("replication", replication)
+    record = run_sortie(chosen, function, seed, replication=replication, progress=progress, observer=observer)
+    return Run(record)
+
+
+def open_run(path: str | Path) -> Run:
+    """Read a run's folder back, as `Run.save` or `sortie fly` wrote it.
+
+    Raises:
+        RunError: there is no run, or it is damaged.
+
+    Example:
+        >>> run = sortie.fly("track_target", {"duration_s": 1, "perception.detector": "none"})
+        >>> sortie.open_run(run.save(folder / "a", recording=False)).fingerprint == run.fingerprint
+        True
+    """
+    from sortie.sim.results import run_folder
+
+    folder = _path("path", path)
+    return Run(run_folder.load(folder), folder)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Sorties under several policies, the same scenario, seeds and draws; made by `sortie.compare`."""
+
+    sorties: tuple[Compared, ...]
+    """One a policy and seed; seed by seed, policies in the order in which they were named."""
+    gains: tuple[Gain, ...]
+    """AP@0.5 of every policy but the first, minus the first's, with a paired 95 % interval. `Gain.over` says what
+    the interval covers."""
+
+    @cached_property
+    def table(self) -> pa.Table:
+        """A row a sortie: `policy`, `seed`, then every metric of the outcome by its dotted name."""
+        import pyarrow as pa
+
+        from sortie._run import _numbers
+
+        rows = [{"policy": s.policy, "seed": s.outcome["seed"], **dict(_numbers("", s.outcome))} for s in self.sorties]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        return pa.table({name: [row.get(name) for row in rows] for name in names})
+
+
+def compare(
+    scenario: ScenarioLike,
+    policies: Iterable[PolicyLike],
+    overrides: Overrides = (),
+    *,
+    seeds: Iterable[int] | None = None,
+    progress: Callable[[str, int, float], None] | None = None,
+) -> Comparison:
+    """Fly a scenario under several policies, with the same seeds and draws.
+
+    Args:
+        scenario, overrides: as `sortie.load` takes them.
+        policies: two or more; gains are over the first.
+        seeds: None flies the scenario's own seed alone. The interval then covers the instants of that one flight. With
+            several seeds it covers flights.
+        progress: called with the policy's label, the seed and the simulated time (s).
+
+    Raises:
+        ScenarioError, PolicyError: what is wrong, before anything flies.
+
+    Example:
+        >>> short = {"duration_s": 2, "perception.detector": "surrogate"}
+        >>> sortie.compare("track_target", ["worked", "silence"], short).table["policy"].to_pylist()
+        ['worked', 'silence']
+    """
+    from sortie.sim.studies.compare import Contender
+    from sortie.sim.studies.compare import compare as compare_policies
+
+    base = load(scenario, overrides)
+    if isinstance(policies, str) or not isinstance(policies, Iterable):
+        raise PolicyError(f"policies: {policies!r}, must be a list of policies: ['worked', 'silence']")
+    flown = [Contender(_label(policy), *_with_policy(base, policy)) for policy in policies]
+    labels = [contender.label for contender in flown]
+    if not flown or len(set(labels)) < len(labels):
+        raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once")
+    if seeds is not None and not isinstance(seeds, Iterable):
+        raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds: range({seeds!r})")
+    chosen = [base.seed] if seeds is None else list(seeds)
+    for seed in chosen:
+        _ensure_seed("seeds", seed)
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
+    return Comparison(*compare_policies(flown, chosen, progress=progress))
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """What is finished of a campaign; made by `sortie.campaign`."""
+
+    path: Path
+    """Its folder."""
+    finished: int
+    """Runs whose rows are on disk."""
+    failed: int
+    """Of those, runs that failed; their rows say why."""
+    flown: int
+    """Runs that this call flew."""
+    seconds: float
+    """How long it took."""
+
+    @cached_property
+    def rows(self) -> pa.Table:
+        """A row a run: its varied fields, policy, seed, status and the campaign's metrics."""
+        from sortie.sim.campaign.rows import read_rows
+
+        return read_rows(self.path).all
+
+    def report(self) -> Path:
+        """Write `report.md` with its figures into the folder, and return its path.
+
+        Raises:
+            RunError: nothing is finished, matplotlib is missing, or the disk refuses.
+        """
+        from sortie.sim.campaign.report import write_report
+
+        with user_errors():
+            return write_report(self.path)
+
+
+def campaign(
+    campaign: str | Path,
+    *,
+    out: str | Path | None = None,
+    workers: int | None = 0,
+    scheduler: str | None = None,
+    resume: bool = False,
+    retry_failed: bool = False,
+    progress: Callable[[Any], None] | None = None,
+) -> Campaign:
+    """Fly a campaign: many sorties over what its file varies. Interrupted at any moment, the same call goes on.
+
+    Args:
+        campaign: a campaign file, or a library campaign's name.
+        out: its folder; None takes `runs/campaign-NAME`.
+        workers: worker processes; 0 flies in this process, None takes one a core. A script that asks for workers keeps
+            its calls under `if __name__ == "__main__":`, since each worker imports the script.
+        scheduler: the address of a dask cluster that is running, `tcp://host:8786`.
+        resume: only go on; an error if there is nothing to go on with.
+        retry_failed: fly runs that failed once more.
+        progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
+
+    Raises:
+        ScenarioError, PolicyError: what is wrong with the campaign, before anything flies.
+        RunError: a folder that cannot be used, or a cluster that is not there.
+
+    Example:
+        >>> done = sortie.campaign("link_battery", out="runs/c", workers=2)    # doctest: +SKIP
+        >>> done.rows.group_by("policy").aggregate([("ap50.mission", "mean")])    # doctest: +SKIP
+    """
+    from sortie.scenarios.reading.campaign import load_campaign
+    from sortie.sim.campaign.drive import run_campaign
+    from sortie.sim.campaign.engine import open_engine
+    from sortie.sim.campaign.plan import make_plan
+    from sortie.sim.campaign.store import ensure_usable
+
+    if scheduler is not None and workers:
+        raise RunError("workers and scheduler: name one of them")
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 0):
+        raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
+    study = load_campaign(_path("campaign", campaign))
+    folder = campaign_folder(study.campaign.campaign) if out is None else _path("out", out)
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    with user_errors():
+        plan = make_plan(study)
+        ensure_usable(folder, plan)
+        with open_engine(count, scheduler) as engine:
+            watch = (lambda p: None) if progress is None else progress
+            done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch)
+    return Campaign(folder, done.finished, done.failed, done.flown, done.seconds)
+
+
+def campaign_folder(name: str) -> Path:
+    """Where a campaign is kept when nothing else is said."""
+    return Path("runs") / f"campaign-{name}"
+
+
+def check(
+    scenarios: str | Path | Sequence[str | Path],
+    overrides: Sequence[str] = (),
+    *,
+    update: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[Checked, ...]:
+    """Fly scenarios and compare their outcomes with their own expectations.
+
+    Args:
+        scenarios: a file, a library scenario's name, a folder (every scenario file below it that expects something), or
+            a list of those.
+        overrides: texts as after `--set`, for every scenario.
+        update: write golden outcomes instead of comparing with them.
+        progress: called with the simulated seconds of the scenario that flies.
+
+    Returns:
+        One `Checked` a scenario: `.verdicts`, `.failed`, and `.replay(verdict)`, the command that shows a failure.
+
+    Raises:
+        ScenarioError, PolicyError, RunError: what is wrong with a scenario, its policy or its golden outcome.
+
+    Example:
+        >>> text = "name: mine\\nduration_s: 1\\nperception: {detector: none}\\n"
+        >>> _ = (folder / "mine.yaml").write_text(text + "expect: [{metric: bytes.data_sent, at_least: 1}]\\n")
+        >>> [checked.failed for checked in sortie.check(folder)]
+        [[]]
+    """
+    from sortie.sim.check.checking import check_scenario, scenario_files
+
+    chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
+    names = [name for one in chosen for name in scenario_files(_path("scenarios", one))]
+    for name in names:
+        reading.load(name, overrides)  # all of them, before the first one flies
+    return tuple(check_scenario(name, overrides, update=update, progress=progress) for name in names)
+
+
+def env(scenario: ScenarioLike, overrides: Overrides = ()) -> SortieEnv:
+    """The sortie as a PettingZoo `ParallelEnv`: one agent a drone, for learners of sharing policies.
+
+    Args:
+        scenario, overrides: as `sortie.load` takes them; at least two drones. The scenario's policy is not asked.
+
+    Raises:
+        ScenarioError: what is wrong with the scenario.
+        RunError: a lone drone, or the extra `env` is not installed.
+
+    Example:
+        >>> env = sortie.env("track_target", {"duration_s": 2, "perception.detector": "surrogate"})
+        >>> observations, infos = env.reset(seed=1)
+        >>> sorted(observations)[:2]
+        ['drone_0', 'drone_1']
+        >>> env.close()
+    """
+    with user_errors():
+        from sortie.sim.env import SortieEnv
+
+        return SortieEnv(load(scenario, overrides))
+
+
+def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenario, Policy | None]:
+    """The scenario to fly, and the callable that decides in place of its policy; None where the scenario's own does."""
+    if policy is None:
+        return scenario, None
+    if isinstance(policy, str):
+        return load(scenario, policy_overrides(policy, scenario.policy.name)), None
+    if not callable(policy):
+        raise PolicyError(f"policy: {policy!r}, must be a name, file.py:function or a callable of one FleetView")
+    try:
+        inspect.signature(policy).bind(object())
+    except TypeError as error:
+        raise PolicyError(f"policy {_label(policy)!r}: {error}, must take one FleetView") from None
+    except ValueError:  # some callables written in C name no parameters
+        pass
+    return scenario, policy
+
+
+def _label(policy: PolicyLike) -> str:
+    return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+
+
+def _path(name: str, value: str | os.PathLike[str]) -> Path:
+    if not isinstance(value, str | os.PathLike):
+        raise RunError(f"{name}: {value!r}, must be a path")
+    return Path(value)
+
+
+def _ensure_seed(name: str, value: object) -> None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED):
+        raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^63 - 1")

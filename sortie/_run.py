@@ -1,0 +1,168 @@
+"""`Run`: one flown sortie, with everything that can be asked of it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sortie.sim.results import run_folder
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from sortie.scenarios.schema import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One flown sortie: its record, and what follows from it.
+
+    Made by `sortie.fly` and `sortie.open_run`.
+
+    Example:
+        >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+        >>> run.policy, run.seed
+        ('worked', 1)
+        >>> run.tables["descriptors"].num_rows > 0
+        True
+    """
+
+    record: SortieRecord
+    """Everything that the sortie left behind (`sortie.sim.results.record.SortieRecord`)."""
+    path: Path | None = None
+    """The folder that it was read from; None for a run that was just flown."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario as it was flown, every default filled in."""
+        return self.record.scenario
+
+    @property
+    def policy(self) -> str:
+        """The policy's name in the record."""
+        return self.record.policy
+
+    @property
+    def seed(self) -> int:
+        """The seed of every random draw."""
+        return self.record.seed
+
+    @property
+    def replication(self) -> int:
+        """Which repetition with other random draws this is; 0 is the first."""
+        return self.record.replication
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over every value of the record, hex. Equal runs have equal fingerprints."""
+        return self.record.fingerprint
+
+    @property
+    def version(self) -> str:
+        """The code that made the record: release, plus sign, digest."""
+        return self.record.version
+
+    @property
+    def tables(self) -> Mapping[str, pa.Table]:
+        """The record's tables by name, as `pyarrow.Table`.
+
+        `sim/results/outcome.md` lists every table and column with its unit. `.to_pandas()` and `polars.from_arrow`
+        convert a table.
+        """
+        return self.record.tables
+
+    @cached_property
+    def outcome(self) -> dict[str, Any]:
+        """All figures of the sortie, nested as in `outcome.json`. Ratios of nothing are None."""
+        return outcome(self.record)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """The outcome's numbers by their dotted names, as `expect`, `compare` and campaigns use them.
+
+        Example:
+            >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+            >>> run.metrics["bytes.data_sent"] == run.outcome["bytes"]["data_sent"]
+            True
+        """
+        return dict(_numbers("", self.outcome))
+
+    def save(self, path: str | Path, *, recording: bool = True) -> Path:
+        """Write the run's folder: outcome, tables as Parquet, scenario and, unless `recording` is False, `sortie.rrd`.
+
+        The folder is written whole or not at all. An older run there is replaced.
+
+        Raises:
+            RunError: the folder holds something that is no run, or the disk refuses.
+        """
+
+        def add_recording(folder: Path) -> None:
+            from sortie.sim.playback.recording import save_rrd
+
+            save_rrd(self.record, folder / run_folder.RECORDING)
+
+        place = Path(path)
+        run_folder.save(self.record, place, add_recording if recording else None)
+        return place
+
+    def report(self, path: str | Path) -> Path:
+        """Write the run as one HTML page that needs nothing else.
+
+        Raises:
+            RunError: the page cannot be written, or matplotlib is missing.
+        """
+        from sortie.sim.results.report import save_page
+
+        place = Path(path)
+        save_page(self.record, place)
+        return place
+
+    def view(self) -> None:
+        """Open the run in the Rerun viewer and wait until it is closed.
+
+        Raises:
+            RunError: no viewer or no display.
+        """
+        from sortie.sim.playback.viewer import open_viewer
+
+        with tempfile.TemporaryDirectory() as made:
+            open_viewer(self._recording(Path(made)))
+
+    def picture(self, path: str | Path, at_s: float = 0.0) -> Path:
+        """Save what the viewer shows at simulated time `at_s` as a PNG file. It needs no screen.
+
+        Raises:
+            RunError: the viewer cannot draw here, or the file cannot be written.
+        """
+        from sortie.sim.playback.picture import take_picture
+
+        place = Path(path)
+        with tempfile.TemporaryDirectory() as made:
+            take_picture(self._recording(Path(made)), place, at_s)
+        return place
+
+    def _recording(self, made: Path) -> Path:
+        """The run's own recording where it lies in its folder, else one made in `made`."""
+        from sortie.sim.playback.recording import save_rrd
+
+        if self.path is not None and (self.path / run_folder.RECORDING).is_file():
+            return self.path / run_folder.RECORDING
+        save_rrd(self.record, made / run_folder.RECORDING)
+        return made / run_folder.RECORDING
+
+    def __repr__(self) -> str:
+        return f"<Run of {self.scenario.name} under {self.policy}, seed {self.seed}, {self.scenario.duration_s:g} s>"
+
+
+def _numbers(prefix: str, value: Any) -> list[tuple[str, float]]:
+    if isinstance(value, Mapping):
+        return [pair for key, inner in value.items() for pair in _numbers(f"{prefix}.{key}" if prefix else key, inner)]
+    if isinstance(value, list):
+        return [pair for i, inner in enumerate(value) for pair in _numbers(f"{prefix}.{i}", inner)]
+    return [(prefix, value)] if isinstance(value, int | float) and not isinstance(value, bool) else []
