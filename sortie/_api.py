@@ -317,7 +317,8 @@ def check(
         >>> [checked.failed for checked in sortie.check(folder)]
         [[]]
     """
-    from sortie.sim.check.checking import check_scenario, scenario_files
+    from sortie.sim.check.checking import check_scenario
+    from sortie.sim.check.discovery import scenario_files
 
     chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
     names = [name for one in chosen for name in scenario_files(_path("scenarios", one))]

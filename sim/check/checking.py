@@ -76,23 +76,6 @@ def check_scenario(
     return Checked(scenario, tuple(verdicts), command, written)
 
 
-def scenario_files(place: str | Path) -> list[str]:
-    """What `place` names: itself, or, where it is a folder, every scenario file below it that expects something.
-
-    Raises:
-        RunError: a folder without any.
-    """
-    from sortie.sim.check.plugin import is_scenario
-
-    folder = Path(place)
-    if str(place) in library() or not folder.is_dir():
-        return [str(place)]
-    found = sorted(str(path) for path in folder.rglob("*.y*ml") if is_scenario(path))
-    if not found:
-        raise RunError(f"{folder}: no scenario below it expects anything")
-    return found
-
-
 def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
     """Refuse to write the outcome of another sortie than the scenario's own as its golden one.
 

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.checking import check_scenario
+from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import check, limit
 from sortie.sim.check.golden import golden_path, moved, write_golden
-from sortie.sim.check.plugin import is_scenario
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
