@@ -15,6 +15,7 @@ from sortie.fleet import tiles
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
 from sortie.policies.contract import Directive, Disc, Representation
+from sortie.scenarios.representation import BOXES
 
 HEADER_BYTES = 40
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
@@ -23,7 +24,7 @@ RAW_BYTES = 5 * 800 * 450 * 3
 
 _EPSILON_S = 1e-6
 _NONE, _FEATURES = Representation.NONE, Representation.FEATURES  # members of an enumeration are slow to look up
-_RELIABLE = tuple(rung in (Representation.TRACKS, Representation.DETECTIONS) for rung in Representation)
+_RELIABLE = tuple(rung in BOXES for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
 """How many boxes the drone's own detector reports in a region right now."""

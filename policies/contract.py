@@ -18,31 +18,33 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.representation import Representation as Representation
 
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
 COVERAGE_CELL_M = 12.8
 """Side of a coverage cell; cells lie on the world's lattice of this pitch."""
-
-
-class Representation(IntEnum):
-    """The fidelity ladder, lowest rung first."""
-
-    NONE = 0
-    TRACKS = 1
-    DETECTIONS = 2
-    FEATURES = 3
-    RAW = 4
+FEATURE_CELLS = 64 * 64
+"""The cells of a drone's feature map, of which ρ is a share."""
+FEATURE_CELL_BYTES = 80 * 2
+"""A feature cell: 80 channels of 2 bytes."""
+FEATURE_MAP_MEGABITS = 8 * FEATURE_CELLS * FEATURE_CELL_BYTES / 1e6
+"""A whole feature map."""
 
 
 class TaskPhase(IntEnum):
-    """What a drone is doing, as its descriptor says it."""
+    """What a drone is doing, as its descriptor states it."""
 
     TRANSIT = 0
     SEARCH = 1
     TRACK = 2
     RETURN = 3
     LANDING = 4
+
+
+PHASE_NAMES: dict[TaskPhase, str] = {phase: phase.name.lower() for phase in TaskPhase}
+"""The names in scenarios, tables and views on disk."""
+PHASE_OF: dict[str, TaskPhase] = {name: phase for phase, name in PHASE_NAMES.items()}
 
 
 class Coverage(IntEnum):
@@ -204,10 +206,31 @@ class PolicyError(SortieError):
     """A policy broke its contract; the message names the directive, the field and the bound."""
 
 
-MAX_RATE_HZ = 30.0
-MAX_DEADLINE_S = 10.0
+class DirectiveBound(NamedTuple):
+    """The highest value of a directive's field, and what kind of value it is. The lowest value is 0 for every field."""
+
+    high: float
+    kind: str
+
+    def breaks(self, name: str, value: Any) -> str | None:
+        """What is wrong with a number (NaN is out of bounds), or None."""
+        return None if 0 <= value <= self.high else f"{name} is {value!r}, must be in [0, {self.high:g}]"
+
+
+DIRECTIVE_BOUNDS: dict[str, DirectiveBound] = {
+    "representation": DirectiveBound(int(max(Representation)), "a Representation"),
+    "rho": DirectiveBound(1.0, "a number"),
+    "rate_hz": DirectiveBound(30.0, "a number"),
+    "deadline_s": DirectiveBound(10.0, "a number"),
+    "fusion_weight": DirectiveBound(1.0, "a number"),
+    "duty_percent": DirectiveBound(100, "a whole number"),
+}
+"""The bounds of a directive's numbers: for policies, for the shield and for what comes in over the wire."""
+_MAX_RUNG, _MAX_RHO, _MAX_RATE_HZ, _MAX_DEADLINE_S, _MAX_WEIGHT, _MAX_DUTY = (b.high for b in DIRECTIVE_BOUNDS.values())
+_FAR_M = 3.4028234663852886e38
+"""The largest 32-bit float. The wire carries a disc in 32-bit floats."""
 MAX_REPOSITION_M = 200.0
-"""No drone may ask for a place farther from where it is."""
+"""A drone may not ask for a place farther away than this."""
 
 
 def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
@@ -239,13 +262,13 @@ def _plainly_sound(directives: Sequence[Directive], view: FleetView) -> bool:
                 and source is ego  # ids are small ints, of which Python has one each
                 and destination.__class__ is int
                 and destination in peers
-                and (rung.__class__ is Representation or (rung.__class__ is int and 0 <= rung <= 4))
-                and 0.0 <= rho <= 1.0
-                and 0.0 <= rate_hz <= MAX_RATE_HZ
-                and 0.0 <= deadline_s <= MAX_DEADLINE_S
-                and 0.0 <= weight <= 1.0
+                and (rung.__class__ is Representation or (rung.__class__ is int and 0 <= rung <= _MAX_RUNG))
+                and 0.0 <= rho <= _MAX_RHO
+                and 0.0 <= rate_hz <= _MAX_RATE_HZ
+                and 0.0 <= deadline_s <= _MAX_DEADLINE_S
+                and 0.0 <= weight <= _MAX_WEIGHT
                 and duty_percent.__class__ is int
-                and 0 <= duty_percent <= 100
+                and 0 <= duty_percent <= _MAX_DUTY
                 and reason.__class__ is str
             ):
                 return False
@@ -299,10 +322,10 @@ def kind_fault(d: object) -> str | None:
     for name in ("source", "destination"):
         if not _is_whole(getattr(d, name)):
             return f"{where}: {name} is {getattr(d, name)!r}, must be a drone's id, a whole number"
-    for name, low, high, kind in _BOUNDS:
+    for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
-        if not _compares(value, low, high) or (kind != "a number" and not _is_whole(value)):
-            return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}], {kind}"
+        if not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
+            return f"{where}: {name} is {value!r}, must be in [0, {high:g}], {kind}"
     if not (d.roi is None or isinstance(d.roi, Disc)):
         return f"{where}: roi is {d.roi!r}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
@@ -323,10 +346,10 @@ def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
         return f"{where}: source is {d.source}, must be the ego {view.ego}"
     if d.destination == view.ego or d.destination not in view.descriptors:
         return f"{where}: destination {d.destination} is not a peer in the view {list(view.peers)}"
-    for name, low, high, _ in _BOUNDS:
-        value = getattr(d, name)
-        if not low <= value <= high:  # also catches NaN
-            return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}]"
+    for name, bound in DIRECTIVE_BOUNDS.items():
+        wrong = bound.breaks(name, getattr(d, name))
+        if wrong is not None:
+            return f"{where}: {wrong}"
     if d.roi is not None:
         if not d.roi.radius_m > 0:
             return f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0"
@@ -352,15 +375,3 @@ def _is_whole(value: Any) -> bool:
     except TypeError:
         return False
     return True
-
-
-_FAR_M = 3.4028234663852886e38
-"""The largest float of 32 bits, as which a disc goes over the wire."""
-_BOUNDS = (
-    ("representation", 0, 4, "a Representation"),
-    ("rho", 0.0, 1.0, "a number"),
-    ("rate_hz", 0.0, MAX_RATE_HZ, "a number"),
-    ("deadline_s", 0.0, MAX_DEADLINE_S, "a number"),
-    ("fusion_weight", 0.0, 1.0, "a number"),
-    ("duty_percent", 0, 100, "a whole number"),
-)

@@ -36,12 +36,12 @@ from sortie.perception.scene.render import VIEWS_SHAPE, Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.representation import BOX_NAMES, MAP_NAMES
 from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 KEPT_CAPTURES = 64
-MAPS, LATE = ("features", "raw"), ("detections", "tracks")
 Disc = tuple[float, float, float]
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
@@ -148,7 +148,7 @@ class TorchDetector:
             jobs = [(ego, ()) for ego, _ in jobs]
         known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        look = {s.capture for s in shared if s.representation in LATE}
+        look = {s.capture for s in shared if s.representation in BOX_NAMES}
         look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
@@ -157,7 +157,7 @@ class TorchDetector:
                 self._head_alone(capture)
         if self._fusion.shares == "boxes":
             for share in shared:
-                if share.representation in MAPS:
+                if share.representation in MAP_NAMES:
                     self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
         # as things stand: what is asked for later stands behind these tasks, and none may wait for it
@@ -270,7 +270,7 @@ class TorchDetector:
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
-        return self._fusion.shares == "features" and share.representation in MAPS
+        return self._fusion.shares == "features" and share.representation in MAP_NAMES
 
     def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
@@ -313,7 +313,7 @@ class TorchDetector:
 
     def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
         """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
-        if share.representation in MAPS:
+        if share.representation in MAP_NAMES:
             lies, part = self._lies(share, now), _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)

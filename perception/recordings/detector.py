@@ -17,9 +17,9 @@ from sortie.perception.metrics.ap import suppress
 from sortie.perception.recordings.exchange import Sent, fused, load_fusion, reaching
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Perception
 
-MAPS = ("features", "raw")
 NEAR_M = 5.0
 """The drone of the sortie has to be this near to where the recorded one was."""
 
@@ -84,14 +84,14 @@ class RecordedDetector:
         config, pose = self._config, self._pose(ego)
         at = (self._frame(ego), ego.drone)
         heard = [s for s in shares if s.weight > 0.0]
-        maps = [self._sent(s, now) for s in heard if s.representation in MAPS]
+        maps = [self._sent(s, now) for s in heard if s.representation in MAP_NAMES]
         if self._fuse is not None and maps:
             local = fused(self._fuse, self._recording, at, pose, maps, config.unsent_cells)
         else:
             local = reaching(self._recording, at, pose, maps)
         found = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
         found = suppress(found, NMS_IOU)
-        late = [self._told(s) for s in heard if s.representation not in MAPS]
+        late = [self._told(s) for s in heard if s.representation not in MAP_NAMES]
         return joined(pose, found, bool(maps), late, config.join)
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:

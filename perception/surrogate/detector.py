@@ -23,10 +23,10 @@ from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from sortie.perception.surrogate.shared_false_positives import Mirages
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.representation import BOX_NAMES
 from sortie.scenarios.schema import Perception
 
 Job = tuple[Capture, Sequence[Share]]
-LATE = ("detections", "tracks")
 BATCH = 400
 """Jobs worked out together; memory grows with it."""
 
@@ -154,7 +154,9 @@ class SurrogateDetector:
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
         asked = [(ego, shares) for ego, shares, _ in jobs]
-        late = {s.capture: None for _, shares in asked for s in shares if s.representation in LATE and s.weight > 0.0}
+        late = {
+            s.capture: None for _, shares in asked for s in shares if s.representation in BOX_NAMES and s.weight > 0.0
+        }
         captures = list(dict.fromkeys(c for ego, shares in asked for c in (ego, *(s.capture for s in shares))))
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
@@ -176,7 +178,7 @@ class SurrogateDetector:
         fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
         heard = []
         for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False):
-            others = [told(s, alone[s.capture]) for s in shares if s.representation in LATE and s.weight > 0.0]
+            others = [told(s, alone[s.capture]) for s in shares if s.representation in BOX_NAMES and s.weight > 0.0]
             heard.append(Heard(ego.est_pose, own, f, others))
         out = joined_many(heard, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))

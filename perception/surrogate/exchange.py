@@ -13,9 +13,9 @@ from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
 from sortie.perception.types import Capture, Share
+from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Scene
 
-MAPS = ("features", "raw")
 _ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
@@ -87,7 +87,7 @@ class FeatureShares:
         for m, (_, shares) in enumerate(jobs):
             slot = 0
             for i, s in enumerate(shares):
-                if s.representation in MAPS and s.weight > 0.0:
+                if s.representation in MAP_NAMES and s.weight > 0.0:
                     x, y, yaw = s.capture.est_pose
                     rho, disc = (1.0, None) if s.representation == "raw" else (s.rho, s.roi)
                     pose = (x, y, yaw) if lies is None else lies[m][i]

@@ -23,6 +23,7 @@ from sortie.perception.surrogate.exchange import (
 from sortie.perception.surrogate.features import CaptureColumns, Eyes, Looks
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.types import Boxes
+from sortie.scenarios.representation import MAP_NAMES
 
 REACH_M = 2.5
 """A box within this of a car is of that car."""
@@ -109,7 +110,7 @@ def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     by_norm = np.array([j.cells_by == "norm" for j in asked.jobs])[pairs.row, None]
     rank = np.where(by_norm, above_norm[pairs.peer], above[pairs.peer]) / 4096.0
     fused = covariates(pairs, exchange, looks, confidence, sent, rank.astype(np.float32), zeros[pairs.row])
-    late = np.array([any(s.representation not in ("features", "raw") for s in j.shares) for j in asked.jobs])
+    late = np.array([any(s.representation not in MAP_NAMES for s in j.shares) for j in asked.jobs])
     shift = mean_shift(pairs, exchange, sent)
     score, offset, alarms = [], [], []
     for m, (job, boxes) in enumerate(zip(asked.jobs, asked.boxes, strict=True)):
@@ -139,7 +140,7 @@ def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, colum
         mine = np.flatnonzero(pairs.row == m)
         slot = 0
         for s in job.shares:
-            if s.representation not in ("features", "raw") or s.weight <= 0:
+            if s.representation not in MAP_NAMES or s.weight <= 0:
                 continue
             rank = asked.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
             mask = budget.select(rank, s.rho, s.roi, *s.capture.est_pose)

@@ -17,12 +17,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.policies.catalogue.coverage_cells import sees
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.contract import (
+    FEATURE_CELLS,
+    FEATURE_MAP_MEGABITS,
+    Descriptor,
+    Directive,
+    FleetView,
+    Representation,
+    TaskPhase,
+    nothing,
+)
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 
 RATE_HZ = 10.0
-MAP_MB = 8 * 4096 * 160e-6
-"""All feature cells of one map, megabits."""
 CARRIED = 0.5
 """A drone asks of the air no more than this part of its mean goodput: the others send as well."""
 STEPS_A_HALVING = 2
@@ -52,7 +59,7 @@ class Arm(NamedTuple):
 ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, True), Arm(2, True, True), Arm(0, True, False))
 """What the adaptive policies choose from; searching there is no region, and maps are of everything."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
-FEW = 8 / 4096
+FEW = 8 / FEATURE_CELLS
 """Of a map: with fewer cells than that to a link boxes are sent."""
 
 
@@ -92,7 +99,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
     measured = [mbps for mbps in map(me.goodput_to, peers) if mbps > 0.0]
     if not measured:
         return 1.0
-    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * MAP_MB * RATE_HZ)
+    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * FEATURE_MAP_MEGABITS * RATE_HZ)
     return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
 
 

@@ -27,8 +27,8 @@ PURE = frozenset({
     "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that know nothing but what they are handed; a policy may use them."""
-KEYED_RANDOMNESS = "sortie.scenarios.streams"
-"""Draws that follow from their key alone, so that the same view is the same decision."""
+SHARED = frozenset({"sortie.scenarios.representation", "sortie.scenarios.streams"})
+"""Modules of another room that a policy may use: the names of representations, and random draws that depend on their key alone."""
 FAR = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip
@@ -129,7 +129,7 @@ class _Rebuilding:
         if isinstance(value, types.ModuleType):
             return _module(value)
         home: str = getattr(value, "__module__", None) or type(value).__module__
-        if home == KEYED_RANDOMNESS or (home in _ONLY and name in _ONLY[home]):
+        if home in SHARED or (home in _ONLY and name in _ONLY[home]):
             return value
         if _far(home):
             return _Forbidden(f"{home}.{name}")
@@ -219,7 +219,7 @@ def _far(home: str) -> bool:
     """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
     parts = home.split(".")
     root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])
-    return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home != KEYED_RANDOMNESS
+    return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home not in SHARED
 
 
 def _import(name: str, *rest: Any) -> Any:

@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.representation import NAME_OF
 
 Kind = Literal["number", "truth"]
 
@@ -100,7 +101,7 @@ WORDS: dict[str, Word] = {
 }
 """Every name an invariant may use."""
 
-CONSTANTS: dict[str, int] = {r.name.lower(): int(r) for r in Representation} | {
+CONSTANTS: dict[str, int] = {name: int(r) for r, name in NAME_OF.items()} | {
     "transit": TaskPhase.TRANSIT,
     "search": TaskPhase.SEARCH,
     "track": TaskPhase.TRACK,
@@ -414,7 +415,7 @@ def just_heard(view: FleetView) -> FleetView:
 def spelt(directives: Iterable[Directive]) -> str:
     """Directives in a few words each."""
     return "; ".join(
-        f"→{d.destination} {Representation(d.representation).name.lower()} ρ {d.rho:g} {d.rate_hz:g} Hz "
+        f"→{d.destination} {NAME_OF[Representation(d.representation)]} ρ {d.rho:g} {d.rate_hz:g} Hz "
         f"duty {d.duty_percent} % ({d.reason})"
         for d in directives
     )

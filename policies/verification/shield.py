@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from sortie.policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
 from sortie.policies.verification.invariants import (
     Binary,
     Invariant,
@@ -29,12 +29,14 @@ from sortie.policies.verification.invariants import (
     just_heard,
     walk,
 )
+from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
 _HIGHEST: dict[str, float] = {
-    "representation": 4, "rho": 1.0, "rate_hz": MAX_RATE_HZ, "deadline_s": MAX_DEADLINE_S, "fusion_weight": 1.0,
-    "duty": 1.0, "roi": 1.0,
-}  # fmt: skip
+    **{name: bound.high for name, bound in DIRECTIVE_BOUNDS.items() if name != "duty_percent"},
+    "duty": 1.0,
+    "roi": 1.0,
+}
 _SUMS = ("sum_links", "count_links", "every_link")
 
 
@@ -145,7 +147,7 @@ def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, o
 
 def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
     because = "; ".join(rule.text for rule in broken)
-    was = f"{Representation(before.representation).name.lower()} at {before.rate_hz:g} Hz"
+    was = f"{NAME_OF[Representation(before.representation)]} at {before.rate_hz:g} Hz"
     return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.streams import stream
 
@@ -139,7 +139,7 @@ def to_json(view: FleetView) -> str:
     for i, d in view.descriptors.items():
         fields = d._asdict() | {
             "coverage_grid": d.coverage_grid.hex(),
-            "task_phase": TaskPhase(d.task_phase).name.lower(),
+            "task_phase": PHASE_NAMES[TaskPhase(d.task_phase)],
             "region": None if d.region is None else list(d.region),
         }
         drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
@@ -182,9 +182,9 @@ def from_json(text: str) -> FleetView:
 
 def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
     try:
-        phase = TaskPhase[str(entry.get("task_phase")).upper()]
+        phase = PHASE_OF[str(entry.get("task_phase"))]
     except KeyError as error:
-        known = ", ".join(p.name.lower() for p in TaskPhase)
+        known = ", ".join(PHASE_OF)
         raise ViewError(f"{where}.task_phase is {entry.get('task_phase')!r}, must be one of {known}") from error
     try:
         grid = bytes.fromhex(entry.get("coverage_grid", ""))

@@ -15,6 +15,8 @@ import simpy
 
 from sortie.fleet.agent import Agent
 from sortie.policies.contract import (
+    PHASE_NAMES,
+    PHASE_OF,
     Directive,
     FleetView,
     Policy,
@@ -32,8 +34,6 @@ from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.schema import PolicyChange, PolicySection
 from sortie.sim.engine.world import at, with_frame
 from sortie.sim.results.record import DECISIONS_OF, Recorder
-
-_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 
 
 class Named(NamedTuple):
@@ -133,7 +133,7 @@ class Pilot:
         self._look = viewpoint_of(plan.first.decide)
         self.agent: Agent | None = None
         changes = enumerate(plan.changes)
-        self._by_phase = {_PHASES[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
+        self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision
         self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
         self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
@@ -179,7 +179,7 @@ class Pilot:
             self._phase = me.task_phase
             place, policy = self._by_phase.get(me.task_phase, (-1, self.policy))
             if place > self._place:  # else a later one of the list came with the phase
-                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}", place)
+                self.take_over(policy, f"phase {PHASE_NAMES[TaskPhase(me.task_phase)]}", place)
 
     def _looked(self, view: FleetView) -> Reposition | None:
         """Where the policy asks to look from."""

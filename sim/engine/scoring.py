@@ -13,8 +13,9 @@ import simpy
 from sortie.fleet.agent import Agent, Received
 from sortie.perception.detectors import DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
-from sortie.sim.results.record import REPRESENTATIONS, Recorder
+from sortie.sim.results.record import Recorder
 
 
 class Detector(Protocol):
@@ -34,7 +35,7 @@ def as_share(received: Received, trust: float = 1.0) -> Share:
     """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
     payload, roi = received.payload, received.payload.roi
     disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-    name, weight = REPRESENTATIONS[payload.representation], payload.fusion_weight * trust
+    name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
     return Share(received.capture, name, payload.rho, disc, weight, received.missing)
 
 

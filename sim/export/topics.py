@@ -18,6 +18,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME
+from sortie.scenarios.representation import BOXES, Representation
 
 BYTES_NAME = "std_msgs/msg/UInt8MultiArray"
 
@@ -39,6 +40,11 @@ class TopicKind(StrEnum):
     def reliable(self) -> bool:
         """Small things that must arrive go reliably, the frequent and the large best effort."""
         return self in (TopicKind.DIRECTIVE, TopicKind.COMPACT)
+
+    @classmethod
+    def of(cls, representation: Representation) -> TopicKind:
+        """The kind of topic that carries a payload of this representation."""
+        return cls.COMPACT if representation in BOXES else cls.FEATURES
 
 
 PAYLOADS = (TopicKind.FEATURES, TopicKind.COMPACT)

@@ -26,6 +26,7 @@ from sortie.fleet.staleness import LinkHealth, health
 from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
+from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
@@ -161,7 +162,7 @@ class LiveNode:
         stamp_ns = round((capture.t_s + self.agent.clock_skew_s) * 1e9)
         header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)
         content = (header + encode_directive(directive)).ljust(payload.size_bytes, b"\0")
-        self._write(peer, TopicKind.COMPACT if payload.reliable else TopicKind.FEATURES, content)
+        self._write(peer, TopicKind.of(payload.representation), content)
 
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
         self._write(peer, TopicKind.FEATURES, bytes(size_bytes))
@@ -173,7 +174,7 @@ class LiveNode:
         self._late_s = max(self._late_s, clock_s - descriptor.stamp_ns * 1e-9)
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
-        rung = enforced.representation.name.lower()
+        rung = NAME_OF[enforced.representation]
         self._new.orders.append(NewDirective(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
 
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:

@@ -10,10 +10,8 @@ from __future__ import annotations
 from math import exp
 
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import Directive, FleetView
+from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView
 
-MAP_MEGABITS = 4096 * 80 * 2 * 8e-6
-"""A full map."""
 TRUSTED_FOR_S = 0.5
 """A delay that takes a map's weight to 1/e."""
 STEPS = 4
@@ -28,7 +26,7 @@ def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED
     directives = []
     for peer in view.peers:
         goodput_mbps = me.goodput_to(peer)
-        delay_s = rho * MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
+        delay_s = rho * FEATURE_MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
         weight = max(1, round(STEPS * exp(-delay_s / trusted_for_s))) / STEPS
         why = f"SyncNet: {delay_s:.1g} s late"
         directives.append(full_sharing(view.ego, peer, rho, why)._replace(fusion_weight=weight))

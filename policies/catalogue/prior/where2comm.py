@@ -13,9 +13,9 @@ from collections.abc import Mapping
 
 from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around, seen_well
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import Directive, FleetView
+from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView
 
-REQUEST_MAP_BYTES = 4096 * 2
+REQUEST_MAP_BYTES = FEATURE_CELLS * 2
 """R = 1 − C as one float16 a feature cell (`sortie.perception.network.fusion.traffic`)."""
 
 
