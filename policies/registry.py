@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import inspect
 import math
 import numbers
@@ -18,6 +17,7 @@ from sortie.policies.catalogue.prior import METHODS
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
+from sortie.policies.user_code import imported_files, is_users, load
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worked": worked,
@@ -62,10 +62,6 @@ BOUNDS: dict[str, Bound] = {
 user's file declares."""
 
 
-_MODULE = "sortie_policy_"
-"""How modules of policies from files are called."""
-
-
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     """A registered policy, or `path/to/file.py:function`, with its parameters bound.
 
@@ -87,10 +83,19 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     return functools.partial(function, **params) if params else function
 
 
-def told(error: Exception) -> str:
-    """An exception out of a policy in words, with the last line that it came through of a file that was not registered."""
+def modules_of(reference: str) -> tuple[Path, ...]:
+    """The files that a policy's code is in: its own and those that it imports (`imported_files`); none if registered.
+
+    Raises:
+        PolicyError: the file is missing.
+    """
+    return imported_files(_file_of(reference)[0]) if ":" in reference else ()
+
+
+def describe_error(error: Exception) -> str:
+    """An exception that a policy raised, and the last line of the user's own files that it passed through."""
     frames = traceback.walk_tb(error.__traceback__)
-    lines = [(f.f_code.co_filename, n) for f, n in frames if str(f.f_globals.get("__name__")).startswith(_MODULE)]
+    lines = [(f.f_code.co_filename, n) for f, n in frames if is_users(f.f_globals.get("__name__"))]
     place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
     return f"{type(error).__name__}: {error}{place}"
 
@@ -121,19 +126,24 @@ def parameters(function: Callable[..., object]) -> dict[str, object]:
     return {p.name: p.default for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
 
 
-def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
+def _file_of(reference: str) -> tuple[Path, str]:
+    """The file and the function that `path/to/file.py:function` names."""
     file, _, attribute = reference.rpartition(":")
     path = Path(file)
     if not path.is_file():
         raise PolicyError(f"policy file {file!r} not found")
-    spec = importlib.util.spec_from_file_location(f"{_MODULE}{path.stem}", path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py":
         raise PolicyError(f"policy file {file!r} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
+    return path, attribute
+
+
+def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
+    path, attribute = _file_of(reference)
+    file = str(path)
     try:
-        spec.loader.exec_module(module)
+        module = load(path)
     except Exception as error:
-        raise PolicyError(f"policy file {file!r} does not load: {told(error)}") from error
+        raise PolicyError(f"policy file {file!r} does not load: {describe_error(error)}") from error
     function = getattr(module, attribute, None)
     if not callable(function):
         raise PolicyError(f"policy file {file!r} has no function {attribute!r}")

@@ -12,12 +12,13 @@ from __future__ import annotations
 import builtins
 import dis
 import functools
-import importlib
 import inspect
 import sys
 import types
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar, cast
+
+from sortie.policies.user_code import is_users
 
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 
@@ -77,6 +78,18 @@ class _Part:
         return getattr(self._module, name)
 
 
+class _OwnModule:
+    """A module of the policy's own, whose functions are confined as well."""
+
+    __slots__ = ("_allowed", "_module")
+
+    def __init__(self, module: types.ModuleType, allowed: Callable[[str, Any], Any]) -> None:
+        self._module, self._allowed = module, allowed
+
+    def __getattr__(self, name: str) -> Any:
+        return self._allowed(name, getattr(self._module, name))
+
+
 def confined(policy: Decides) -> Decides:
     """The policy, or its viewpoint, over a namespace of its own: where it keeps to its view it decides the same.
 
@@ -112,7 +125,10 @@ class _Rebuilding:
         if id(found) in self._functions:
             return self._functions[id(found)]
         module, code = found.__globals__, found.__code__
-        space = self._namespaces.setdefault(id(module), {"__builtins__": _builtins(), "__name__": module["__name__"]})
+        if id(module) not in self._namespaces:
+            plain = {name: module.get(name) for name in ("__name__", "__package__")}
+            self._namespaces[id(module)] = {"__builtins__": self._builtins(module["__builtins__"]), **plain}
+        space = self._namespaces[id(module)]
         cells = found.__closure__ and tuple(types.CellType() for _ in found.__closure__)
         built = types.FunctionType(code, space, found.__name__, found.__defaults__, cells)
         built.__kwdefaults__ = found.__kwdefaults__
@@ -127,16 +143,36 @@ class _Rebuilding:
     def _allowed(self, name: str, value: Any) -> Any:
         """The value itself where it is harmless, built anew where it is the policy's own function, or forbidden."""
         if isinstance(value, types.ModuleType):
-            return _module(value)
+            return self._module(value)
         home: str = getattr(value, "__module__", None) or type(value).__module__
         if home in SHARED or (home in _ONLY and name in _ONLY[home]):
             return value
         if _far(home):
             return _Forbidden(f"{home}.{name}")
-        own = home.split(".")[0] == "policies" or home.split(".")[0] not in PURE
+        own = home.split(".")[0] not in PURE
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
             return self.function(value)
         return value
+
+    def _module(self, module: types.ModuleType) -> Any:
+        home = module.__name__
+        if home in _BUT or home in _ONLY:
+            return _Part(module)
+        if is_users(home):
+            return _OwnModule(module, self._allowed)
+        return _Forbidden(home) if _far(home) else module
+
+    def _builtins(self, own: Any) -> dict[str, Any]:
+        """Builtins for the functions of a module that has `own`; its imports find what they find without confinement."""
+        find = own["__import__"] if isinstance(own, dict) else __import__
+
+        def importing(name: str, *rest: Any) -> Any:
+            if _far(name) and name not in _ONLY:
+                raise Reached(name)
+            return self._module(find(name, *rest))
+
+        kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
+        return kept | {"__import__": importing}
 
 
 _FROZEN = ("__setattr__", "__delattr__")
@@ -208,30 +244,8 @@ def _names(code: types.CodeType) -> set[str]:
     return set(code.co_names).union(*inner)
 
 
-def _module(module: types.ModuleType) -> Any:
-    home = module.__name__
-    if home in _BUT or home in _ONLY:
-        return _Part(module)
-    return _Forbidden(home) if _far(home) else module
-
-
 def _far(home: str) -> bool:
     """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
     parts = home.split(".")
     root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])
     return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home not in SHARED
-
-
-def _import(name: str, *rest: Any) -> Any:
-    """What `import` inside a policy's function finds."""
-    if _far(name) and name not in _ONLY:
-        raise Reached(name)
-    importlib.import_module(name)
-    found = __import__(name, *rest)
-    return _module(found)
-
-
-@functools.cache
-def _builtins() -> dict[str, Any]:
-    kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
-    return kept | {"__import__": _import}

@@ -26,7 +26,7 @@ from sortie.policies.contract import (
     check_directives,
     check_reposition,
 )
-from sortie.policies.registry import handshake_bytes, resolve, told, viewpoint_of
+from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
 from sortie.policies.verification.shield import MARK, checked, enforce
@@ -187,7 +187,7 @@ class Pilot:
         try:
             asked = self._look(view)
         except Exception as error:
-            what = f"its viewpoint raises {told(error)}"
+            what = f"its viewpoint raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
         check_reposition(asked, view)
         return asked
@@ -198,7 +198,7 @@ class Pilot:
         except PolicyError:
             raise
         except Exception as error:
-            what = f"raises {told(error)}"
+            what = f"raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
         if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
             what = f"returns {type(answer).__name__}, must be a sequence of directives"
