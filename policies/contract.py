@@ -24,6 +24,9 @@ COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
 COVERAGE_CELL_M = 12.8
 """Side of a coverage cell; cells lie on the world's lattice of this pitch."""
+COVERAGE_BYTES = COVERAGE_CELLS**2 // 4
+AGENT_IDS = 256
+"""How many ids there are: an id is a byte. Rankings break ties by `(id - first) % AGENT_IDS`."""
 FEATURE_CELLS = 64 * 64
 """The cells of a drone's feature map, of which ρ is a share."""
 FEATURE_CELL_BYTES = 80 * 2

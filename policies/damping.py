@@ -36,15 +36,15 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
     """
     if not hysteresis:
         return heard
-    asked = _answered.get(heard.agent_id)  # all that heard one broadcast ask the same, each in its turn
+    asked = _last_results.get(heard.agent_id)  # all that heard one broadcast ask the same, each in its turn
     if asked is not None and asked[0] is before and asked[1] is heard and asked[2] == hysteresis:
         return asked[3]
     answer = _banded(before, heard, hysteresis)
-    _answered[heard.agent_id] = before, heard, hysteresis, answer
+    _last_results[heard.agent_id] = before, heard, hysteresis, answer
     return answer
 
 
-_answered: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
+_last_results: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
 """By drone: what was asked of `believed` last, and its answer."""
 
 

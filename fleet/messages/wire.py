@@ -15,6 +15,7 @@ from math import isfinite
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
 from sortie.fleet.messages.compact import MARK, decode_compact
 from sortie.policies.contract import (
+    COVERAGE_BYTES,
     DIRECTIVE_BOUNDS,
     Descriptor,
     Directive,
@@ -25,7 +26,6 @@ from sortie.policies.contract import (
 from sortie.scenarios.errors import SortieError
 
 MAX_DESCRIPTOR_BYTES = 1024
-COVERAGE_BYTES = 64
 MAX_AGENT_ID = 254
 
 _MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"

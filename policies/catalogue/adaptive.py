@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.policies.catalogue.coverage_cells import sees
+from sortie.policies.catalogue.prior.full import RATE_HZ
 from sortie.policies.contract import (
     FEATURE_CELLS,
     FEATURE_MAP_MEGABITS,
@@ -29,7 +30,6 @@ from sortie.policies.contract import (
 )
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 
-RATE_HZ = 10.0
 CARRIED = 0.5
 """A drone asks of the air no more than this part of its mean goodput: the others send as well."""
 STEPS_A_HALVING = 2

@@ -9,10 +9,10 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
+from sortie.policies.catalogue.prior.full import RATE_HZ
 from sortie.policies.contract import Directive, FleetView, Representation, nothing
 from sortie.policies.geometry import peers_by_overlap
 
-RATE_HZ = 10.0
 RESHUFFLE_S = 10
 """random-k draws new peers this often: longer than any sensible dwell time, so that the links come up."""
 

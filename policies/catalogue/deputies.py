@@ -9,15 +9,20 @@ from __future__ import annotations
 
 from sortie.policies.catalogue.coverage_cells import seen_well
 from sortie.policies.catalogue.freshness import freshness
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.catalogue.worked import (
+    FULL_RATE_HZ,
+    HALF_RATE_HZ,
+    HIGH_BATTERY,
+    LOW_BATTERY,
+    MIN_GOODPUT_MBPS,
+    SLOW_RATE_HZ,
+)
+from sortie.policies.contract import AGENT_IDS, Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
 from sortie.policies.geometry import footprint_overlap
 
-HIGH_BATTERY, LOW_BATTERY = 0.60, 0.30
-FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
-MIN_GOODPUT_MBPS, GOOD_GOODPUT_MBPS = 5.0, 20.0
+GOOD_GOODPUT_MBPS = 20.0
 RESTING_DUTY_PERCENT = 50
 SLOW_DEADLINE_S = 0.5
-_IDS = 256
 
 
 def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directive]:
@@ -64,7 +69,7 @@ def _appointed(view: FleetView, receiver: int) -> list[int]:
     def merit(i: int) -> tuple[float, float, int]:
         d = view.descriptors[i]
         adds = len(seen_well(d) - known) * _link(d.goodput_to(receiver)) * _battery(d.battery_soc)
-        return -round(adds), -round(footprint_overlap(d, served), 1), (i - receiver) % _IDS
+        return -round(adds), -round(footprint_overlap(d, served), 1), (i - receiver) % AGENT_IDS
 
     return sorted((i for i in view.descriptors if i != receiver), key=merit)
 

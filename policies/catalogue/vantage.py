@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from math import fsum, hypot
 
 from sortie.policies.catalogue.baselines import everyone
+from sortie.policies.catalogue.freshness import GONE_PERIODS
 from sortie.policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
 
-FRESH_PERIODS = 10.0
-"""Peers heard longer ago than this are detached: where they are now is not known."""
 NEAR_M = 5.0
 """Nearer than this is near enough: everyone stays where it is."""
 MOST_M = 100.0
@@ -27,7 +26,7 @@ def over_region(view: FleetView) -> Reposition | None:
     me = view.me
     if me is None or me.region is None or me.task_phase != TaskPhase.TRACK:
         return None
-    fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= FRESH_PERIODS * view.period_s]
+    fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= GONE_PERIODS * view.period_s]
     if not fresh:
         return None
     middle_x, middle_y = (fsum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))

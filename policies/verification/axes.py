@@ -56,7 +56,7 @@ class Observed(NamedTuple):
     decisions: frozenset[str]
 
 
-class _Watched:
+class _WatchedDescriptor:
     """A descriptor that notes which fields are read; it is no tuple, so that nothing is read by place."""
 
     def __init__(self, descriptor: Descriptor, read: set[str]) -> None:
@@ -75,7 +75,7 @@ def observe(policy: Callable[..., Sequence[Directive]], views: Iterable[FleetVie
     read: set[str] = set()
     decided: set[str] = set()
     for view in views:
-        watched = {i: cast(Descriptor, _Watched(d, read)) for i, d in view.descriptors.items()}
+        watched = {i: cast(Descriptor, _WatchedDescriptor(d, read)) for i, d in view.descriptors.items()}
         for directive in policy(view._replace(descriptors=watched)):
             decided |= decisions_of(directive)
     return Observed(frozenset(a for f in read if (a := FIELDS[f]) is not None), frozenset(decided))

@@ -22,7 +22,7 @@ from sortie.policies.user_code import is_users
 
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 
-PURE = frozenset({
+ALLOWED = frozenset({
     "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
     "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions", "functools", "heapq", "itertools",
     "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
@@ -30,12 +30,12 @@ PURE = frozenset({
 """Packages that know nothing but what they are handed; a policy may use them."""
 SHARED = frozenset({"sortie.scenarios.representation", "sortie.scenarios.streams"})
 """Modules of another room that a policy may use: the names of representations, and random draws that depend on their key alone."""
-FAR = frozenset({
+FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip
 _ONLY = {"random": {"Random"}, "sortie": {"policies"}}
 """Modules of which a policy may use so much: a generator with a seed of its own."""
-_BUT = {
+_EXCEPT = {
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
 }  # fmt: skip
 _NO_BUILTINS = {"breakpoint", "compile", "eval", "exec", "exit", "globals", "help", "input", "open", "print", "quit"}
@@ -73,7 +73,7 @@ class _Part:
 
     def __getattr__(self, name: str) -> Any:
         home = self._module.__name__
-        if name in _BUT.get(home, ()) or (home in _ONLY and name not in _ONLY[home]):
+        if name in _EXCEPT.get(home, ()) or (home in _ONLY and name not in _ONLY[home]):
             raise Reached(f"{home}.{name}")
         return getattr(self._module, name)
 
@@ -149,14 +149,14 @@ class _Rebuilding:
             return value
         if _far(home):
             return _Forbidden(f"{home}.{name}")
-        own = home.split(".")[0] not in PURE
+        own = home.split(".")[0] not in ALLOWED
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
             return self.function(value)
         return value
 
     def _module(self, module: types.ModuleType) -> Any:
         home = module.__name__
-        if home in _BUT or home in _ONLY:
+        if home in _EXCEPT or home in _ONLY:
             return _Part(module)
         if is_users(home):
             return _OwnModule(module, self._allowed)
@@ -248,4 +248,4 @@ def _far(home: str) -> bool:
     """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
     parts = home.split(".")
     root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])
-    return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home not in SHARED
+    return root not in ALLOWED and (root in FORBIDDEN or root in sys.stdlib_module_names) and home not in SHARED

@@ -13,7 +13,7 @@ import contextlib
 import inspect
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -144,8 +144,13 @@ def _keeps_bounds(policy: Policy, view: FleetView) -> str | None:
 
 
 def _one_a_link(policy: Policy, view: FleetView) -> str | None:
-    decided = sorted(d.destination for d in _ask(policy, view))
-    return None if decided == list(view.peers) else f"directives for {decided}, must be for each of {list(view.peers)}"
+    return missing_links(_ask(policy, view), view)
+
+
+def missing_links(directives: Iterable[Directive], view: FleetView) -> str | None:
+    """A complaint if the directives are not exactly one for each peer."""
+    decided, peers = sorted(d.destination for d in directives), list(view.peers)
+    return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
 
 
 def _says_why(policy: Policy, view: FleetView) -> str | None:
@@ -222,14 +227,19 @@ def age_monotone(policy: Policy, view: FleetView) -> str | None:
     Each descriptor's age is raised by itself, and all together, to beyond each of the plane's two thresholds.
     """
     before = _ask(policy, view)
+    for who, add_s, older in older_views(view):
+        raised = raised_part(before, _ask(policy, older))
+        if raised is not None:
+            return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
+    return None
+
+
+def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
+    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view."""
     for periods in (1.0, 3.5, 10.5, 1000.0):
         add_s = periods * view.period_s
         for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
-            older = view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
-            raised = raised_part(before, _ask(policy, older))
-            if raised is not None:
-                return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
-    return None
+            yield who, add_s, view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
 
 
 def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str | None:

@@ -31,8 +31,8 @@ from typing import Literal
 
 from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
 from sortie.policies.verification.confine import looks_up
-from sortie.policies.verification.conformance import raised_part
-from sortie.policies.verification.invariants import Invariant, spelt, violations
+from sortie.policies.verification.conformance import missing_links, older_views, raised_part
+from sortie.policies.verification.invariants import Invariant, just_heard, spelt, violations
 from sortie.policies.verification.ranges import FleetOfRanges
 from sortie.policies.verification.symbols import Path, Refused, explore
 from sortie.policies.verification.views import draw_views, smaller
@@ -84,8 +84,7 @@ class RepeatableView:
 
     def just_heard(self) -> FleetView:
         """The same with every age 0."""
-        view = self.now()
-        return view._replace(age_s=dict.fromkeys(view.age_s, 0.0))
+        return just_heard(self.now())
 
     def older(self) -> Iterator[FleetView]:
         """The same with ages raised: any raise at all in a search, a few in a trial."""
@@ -94,10 +93,7 @@ class RepeatableView:
             return
         if self._raised is not None:
             yield self.now()._replace(age_s=dict(self._raised))
-        view = self.now()
-        for periods in (1.0, 3.5, 10.5, 1000.0):
-            for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
-                yield view._replace(age_s={i: a + periods * view.period_s * (i in who) for i, a in view.age_s.items()})
+        yield from (older for _, _, older in older_views(self.now()))
 
 
 # --- properties ----------------------------------------------------------------------------------
@@ -110,8 +106,7 @@ def keeps_contract(policy: Policy, view: RepeatableView) -> str | None:
         check_directives(directives, view.now())
     except PolicyError as error:
         return str(error)
-    decided, peers = sorted(d.destination for d in directives), list(view.now().peers)
-    return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
+    return missing_links(directives, view.now())
 
 
 def only_falls_with_age(policy: Policy, view: RepeatableView) -> str | None:

@@ -8,15 +8,14 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
-from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, TaskPhase
 from sortie.policies.geometry import circle_overlap, peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
-from sortie.policies.verification.views import GRID_BYTES
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8
 """Bits of a descriptor's novelty flags; the plane itself uses two."""
-_HIGHEST: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
+_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
 
 class FleetOfRanges:
@@ -33,7 +32,7 @@ class FleetOfRanges:
         return FleetView(self.ego, self.period_s, descriptors, ages)
 
     def _age(self, i: int) -> Ranged:
-        return self.path.number(f"age_s of drone {i}", 0.0, _HIGHEST["age"])
+        return self.path.number(f"age_s of drone {i}", 0.0, _SEARCHED_UP_TO["age"])
 
     def older_view(self) -> FleetView:
         """The view at ages not below this cell's: each at least the lowest age of the cell reached so far.
@@ -46,7 +45,7 @@ class FleetOfRanges:
         for i in self.heard:
             self._age(i)
             low, _ = self.path.ranges[f"age_s of drone {i}"]
-            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _HIGHEST["age"])
+            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _SEARCHED_UP_TO["age"])
         return self.view()._replace(age_s=ages)
 
     def example(self) -> FleetView:
@@ -77,7 +76,7 @@ class FleetOfRanges:
                 peer_goodput_mbps=tuple(
                     number(f"goodput of drone {i} to slot {slot}", 100.0) for slot in range(self.drones - 1)
                 ),
-                coverage_grid=bytes(GRID_BYTES),
+                coverage_grid=bytes(COVERAGE_BYTES),
                 novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
                 task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
@@ -129,7 +128,7 @@ class DescriptorOfRanges:
 
     @property
     def peer_goodput_mbps(self) -> tuple[Any, ...]:
-        path, me, high = self._system.path, self.agent_id, _HIGHEST["goodput"]
+        path, me, high = self._system.path, self.agent_id, _SEARCHED_UP_TO["goodput"]
         slots = range(self._system.drones - 1)
         return tuple(path.number(f"goodput of drone {me} to slot {slot}", 0.0, high) for slot in slots)
 
@@ -157,7 +156,7 @@ class DescriptorOfRanges:
 
     @property
     def priority_target_ids(self) -> Any:
-        return _Counted(self._number("targets", 0, 16), self._system.path)
+        return _TargetIds(self._number("targets", 0, 16), self._system.path)
 
     @property
     def position_m(self) -> tuple[float, float, float]:
@@ -224,8 +223,8 @@ def _of_all_bits(name: str) -> Callable[..., Any]:
     return operator
 
 
-_UNASKED = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
-for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _UNASKED:
+_OWN_METHODS = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
+for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _OWN_METHODS:
     setattr(_Flags, _asked, _of_all_bits(_asked))  # where Python looks for operators
 
 
@@ -233,7 +232,7 @@ def _flag(bit: int, agent_id: int) -> str:
     return f"novelty flag {bit} of drone {agent_id}"
 
 
-class _Counted:
+class _TargetIds:
     """Target ids of which only the number is known."""
 
     def __init__(self, count: Any, path: Path) -> None:

@@ -296,11 +296,11 @@ class Text(str):
         self._path.refuse(f"looks into the text of {self._axis}, which is for reasons alone")
 
 
-_HANDED_ON = {
+_INHERITED = {
     "__new__", "__init__", "__init_subclass__", "__subclasshook__", "__class__", "__doc__", "__dir__", "__getattribute__",
     "__setattr__", "__delattr__", *vars(Text),
 }  # fmt: skip
-for _asked in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _HANDED_ON:
+for _asked in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _INHERITED:
     setattr(Text, _asked, Text._looked_into)
 
 _MARK = "\ue000"

@@ -11,10 +11,10 @@ import numpy as np
 
 from sortie.policies.contract import PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
 from sortie.scenarios.errors import SortieError
+from sortie.policies.contract import COVERAGE_BYTES, PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
-GRID_BYTES = 64
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
@@ -69,7 +69,7 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
         cpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         peer_goodput_mbps=tuple(_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(drones - 1)),
-        coverage_grid=rng.bytes(GRID_BYTES) if rng.random() < 0.7 else bytes(GRID_BYTES),
+        coverage_grid=rng.bytes(COVERAGE_BYTES) if rng.random() < 0.7 else bytes(COVERAGE_BYTES),
         novelty_flags=int(rng.integers(4)),
         task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
         region=region,
@@ -89,7 +89,7 @@ _PLAIN: dict[str, Any] = {
     "velocity_mps": (0.0, 0.0, 0.0),
     "cpu_headroom": 1.0,
     "gpu_headroom": 1.0,
-    "coverage_grid": bytes(GRID_BYTES),
+    "coverage_grid": bytes(COVERAGE_BYTES),
     "novelty_flags": 0,
     "region": None,
     "priority_target_ids": (),
@@ -190,8 +190,8 @@ def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
         grid = bytes.fromhex(entry.get("coverage_grid", ""))
     except (TypeError, ValueError) as error:
         raise ViewError(f"{where}.coverage_grid must be hexadecimal") from error
-    if len(grid) != GRID_BYTES:
-        raise ViewError(f"{where}.coverage_grid has {len(grid)} bytes, must have {GRID_BYTES}")
+    if len(grid) != COVERAGE_BYTES:
+        raise ViewError(f"{where}.coverage_grid has {len(grid)} bytes, must have {COVERAGE_BYTES}")
     region = entry.get("region")
     x_m, y_m, z_m = _numbers(entry, "position_m", where, 3)
     vx_mps, vy_mps, vz_mps = _numbers(entry, "velocity_mps", where, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sortie.policies.contract import Directive, Representation
 
 RATE_HZ = 10.0
+"""One payload for every frame."""
 
 
 def full_sharing(source: int, destination: int, rho: float, reason: str) -> Directive:

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
-from sortie.policies.contract import Directive, FleetView, nothing
-
-_IDS = 256
+from sortie.policies.contract import AGENT_IDS, Directive, FleetView, nothing
 
 
 def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
@@ -20,7 +18,7 @@ def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     directives = []
     for peer in view.peers:
         scores = scores_for(view, peer)
-        best = max(scores, key=lambda i: (scores[i], -((i - peer) % _IDS)))
+        best = max(scores, key=lambda i: (scores[i], -((i - peer) % AGENT_IDS)))
         if best == view.ego:
             directives.append(full_sharing(view.ego, peer, rho, f"Who2com: best for {peer}, {scores[best]:.2f}"))
         else:
