@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.contract import PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
-from sortie.scenarios.errors import SortieError
 from sortie.policies.contract import COVERAGE_BYTES, PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
