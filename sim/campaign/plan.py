@@ -19,6 +19,7 @@ import numpy as np
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
+from sortie.policies.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
 from sortie.scenarios.reading.load import loads
@@ -234,11 +235,12 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
 
 
 def _files(named: list[str]) -> dict[str, str]:
-    """Digests of the files that runs read beside the code, by path."""
-    paths = [Path(name) for name in named]
+    """Digests of the files that runs read beside the code, by path; of Python files also of those that they import."""
     found = {}
-    for path in paths:
+    for path in map(Path, named):
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        if path.suffix == ".py" and path.is_file():
+            inside = list(imported_files(path))
         for file in inside:
             try:
                 found[str(file)] = file_digest(file)
