@@ -15,6 +15,7 @@ import numpy as np
 
 from sortie.perception.geometry import CELLS as GRID
 from sortie.perception.geometry import CHANNELS, FULL
+from sortie.scenarios.disc import Disc
 
 CELLS = GRID * GRID
 CELL_M = FULL.cell_m
@@ -40,7 +41,7 @@ _CENTRES_M = tuple((i + 0.5 - GRID / 2) * CELL_M for i in range(GRID))
 """Along either axis of the sender's levelled frame: x forward (rows), y left (columns)."""
 
 
-def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> np.ndarray:
+def roi_mask(roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> np.ndarray:
     """[64, 64] bool: cells of a sender at this estimated pose whose centres are in the disc (x, y, radius), ENU."""
     if roi is None:
         return np.ones((GRID, GRID), bool)
@@ -50,7 +51,7 @@ def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw
     return mask
 
 
-def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> int:
+def cells_sent(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> int:
     """How many cells go: ⌊ρ·4096⌋, at most those in the ROI."""
     budget = math.floor(rho * CELLS + 1e-9)
     if roi is None or budget == 0:
@@ -60,15 +61,13 @@ def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y
     return min(budget, sum([bisect_right(aside, left) for left in room]))
 
 
-def must_choose(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
+def must_choose(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
     """Whether the budget is below the cells there are, so that they have to be ranked."""
     candidates = CELLS if roi is None else cells_sent(1.0, roi, x_m, y_m, yaw_rad)
     return math.floor(rho * CELLS + 1e-9) < candidates
 
 
-def _window(
-    roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float
-) -> tuple[slice, slice, list[float], list[float]]:
+def _window(roi: Disc, x_m: float, y_m: float, yaw_rad: float) -> tuple[slice, slice, list[float], list[float]]:
     """The rows and columns that a disc can touch; what each row leaves of the squared radius, and each column's squared
     distance from the centre: a cell is inside where the second is at most the first. Lists: there are some twenty."""
     dx, dy, radius_m = roi[0] - x_m, roi[1] - y_m, roi[2]
@@ -91,7 +90,7 @@ def _span(centre_m: float, radius_m: float) -> slice:
 def select(
     rank: np.ndarray,
     rho: float,
-    roi: tuple[float, float, float] | None,
+    roi: Disc | None,
     x_m: float,
     y_m: float,
     yaw_rad: float,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 
@@ -26,7 +27,7 @@ class Detector(Protocol):
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """What there is to find in the ego's square at `t_s`, ENU."""
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many detections the drone would send for this capture, inside a disc (x, y, radius) if there is one."""
 
     def camera_views(self, capture: Capture) -> NDArray[Any]:

@@ -19,6 +19,7 @@ from sortie.perception import budget
 from sortie.perception.geometry import in_square
 from sortie.perception.metrics.ap import best_first, rivals, standing
 from sortie.perception.types import Boxes, Share
+from sortie.scenarios.disc import Disc
 
 NMS_IOU = 0.15
 """Boxes that overlap by more are of one car."""
@@ -40,7 +41,7 @@ class Told:
     """Its weight against the others'."""
     pose: Pose
     """x, y, yaw of its square when it looked, ENU."""
-    roi: tuple[float, float, float] | None = None
+    roi: Disc | None = None
     """Where its boxes were asked for; it says nothing of what lies outside."""
     cut: bool = False
     """Weaker boxes were left out: of what it does not mention it says nothing."""

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.scenarios.disc import Disc
+
 
 class Capture(NamedTuple):
     """One drone's sensing at one instant: a cheap handle, rendered only when somebody looks."""
@@ -44,7 +46,7 @@ class Share(NamedTuple):
     representation: str
     """features, detections, tracks or raw."""
     rho: float
-    roi: tuple[float, float, float] | None
+    roi: Disc | None
     """x_m, y_m, radius_m, ENU."""
     weight: float
     """Fusion weight from the directive, 0 … 1."""
@@ -72,7 +74,7 @@ class Boxes:
         """The boxes at the given indices, under the given mask or in the given slice, in that order."""
         return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which])
 
-    def inside(self, disc: tuple[float, float, float] | None) -> Boxes:
+    def inside(self, disc: Disc | None) -> Boxes:
         """The boxes whose centres are in the disc (x, y, radius); all of them for None."""
         if disc is None:
             return self

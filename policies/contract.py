@@ -17,6 +17,7 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from sortie.scenarios.disc import Disc as Disc  # policies import it from here
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.representation import Representation as Representation
 
@@ -57,14 +58,6 @@ class Coverage(IntEnum):
     POOR = 1
     WELL = 2
     NOVEL = 3
-
-
-class Disc(NamedTuple):
-    """A disc on the ground, ENU, metres."""
-
-    x_m: float
-    y_m: float
-    radius_m: float
 
 
 class Descriptor(NamedTuple):

@@ -32,6 +32,7 @@ from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, best_first, hits, suppressed
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.streams import stream
 
 __all__ = ["FLOOR", "NMS_IOU", "REGION_M", "Evaluation", "Region", "Settings", "evaluate", "mission_target", "truth"]
@@ -188,7 +189,7 @@ def exchanges(
     est = frames.est_pose[f]
     drones = len(est)
     overlap = selection.footprint_overlap(est[:, :2], np.full(drones, selection.FOOTPRINT_M))
-    roi = None if target is None else selection.in_disc(est, (*target, REGION_M), geometry)
+    roi = None if target is None else selection.in_disc(est, Disc(*target, REGION_M), geometry)
     orders: dict[tuple[str, bool], NDArray[np.int16]] = {}
     out = []
     for c in conditions:

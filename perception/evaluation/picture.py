@@ -18,6 +18,7 @@ from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges,
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 PAPER_BUDGETS = (0.25, 0.02)
 
@@ -36,7 +37,7 @@ class Picture:
     truth: Boxes
     found: Boxes
     """Under full sharing, at τ."""
-    disc: tuple[float, float, float] | None
+    disc: Disc | None
     """The mission's."""
     shared: tuple[tuple[float, NDArray[np.int64]], ...]
     """For each budget how many peers share each cell of the ego's grid [64, 64]."""
@@ -79,7 +80,7 @@ def picture(
         est_pose=frames.est_pose[f],
         truth=truth(frames, f, ego, geometry),
         found=suppress(found, settings.nms_iou),
-        disc=None if target is None else (*target, REGION_M),
+        disc=None if target is None else Disc(*target, REGION_M),
         shared=tuple(
             (rho, sharers(e, frames.est_pose[f], geometry)) for rho, e in zip(budgets, given[1:], strict=True)
         ),

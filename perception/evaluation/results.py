@@ -12,7 +12,7 @@ from sortie.perception.metrics.bootstrap import DRAWS
 
 TAU = 0.1
 """UAV3D's head cuts its scores there."""
-Disc = Literal["mission", "ego"]
+DiscCentre = Literal["mission", "ego"]
 """Around the mission's target, or around the ego."""
 
 
@@ -47,10 +47,10 @@ class TableResults:
 
     evaluation: Evaluation
     asked: TableSettings
-    _made: dict[tuple[Unsent, float, Disc], Bootstrap] = field(default_factory=dict)
+    _made: dict[tuple[Unsent, float, DiscCentre], Bootstrap] = field(default_factory=dict)
     _cut: dict[float, Evaluation] = field(default_factory=dict)
 
-    def scores(self, unsent: Unsent, *, tau: float | None = None, disc: Disc = "mission") -> Bootstrap:
+    def scores(self, unsent: Unsent, *, tau: float | None = None, disc: DiscCentre = "mission") -> Bootstrap:
         """Bootstrapped APs of one instrument, at the threshold that was asked for or another."""
         key = (unsent, self.asked.tau if tau is None else tau, disc)
         if key not in self._made:

@@ -13,6 +13,7 @@ from sortie.perception.budget import index_bytes, payload_bytes
 from sortie.perception.evaluation.condition import Allocation, Sharing
 from sortie.perception.geometry import CELLS as GRID
 from sortie.perception.geometry import FULL, Geometry
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.streams import stream
 
 CELLS = GRID * GRID
@@ -21,8 +22,6 @@ FOOTPRINT_M = 60.0 * math.tan(math.radians(35.0))
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Disc = tuple[float, float, float]
-"""x, y, radius in metres, ENU."""
 
 
 def footprint_overlap(xy_m: Floats, radius_m: Floats) -> Floats:

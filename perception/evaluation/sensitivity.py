@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from sortie.perception.evaluation.claims import CLAIMS, Claim
 from sortie.perception.evaluation.condition import Unsent
-from sortie.perception.evaluation.results import Disc, TableResults
+from sortie.perception.evaluation.results import DiscCentre, TableResults
 
 TAUS = (0.01, 0.1, 0.2, 0.3, 0.5)
-DISCS: dict[Disc, str] = {"mission": "around the target", "ego": "around the ego"}
+DISCS: dict[DiscCentre, str] = {"mission": "around the target", "ego": "around the ego"}
 BY_TAU = ("gain", "curve.0.1", "starved", "flip.0.02", "flip.0.05", "flip.0.1", "flip.0.25", "oracle.held-out")
 BY_DISC = ("mission.full", "mission.widest", "mission.tenth", "mission.peak", "compose.mission", "compose.spread")
 """Claims that are looked at again."""
@@ -55,7 +55,7 @@ def _varied(
     setting: str,
     *,
     tau: float | None = None,
-    disc: Disc = "mission",
+    disc: DiscCentre = "mission",
 ) -> Varied:
     measured = claim.measure.measure(found.scores(unsent, tau=tau, disc=disc))  # type: ignore[union-attr]
     value = measured.value if measured.value == measured.value else None

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
@@ -153,7 +154,7 @@ def suppress(boxes: Boxes, iou: float) -> Boxes:
 def match(
     found: Boxes,
     truth: Boxes,
-    disc: tuple[float, float, float] | None = None,
+    disc: Disc | None = None,
     iou: float = 0.5,
     convention: Convention = ROTATED,
 ) -> Matched:

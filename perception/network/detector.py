@@ -36,13 +36,13 @@ from sortie.perception.scene.render import VIEWS_SHAPE, Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import BOX_NAMES, MAP_NAMES
 from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 KEPT_CAPTURES = 64
-Disc = tuple[float, float, float]
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
@@ -169,7 +169,7 @@ class TorchDetector:
         """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
         return ground_truth(self._scene, t_s, ego.position_m[:2], FULL.half_extent_m, ego.true_yaw_rad)
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
         self._encode([capture])
         return len(self._sendable(self._look_alone(capture).result()).inside(roi))

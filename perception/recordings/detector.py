@@ -17,6 +17,7 @@ from sortie.perception.metrics.ap import suppress
 from sortie.perception.recordings.exchange import Sent, fused, load_fusion, reaching
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Perception
 
@@ -66,7 +67,7 @@ class RecordedDetector:
         columns = (cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
         return Boxes(*(column.astype(np.float32) for column in columns))
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many recorded detections the drone would send."""
         return len(self._sendable(self._alone(capture, self._pose(capture))).inside(roi))
 

@@ -23,6 +23,7 @@ from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from sortie.perception.surrogate.shared_false_positives import Mirages
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import BOX_NAMES
 from sortie.scenarios.schema import Perception
 
@@ -128,7 +129,7 @@ class SurrogateDetector:
         columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
         return BoxColumns(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
         half = FULL.half_extent_m
         x, y, radius = (*capture.position_m[:2], 2 * half / np.sqrt(np.pi)) if roi is None else roi

@@ -13,6 +13,7 @@ from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
 from sortie.perception.types import Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Scene
 
@@ -122,7 +123,7 @@ def _allowed(roi: Floats, pose: Floats) -> Floats:
     off = np.hypot(roi[:, 0] - pose[:, 0], roi[:, 1] - pose[:, 1]) + radius
     for i in np.flatnonzero(np.isfinite(radius) & (off > FULL.half_extent_m)).tolist():
         x, y, yaw = pose[i].tolist()
-        out[i] = budget.cells_sent(1.0, tuple(roi[i].tolist()), x, y, yaw)
+        out[i] = budget.cells_sent(1.0, Disc(*roi[i].tolist()), x, y, yaw)
     return np.asarray(out)
 
 

@@ -11,7 +11,8 @@ from sortie.perception.metrics.bootstrap import compare, interval, rank, resampl
 from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.plan import THRESHOLD, Disc, Question, scene_model
+from sortie.perception.surrogate.plan import THRESHOLD, Question, scene_model
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 WITHIN = 0.02

@@ -14,6 +14,7 @@ from sortie.perception.joining import Rule
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TargetPath
 from sortie.perception.types import Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Scene, Target
 from sortie.scenarios.streams import stream
 
@@ -44,7 +45,6 @@ _SHAPES = {
     "wedge": np.array([(0, 0), (-1, 1), (-1, -1), (-2, 2), (-2, -2)], dtype=np.float64) / np.sqrt(2),
     "circle": np.array([(np.cos(a), np.sin(a)) for a in np.arange(5) * 2 * np.pi / 5]) / (2 * np.sin(np.pi / 5)),
 }
-Disc = tuple[float, float, float]
 Fleets = tuple[list[Capture], dict[float, list[Capture]]]
 """A fleet's captures now, and a little earlier by how much."""
 
@@ -129,7 +129,7 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
         if manner == "anywhere":
             return [job for ego in egos for job in conditions(ego, now, old)]
         x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
-        return [job for ego in egos for job in street_conditions(ego, now, old, (x, y, 32.0))]
+        return [job for ego in egos for job in street_conditions(ego, now, old, Disc(x, y, 32.0))]
     jobs = [Question(ego, (), "masked", "confidence", "") for ego in now]
     jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(DRAWN)]
     return jobs + [_plain(rng, ego, now) for ego in now for _ in range(PLAIN)]
@@ -141,7 +141,7 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
     near = sorted(peers, key=lambda i: np.hypot(*np.subtract(now[i].position_m, now[ego].position_m)[:2]))
     x, y, _ = now[ego].position_m
     turn = now[ego].true_yaw_rad
-    disc = (x + 20 * float(np.cos(turn)), y + 20 * float(np.sin(turn)), 32.0)
+    disc = Disc(x + 20 * float(np.cos(turn)), y + 20 * float(np.sin(turn)), 32.0)
 
     def job(
         name: str,
@@ -317,7 +317,7 @@ def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: d
     roi = None
     if u[3] < 0.25:
         x, y = np.array(ego.position_m[:2]) + rng.uniform(-45, 45, 2)
-        roi = (float(x), float(y), float(20 + 30 * u[4]))
+        roi = Disc(float(x), float(y), float(20 + 30 * u[4]))
     ages = rng.choice((0.0, *AGES_S), size=len(peers)) if u[5] < 0.35 else np.zeros(len(peers))
     if u[5] < 0.2:
         ages[:] = ages[0]

@@ -28,8 +28,8 @@ ALLOWED = frozenset({
     "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that know nothing but what they are handed; a policy may use them."""
-SHARED = frozenset({"sortie.scenarios.representation", "sortie.scenarios.streams"})
-"""Modules of another room that a policy may use: the names of representations, and random draws that depend on their key alone."""
+SHARED = frozenset({"sortie.scenarios.disc", "sortie.scenarios.representation", "sortie.scenarios.streams"})
+"""Modules of another room that a policy may use: two types, and random draws that depend on their key alone."""
 FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip

@@ -33,10 +33,9 @@ def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
 
 def as_share(received: Received, trust: float = 1.0) -> Share:
     """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
-    payload, roi = received.payload, received.payload.roi
-    disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
+    payload = received.payload
     name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
-    return Share(received.capture, name, payload.rho, disc, weight, received.missing)
+    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing)
 
 
 Job = tuple[Capture, list[Share]]

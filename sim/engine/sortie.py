@@ -124,7 +124,7 @@ def run_sortie(
 
     def count_boxes(capture: Capture, roi: Disc | None) -> int:
         assert detector is not None  # noqa: S101
-        return detector.count_boxes(capture, None if roi is None else (roi.x_m, roi.y_m, roi.radius_m))
+        return detector.count_boxes(capture, roi)
 
     rules = PlaneRules(
         period_s=scenario.frame_s,

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ def sightings(
         own = own.take(np.argsort(-own.score, kind="stable"))  # the order of full.hit
         hits = own.take(full.hit)
         disc = discs[np.searchsorted(disc_t_s, t_s, side="right") - 1]
-        mission = None if np.isnan(disc[2]) else match(own, truth, (float(disc[0]), float(disc[1]), float(disc[2])))
+        mission = None if np.isnan(disc[2]) else match(own, truth, Disc(*disc.tolist()))
         yield Sighting(t_s, drone, hits, own.take(~full.hit), truth.take(_uncovered(truth, hits)), full, mission)
 
 
