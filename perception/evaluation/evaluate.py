@@ -15,6 +15,7 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.budget import cells_in
 from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, FrameView, Instrument
@@ -193,7 +194,7 @@ def exchanges(
     orders: dict[tuple[str, bool], NDArray[np.int16]] = {}
     out = []
     for c in conditions:
-        total = selection.total_cells(c.rho, drones - 1)
+        total = cells_in(c.rho, drones - 1)
         which = (c.cells_by, c.roi and roi is not None)
         if total and which not in orders:
             orders[which] = selection.sending_order(view.rank(c.cells_by), roi if which[1] else None)
