@@ -149,7 +149,7 @@ def _averaged(boxes: Boxes, of: NDArray[np.intp], group: NDArray[np.intp], all_t
     heard = np.where(_looked(all_told, xy) | (said > 0.0), say, 0.0)
     score = (heard * said).sum(axis=1) / heard.sum(axis=1)
     order = np.argsort(-score, kind="stable")
-    return Boxes(*(v.astype(np.float32)[order] for v in (xy, size, yaw, score)))
+    return Boxes(xy, size, yaw, score).single().take(order)
 
 
 def _looked(all_told: Sequence[Told], xy_m: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.geometry import to_world
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.representation import MAP_NAMES
 
 
 class Capture(NamedTuple):
@@ -33,6 +35,11 @@ class Capture(NamedTuple):
         return self.est_position_m[0], self.est_position_m[1], self.est_yaw_rad
 
     @property
+    def true_pose(self) -> tuple[float, float, float]:
+        """x, y, yaw as they were: the centre and the turn of the square that is scored."""
+        return self.position_m[0], self.position_m[1], self.true_yaw_rad
+
+    @property
     def true_yaw_rad(self) -> float:
         """The heading it had."""
         x, y, z, w = self.orientation_xyzw
@@ -52,6 +59,11 @@ class Share(NamedTuple):
     """Fusion weight from the directive, 0 … 1."""
     missing: tuple[int, ...] = ()
     """Ranks (0 the best) of the cells that were sent and did not arrive."""
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it holds feature cells rather than boxes."""
+        return self.representation in MAP_NAMES
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +97,10 @@ class Boxes:
         """[n, 5] float64: x, y, length, width, yaw."""
         return np.concatenate([self.xy_m, self.size_m, self.yaw_rad[:, None]], axis=1).astype(np.float64)
 
+    def single(self) -> Boxes:
+        """The same boxes in float32, as sorties record them."""
+        return Boxes(*(getattr(self, name).astype(np.float32) for name in self.__slots__))
+
     @classmethod
     def empty(cls) -> Boxes:
         """No boxes."""
@@ -100,7 +116,5 @@ class Boxes:
     @classmethod
     def placed(cls, local: NDArray[Any], pose: tuple[float, float, float]) -> Boxes:
         """Boxes [n, 6] of a drone's frame (x forward, y left, length, width, yaw, score), put into the world by its pose (x, y, yaw)."""
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        x, y = local[:, 0], local[:, 1]
-        xy = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=1)
-        return cls(*(a.astype(np.float32) for a in (xy, local[:, 2:4], local[:, 4] + pose[2], local[:, 5])))
+        xy = np.stack(to_world(local[:, 0], local[:, 1], pose), axis=1)
+        return cls(xy, local[:, 2:4], local[:, 4] + pose[2], local[:, 5]).single()

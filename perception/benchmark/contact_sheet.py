@@ -9,11 +9,10 @@ import numpy as np
 
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
-from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import CAMERAS, Renderer
-from sortie.perception.scene.scene_model import SceneModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +35,7 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
     if index < 0 or frame < 0:
         raise ValueError(f"scene {index}, frame {frame}: must be 0 or above")
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
     views = Renderer(scene, scene_id(bench.seed, split, index)).render(captures)
     ground = lift(views, captures, bench.geometry).numpy()

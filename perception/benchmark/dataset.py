@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.difficulty import Difficulty, Layout, Split
 from sortie.perception.benchmark.manifest import COLUMNS, BenchmarkError
-from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import Renderer
-from sortie.perception.scene.scene_model import SceneModel
 
 FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
@@ -104,7 +103,7 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
         return path
     name = scene_id(bench.seed, split, index)
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     renderer = Renderer(scene, name)
     images = np.empty((frames, DRONES, 4, IMAGE_PX, IMAGE_PX), np.uint8)
     true_pose, est_pose = np.empty((frames, DRONES, 3)), np.empty((frames, DRONES, 3))
@@ -112,10 +111,9 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
     for f in range(frames):
         captures = draw_captures(bench.seed, split, index, f, bench.difficulty)
         images[f] = lift(renderer.render(captures), captures, bench.geometry).numpy()
-        true_pose[f] = [(*c.position_m[:2], c.true_yaw_rad) for c in captures]
+        true_pose[f] = [c.true_pose for c in captures]
         est_pose[f] = [c.est_pose for c in captures]
-        at = scene.cars_at(captures[0].t_s)
-        cars.append(np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1))
+        cars.append(scene.cars_at(captures[0].t_s).table())
     table = np.full((frames, max(len(c) for c in cars), 5), np.nan)
     for row, c in zip(table, cars, strict=True):
         row[: len(c)] = c

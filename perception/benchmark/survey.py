@@ -9,9 +9,8 @@ import numpy as np
 
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
-from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene
+from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, model_of
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
-from sortie.perception.scene.scene_model import SceneModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +35,7 @@ class Counts:
 def survey(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Counts:
     """Count one frame of a scene; about a fifth of a CPU second."""
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
     cars = scene.cars_at(captures[0].t_s)
     asked = np.stack([inside(c, cars, bench.geometry.half_extent_m) for c in captures])

@@ -22,7 +22,7 @@ import torch
 
 from sortie.perception.benchmark.dataset import FORMAT, Frames, start_worker
 from sortie.perception.benchmark.difficulty import Difficulty
-from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
@@ -146,15 +146,14 @@ def evaluate_scene(weights: Path, index: int, rows: Sequence[ParameterShift], pa
             config = draw_scene(SEED, "test", index, move.difficulty)
             key = config.model_dump_json()
             if key not in towns:
-                towns[key] = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+                towns[key] = model_of(config)
                 renderers[key] = Renderer(towns[key], scene_id(SEED, "test", index))
             captures = draw_captures(SEED, "test", index, 0, move.difficulty)
-            at = towns[key].cars_at(captures[0].t_s)
             frames = Frames(
                 images=lift(renderers[key].render(captures), captures, instrument.geometry).numpy()[None],
-                true_pose=np.array([[(*c.position_m[:2], c.true_yaw_rad) for c in captures]]),
+                true_pose=np.array([[c.true_pose for c in captures]]),
                 est_pose=np.array([[c.est_pose for c in captures]]),
-                cars=np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1)[None],
+                cars=towns[key].cars_at(captures[0].t_s).table()[None],
                 scene=np.array([index]),
             )
             result = evaluate(instrument, frames, CONDITIONS, regions=("full",))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.perception.evaluation.contract import Floats
-from sortie.perception.evaluation.picture import Picture, to_world
-from sortie.perception.geometry import CELLS
+from sortie.perception.evaluation.picture import Picture
+from sortie.perception.geometry import CELLS, to_world
 from sortie.perception.metrics.overlap import corners
 from sortie.perception.types import Boxes
 

@@ -16,12 +16,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.joining import NMS_IOU
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, average_precision
 
 Region = Literal["full", "mission", "ego"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NMS_IOU, FLOOR = 0.15, 0.01
+FLOOR = 0.01
 
 
 @dataclass(frozen=True, slots=True)

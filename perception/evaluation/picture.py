@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from sortie.perception.evaluation.condition import FULL_SHARING, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
 from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
-from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.geometry import CELLS, Geometry, to_local, to_world
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
@@ -95,16 +94,7 @@ def sharers(exchange: Exchange, est_pose: Floats, geometry: Geometry) -> NDArray
     x, y = to_world(forward, left, est_pose[exchange.ego])
     count = np.zeros((CELLS, CELLS), np.int64)
     for peer, sent in zip(exchange.peers, exchange.sent, strict=True):
-        px, py, yaw = est_pose[peer]
-        c, s = np.cos(yaw), np.sin(yaw)
-        row = np.floor((c * (x - px) + s * (y - py)) / geometry.cell_m + CELLS / 2).astype(int)
-        column = np.floor((c * (y - py) - s * (x - px)) / geometry.cell_m + CELLS / 2).astype(int)
+        row, column = (np.floor(v / geometry.cell_m + CELLS / 2).astype(int) for v in to_local(x, y, est_pose[peer]))
         inside = (row >= 0) & (row < CELLS) & (column >= 0) & (column < CELLS)
         count[inside] += sent[row[inside], column[inside]]
     return count
-
-
-def to_world(forward: NDArray[Any], left: NDArray[Any], pose: Floats) -> tuple[Floats, Floats]:
-    """Points of a drone's level frame, put into the world by its pose (x, y, yaw)."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return pose[0] + c * forward - s * left, pose[1] + s * forward + c * left

@@ -11,7 +11,7 @@ from sortie.perception.evaluation.scores import Bootstrap, By
 from sortie.perception.metrics.bootstrap import DRAWS
 
 TAU = 0.1
-"""UAV3D's head cuts its scores there."""
+"""Score threshold: UAV3D's head drops boxes below it, and so does a scenario unless it says otherwise."""
 DiscCentre = Literal["mission", "ego"]
 """Around the mission's target, or around the ego."""
 

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from sortie.perception.compiled import compiled, fma
-from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
-from sortie.perception.scene.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
+from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, IMAGE_PX, Geometry
+from sortie.perception.scene.render import CAMERAS, tilt
 from sortie.perception.scene.town import Bytes, FloatMap
 from sortie.perception.types import Capture
 

@@ -21,7 +21,8 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.geometry import CELLS, FULL, in_square
+from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
@@ -37,7 +38,6 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
-from sortie.scenarios.representation import BOX_NAMES, MAP_NAMES
 from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -46,36 +46,12 @@ KEPT_CAPTURES = 64
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
-__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth", "shipped"]
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "shipped"]
 
 
 def shipped(fusion: str) -> Path:
     """The weights that a fusion flies with when the scenario names none; those without parameters of their own take DiscoNet's."""
     return SHIPPED_WEIGHTS if FUSIONS[fusion].shares != "features" else WEIGHTS / f"{fusion}.safetensors"
-
-
-def ground_truth(
-    scene: SceneModel,
-    t_s: float,
-    centre_xy: tuple[float, float],
-    half_extent: float = FULL.half_extent_m,
-    yaw_rad: float = 0.0,
-) -> Boxes:
-    """The cars at `t_s` whose centres lie in the square about `centre_xy` (ENU, m) that is turned by `yaw_rad`.
-
-    Every such car counts, also one that no drone could see. Scores are 1.
-    """
-    cars = scene.cars_at(t_s)
-    xy = np.stack([cars.x_m, cars.y_m], axis=1)
-    inside = in_square(xy, [(*centre_xy, yaw_rad)], half_extent)[:, 0]
-    cars = cars.where(inside)
-    columns = (
-        xy[inside],
-        np.stack([cars.length_m, cars.width_m], 1),
-        cars.yaw_rad,
-        np.ones(len(cars)),
-    )
-    return Boxes(*(column.astype(np.float32) for column in columns))
 
 
 @dataclass(slots=True)
@@ -148,7 +124,7 @@ class TorchDetector:
             jobs = [(ego, ()) for ego, _ in jobs]
         known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        look = {s.capture for s in shared if s.representation in BOX_NAMES}
+        look = {s.capture for s in shared if not s.is_map}
         look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
@@ -157,7 +133,7 @@ class TorchDetector:
                 self._head_alone(capture)
         if self._fusion.shares == "boxes":
             for share in shared:
-                if share.representation in MAP_NAMES:
+                if share.is_map:
                     self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
         # as things stand: what is asked for later stands behind these tasks, and none may wait for it
@@ -166,8 +142,8 @@ class TorchDetector:
         return lambda: [f.result() for f in found]
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
-        """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
-        return ground_truth(self._scene, t_s, ego.position_m[:2], FULL.half_extent_m, ego.true_yaw_rad)
+        """The cars inside the ego's square at `t_s`, about its true position and heading at capture."""
+        return ground_truth(self._scene.cars_at(t_s).table(), ego.true_pose).single()
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
@@ -270,7 +246,7 @@ class TorchDetector:
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
-        return self._fusion.shares == "features" and share.representation in MAP_NAMES
+        return self._fusion.shares == "features" and share.is_map
 
     def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
@@ -313,7 +289,7 @@ class TorchDetector:
 
     def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
         """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
-        if share.representation in MAP_NAMES:
+        if share.is_map:
             lies, part = self._lies(share, now), _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.geometry import CELLS, CHANNELS, FULL, in_square
+from sortie.perception.geometry import CELLS, CHANNELS, FULL
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import NMS_IOU, Told, joined, sendable, told
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.recordings.exchange import Sent, fused, load_fusion, reaching
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
-from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Perception
 
 NEAR_M = 5.0
@@ -62,10 +62,7 @@ class RecordedDetector:
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The recorded cars of the frame nearest to `t_s`, in the square about where the ego was recorded."""
         pose = self._recording.pose[self._frame(ego), ego.drone]
-        cars = self._recording.truth(self._nearest(t_s, "truth"))
-        cars = cars[in_square(cars[:, :2], [pose])[:, 0]]
-        columns = (cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
-        return Boxes(*(column.astype(np.float32) for column in columns))
+        return ground_truth(self._recording.truth(self._nearest(t_s, "truth")), pose).single()
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many recorded detections the drone would send."""
@@ -85,14 +82,14 @@ class RecordedDetector:
         config, pose = self._config, self._pose(ego)
         at = (self._frame(ego), ego.drone)
         heard = [s for s in shares if s.weight > 0.0]
-        maps = [self._sent(s, now) for s in heard if s.representation in MAP_NAMES]
+        maps = [self._sent(s, now) for s in heard if s.is_map]
         if self._fuse is not None and maps:
             local = fused(self._fuse, self._recording, at, pose, maps, config.unsent_cells)
         else:
             local = reaching(self._recording, at, pose, maps)
         found = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
         found = suppress(found, NMS_IOU)
-        late = [self._told(s) for s in heard if s.representation not in MAP_NAMES]
+        late = [self._told(s) for s in heard if not s.is_map]
         return joined(pose, found, bool(maps), late, config.join)
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:

@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.geometry import HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
 from sortie.perception.scene.rays import COARSE, FAR, FAR_REACH, REACH, see
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.stamping import raised, restore, saved, stamp
@@ -24,11 +25,7 @@ from sortie.perception.types import Capture
 from sortie.scenarios.streams import stream
 
 CAMERAS = ("front", "left", "right", "back", "nadir")
-WIDTH_PX, HEIGHT_PX = 160, 90
 VIEWS_SHAPE = (len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3)
-HALF_H = float(np.tan(np.radians(35.0)))
-"""Tangent of half the horizontal field of view."""
-HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
 MAX_REACH_M = 170.0
 RES = np.float32(RES_M)
 FloatOrArray = TypeVar("FloatOrArray", float, Floats)

@@ -41,6 +41,10 @@ class Cars:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def table(self) -> Floats:
+        """[n, 5]: x, y, length, width, yaw."""
+        return np.stack([self.x_m, self.y_m, self.length_m, self.width_m, self.yaw_rad], axis=1)
+
     def where(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Cars:
         """The cars that a mask [n] marks, or those at the given indices, in that order."""
         return Cars(*(getattr(self, name)[which] for name in self.__slots__))

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sortie.perception.benchmark.dataset import SIZES
-from sortie.perception.study.measure import MODEL_TAU, StudyRow
+from sortie.perception.evaluation.results import TAU
+from sortie.perception.study.measure import StudyRow
 from sortie.perception.study.plan import StudyPlan
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
@@ -89,7 +90,7 @@ def networks(plan: StudyPlan, found: StudyRows) -> str:
     lines = [_LEGEND, ""]
     for unsent in plan.measured.unsent:
         views = {v.job(s): FixedSettings(v.name, s, unsent) for v in plan.variants for s in v.seeds}
-        lines += [f"**{UNSENT[unsent]}**, τ = {MODEL_TAU:g}, cells by confidence:", ""]
+        lines += [f"**{UNSENT[unsent]}**, τ = {TAU:g}, cells by confidence:", ""]
         lines += [*_table(plan, found, "network", views), ""]
     return "\n".join(lines)
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.geometry import FULL
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
-from sortie.perception.network.detector import SHIPPED_WEIGHTS, ground_truth
+from sortie.perception.network.detector import SHIPPED_WEIGHTS
 from sortie.perception.surrogate.collect import FLOOR, DetectorRuns, collect, read
 from sortie.perception.surrogate.correlation import hang_together, seen_by_several
 from sortie.perception.surrogate.fit import fit
@@ -124,9 +124,7 @@ def _ap(asked: Sequence[DetectorRuns], seed: int, shared: bool, floor: float) ->
         scene = scene_model(seed, a.split, a.scene)
         for job, boxes in zip(a.jobs, a.boxes, strict=True):
             if bool(job.shares) == shared:
-                truth = ground_truth(
-                    scene, job.ego.t_s, job.ego.position_m[:2], FULL.half_extent_m, job.ego.true_yaw_rad
-                )
+                truth = ground_truth(scene.cars_at(job.ego.t_s).table(), job.ego.true_pose).single()
                 matched.append(match(boxes.take(boxes.score >= THRESHOLD), truth))
     return average_precision(matched), average_precision([m.at(floor) for m in matched])
 

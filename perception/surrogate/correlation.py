@@ -124,7 +124,7 @@ def seen_by_several(asked: Sequence[DetectorRuns], floor: float, seed: int) -> N
         egos = [(j.ego, b.take(b.score >= floor)) for j, b in zip(a.jobs, a.boxes, strict=True) if not j.shares]
         looks = eyes.look(CaptureColumns.of([ego for ego, _ in egos]))
         # by where drones were: what they are wrong about that, they are wrong about in a sortie as well
-        poses = [(*ego.position_m[:2], ego.true_yaw_rad) for ego, _ in egos]
+        poses = [ego.true_pose for ego, _ in egos]
         alarms = [
             Boxes.placed(claim(ego, boxes, looks, np.flatnonzero(looks.capture == m), eyes)[2], poses[m])
             for m, (ego, boxes) in enumerate(egos)

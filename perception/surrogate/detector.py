@@ -24,7 +24,6 @@ from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load,
 from sortie.perception.surrogate.shared_false_positives import Mirages
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
-from sortie.scenarios.representation import BOX_NAMES
 from sortie.scenarios.schema import Perception
 
 Job = tuple[Capture, Sequence[Share]]
@@ -125,9 +124,10 @@ class SurrogateDetector:
         return _joined(parts)
 
     def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> BoxColumns:
+        """As `ground_truth`, but in float32: at the square's edge, within a hundredth of a millimetre, the two may differ."""
         looks = self._eyes.look(replace(CaptureColumns.of(egos), t_s=np.asarray(t_s, float)), bare=True)
-        columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
-        return BoxColumns(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
+        boxes = Boxes(looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
+        return BoxColumns(looks.first, boxes.single())
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many detections the drone would send, as many as the detector has there on average."""
@@ -155,9 +155,7 @@ class SurrogateDetector:
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
         asked = [(ego, shares) for ego, shares, _ in jobs]
-        late = {
-            s.capture: None for _, shares in asked for s in shares if s.representation in BOX_NAMES and s.weight > 0.0
-        }
+        late = {s.capture: None for _, shares in asked for s in shares if not s.is_map and s.weight > 0.0}
         captures = list(dict.fromkeys(c for ego, shares in asked for c in (ego, *(s.capture for s in shares))))
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
@@ -179,7 +177,7 @@ class SurrogateDetector:
         fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
         heard = []
         for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False):
-            others = [told(s, alone[s.capture]) for s in shares if s.representation in BOX_NAMES and s.weight > 0.0]
+            others = [told(s, alone[s.capture]) for s in shares if not s.is_map and s.weight > 0.0]
             heard.append(Heard(ego.est_pose, own, f, others))
         out = joined_many(heard, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
@@ -224,7 +222,7 @@ class SurrogateDetector:
         x_m, y_m, turn = fleet.est[exchange.ego[row]].T
         xy = turned(at, turn) + np.stack([x_m, y_m], axis=1)
         first = np.searchsorted(row, np.arange(len(exchange.ego) + 1))
-        return BoxColumns(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
+        return BoxColumns(first, Boxes(xy, size, yaw + turn, score).single())
 
     def _alarms(
         self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], luck: Drawn

@@ -14,7 +14,6 @@ from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.disc import Disc
-from sortie.scenarios.representation import MAP_NAMES
 from sortie.scenarios.schema import Scene
 
 _ALL = slice(None)
@@ -88,7 +87,7 @@ class FeatureShares:
         for m, (_, shares) in enumerate(jobs):
             slot = 0
             for i, s in enumerate(shares):
-                if s.representation in MAP_NAMES and s.weight > 0.0:
+                if s.is_map and s.weight > 0.0:
                     x, y, yaw = s.capture.est_pose
                     rho, disc = (1.0, None) if s.representation == "raw" else (s.rho, s.roi)
                     pose = (x, y, yaw) if lies is None else lies[m][i]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.perception.geometry import FULL
+from sortie.perception.geometry import FULL, HALF_H, HALF_V
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
@@ -20,9 +20,6 @@ from sortie.perception.surrogate.line_of_sight import HeightField, Kerbs, next_o
 from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]
-HALF_H = float(np.tan(np.radians(35.0)))
-HALF_V = HALF_H * 90 / 160
-"""The cameras' half angles, as in `render.py`, which needs torch."""
 LOOK_COVARIATES = (
     "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
     "crowd", "altitude", "strange", "square", "next", "next_along", "next_across",

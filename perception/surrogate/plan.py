@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, model_of
 from sortie.perception.joining import Rule
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TargetPath
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scene, Target
 from sortie.scenarios.streams import stream
 
@@ -24,13 +26,10 @@ Manner = Literal["anywhere", "street"]
 MANNERS: tuple[Manner, ...] = ("anywhere", "street")
 """How a scene's first moment is flown, and its second: anywhere and turned anyhow, or along the street through the origin as
 sorties are, with a mission's target below, and cars that stand square on every drone's map."""
-AREA_M = 60.0
-"""The fleet's middle lies within ± this of the scene's origin."""
 LANE_M = 1.75
 """From a street's middle to that of its lanes."""
 FIRST_S, LAST_S = 5.0, 300.0
 """Scenes are asked about between these times."""
-DRONES = 5
 THRESHOLD = 0.1
 """Boxes count from this score on."""
 BUDGETS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
@@ -40,11 +39,13 @@ AGES_S = (0.1, 0.2, 0.4)
 """How much older than the ego's a share may be."""
 STYLES = ("town", "old_town", "suburb", "yard")
 _SHAPES = {
-    "cross": np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64),
+    "cross": slots("cross", DRONES, 1.0),
     "line": np.array([(0, 0), (0, 1), (0, 2), (0, -1), (0, -2)], dtype=np.float64),
-    "wedge": np.array([(0, 0), (-1, 1), (-1, -1), (-2, 2), (-2, -2)], dtype=np.float64) / np.sqrt(2),
+    "wedge": slots("wedge", DRONES, 1.0),
     "circle": np.array([(np.cos(a), np.sin(a)) for a in np.arange(5) * 2 * np.pi / 5]) / (2 * np.sin(np.pi / 5)),
 }
+"""The shipped calibration was drawn with these. Line and circle are not the fleet's (`scenarios.formation.slots`): its line
+counts left and right in turn, and its circle is a little smaller, as it measures spacing along the arc."""
 Fleets = tuple[list[Capture], dict[float, list[Capture]]]
 """A fleet's captures now, and a little earlier by how much."""
 
@@ -110,8 +111,7 @@ def draw_target(seed: int, split: Split, index: int) -> Target:
 
 def scene_model(seed: int, split: Split, index: int) -> SceneModel:
     """The scene as every moment of it is asked for."""
-    bounds = (-AREA_M, -AREA_M, AREA_M, AREA_M)
-    return SceneModel(draw_scene(seed, split, index), draw_target(seed, split, index), bounds)
+    return model_of(draw_scene(seed, split, index), draw_target(seed, split, index))
 
 
 def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Question]:
@@ -219,9 +219,9 @@ def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
         position_error, heading_error = 0.05 + 0.5 * u[5], np.radians(1.0 * u[6])
     heading, speed = 2 * np.pi * u[7], 8 * u[8]
     c, s = np.cos(heading), np.sin(heading)
-    slots = rng.uniform(-AREA_M, AREA_M, 2) + spacing * _SHAPES[shape] @ np.array([[c, s], [-s, c]])
+    places = rng.uniform(-AREA_M, AREA_M, 2) + spacing * _SHAPES[shape] @ np.array([[c, s], [-s, c]])
     poses = []
-    for slot in slots:
+    for slot in places:
         place = np.array([*slot, altitude]) + 0.5 * rng.normal(size=3)
         yaw = heading + np.radians(1.0) * rng.normal()
         roll, pitch = np.radians(3.0) * rng.normal(size=2)
@@ -236,9 +236,11 @@ def _on_street(rng: np.random.Generator) -> Fleets:
     heading, speed = flown.heading, flown.speed_mps
     c, s = np.cos(heading), np.sin(heading)
     across_m = 2.0 * rng.normal()
-    slots = (np.array([flown.along_m, across_m]) + flown.spacing_m * _SHAPES[flown.shape]) @ np.array([[c, s], [-s, c]])
+    places = (np.array([flown.along_m, across_m]) + flown.spacing_m * _SHAPES[flown.shape]) @ np.array(
+        [[c, s], [-s, c]]
+    )
     poses = []
-    for slot in slots:
+    for slot in places:
         place = np.array([*slot, 60.0]) + 0.5 * rng.normal(size=3)
         yaw = heading + np.radians(0.15) * rng.normal()
         pitch, roll = np.radians(0.5 * speed + 1.7 * rng.normal()), np.radians(2.0) * rng.normal()

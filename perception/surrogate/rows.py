@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.geometry import to_local
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.collect import DetectorRuns, captures_of
 from sortie.perception.surrogate.exchange import (
@@ -23,7 +24,6 @@ from sortie.perception.surrogate.exchange import (
 from sortie.perception.surrogate.features import CaptureColumns, Eyes, Looks
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.types import Boxes
-from sortie.scenarios.representation import MAP_NAMES
 
 REACH_M = 2.5
 """A box within this of a car is of that car."""
@@ -110,7 +110,7 @@ def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     by_norm = np.array([j.cells_by == "norm" for j in asked.jobs])[pairs.row, None]
     rank = np.where(by_norm, above_norm[pairs.peer], above[pairs.peer]) / 4096.0
     fused = covariates(pairs, exchange, looks, confidence, sent, rank.astype(np.float32), zeros[pairs.row])
-    late = np.array([any(s.representation not in MAP_NAMES for s in j.shares) for j in asked.jobs])
+    late = np.array([any(not s.is_map for s in j.shares) for j in asked.jobs])
     shift = mean_shift(pairs, exchange, sent)
     score, offset, alarms = [], [], []
     for m, (job, boxes) in enumerate(zip(asked.jobs, asked.boxes, strict=True)):
@@ -140,7 +140,7 @@ def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, colum
         mine = np.flatnonzero(pairs.row == m)
         slot = 0
         for s in job.shares:
-            if s.representation not in MAP_NAMES or s.weight <= 0:
+            if not s.is_map or s.weight <= 0:
                 continue
             rank = asked.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
             mask = budget.select(rank, s.rho, s.roi, *s.capture.est_pose)
@@ -152,10 +152,7 @@ def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, colum
 
 def claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
     """Which box is of which car, best first: scores [cars] (0: none), offsets [cars, 5], and the boxes that are of none [a, 6]."""
-    x, y, yaw = ego.est_pose
-    c, s = np.cos(yaw), np.sin(yaw)
-    dx, dy = boxes.xy_m[:, 0] - x, boxes.xy_m[:, 1] - y
-    at: Floats = np.stack([c * dx + s * dy, c * dy - s * dx], axis=1)
+    at: Floats = np.stack(to_local(boxes.xy_m[:, 0], boxes.xy_m[:, 1], ego.est_pose), axis=1)
     cars = looks.xy_m[mine]
     score, offset = np.zeros(len(mine)), np.zeros((len(mine), 5))
     rest = []
@@ -164,7 +161,7 @@ def claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tupl
     for b in range(len(boxes)):  # they are best first
         away = np.hypot(*(cars - at[b]).T) + 1e3 * (score > 0)
         best = int(away.argmin()) if len(away) else -1
-        turn = float(boxes.yaw_rad[b] - yaw)
+        turn = float(boxes.yaw_rad[b] - ego.est_yaw_rad)
         if best < 0 or away[best] > REACH_M:
             rest.append((*at[b], *boxes.size_m[b], turn, boxes.score[b]))
             continue

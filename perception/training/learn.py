@@ -12,7 +12,8 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.benchmark.scenes import DRONES
-from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry
+from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry, to_local
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.network.decode import REFERENCE_SIZE_M
 from sortie.perception.network.fusion.base import UnsentCells, takes_part
 from sortie.perception.network.model import CarNet
@@ -62,14 +63,8 @@ def draw_batch(frames: Frames, seed: int, step: int, shard: int) -> Batch:
 
 def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64], geometry: Geometry = FULL) -> NDArray[np.float64]:
     """The cars [n, 5] inside a drone's square, in its frame (x forward, y left)."""
-    cars = cars[~np.isnan(cars[:, 0])]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    dx, dy = cars[:, 0] - pose[0], cars[:, 1] - pose[1]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    inside = (np.abs(x) < geometry.half_extent_m) & (np.abs(y) < geometry.half_extent_m)
-    local: NDArray[np.float64] = np.stack([x, y, cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
-    kept: NDArray[np.float64] = local[inside]
-    return kept
+    cars = ground_truth(cars, pose, geometry.half_extent_m).table()
+    return np.stack([*to_local(cars[:, 0], cars[:, 1], pose), cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
 
 
 def targets(

@@ -14,14 +14,13 @@ from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.results import TAU
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
 from sortie.perception.training.recipe import command, of_benchmark
 
-TAU = 0.1
-"""The score below which boxes are dropped: the schema's default, and UAV3D's own head's."""
 LEVELS = ((1.0, 1.0), (1.0, 2.5), (0.0, 0.0))
 """Factors on the benchmark's own pose errors, position and heading; its own first."""
 

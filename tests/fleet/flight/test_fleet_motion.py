@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.formation import slots
 from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, MotionError, Trajectories, attitude, body_rates, fly
+from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Fleet, Formation, Route
 from sortie.scenarios.schema import Trajectories as MotionConfig
 

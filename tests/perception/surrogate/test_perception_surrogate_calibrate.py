@@ -185,9 +185,7 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
 
 
 def truth_of(scene: int, jobs: Sequence[Question]) -> list[Boxes]:
-    from sortie.perception.geometry import FULL
-    from sortie.perception.network.detector import ground_truth
+    from sortie.perception.ground_truth import ground_truth
 
     model = scene_model(0, "held-out", scene)
-    half = FULL.half_extent_m
-    return [ground_truth(model, j.ego.t_s, j.ego.position_m[:2], half, j.ego.true_yaw_rad) for j in jobs]
+    return [ground_truth(model.cars_at(j.ego.t_s).table(), j.ego.true_pose) for j in jobs]

@@ -11,8 +11,8 @@ from perception_examples import EMPTY, capture, cross
 
 from sortie.perception.detectors import DetectsMany
 from sortie.perception.geometry import in_square
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import match
-from sortie.perception.network.detector import ground_truth
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.draws import Luck
@@ -210,7 +210,7 @@ def test_boxes_stand_by_the_estimated_pose(scene: SceneModel) -> None:
 
 def test_truth_is_the_detectors(scene: SceneModel, detector: SurrogateDetector) -> None:
     ego = capture(10.0, 20.0, yaw=0.4, pitch=0.05, t_s=7.3)
-    mine, theirs = detector.truth(7.4, ego), ground_truth(scene, 7.4, (10.0, 20.0), 102.4, ego.true_yaw_rad)
+    mine, theirs = detector.truth(7.4, ego), ground_truth(scene.cars_at(7.4).table(), (10.0, 20.0, ego.true_yaw_rad))
     assert len(mine) == len(theirs) > 10
     order = [np.lexsort(b.xy_m.T) for b in (mine, theirs)]
     np.testing.assert_allclose(mine.xy_m[order[0]], theirs.xy_m[order[1]], atol=1e-3)
