@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sortie.perception.evaluation.report import put_into
 from sortie.scenarios.errors import SortieError
 
 
@@ -136,9 +135,25 @@ def put_between(path: Path, section: str, begin: str, end: str) -> None:
     write_text(path, _put_between(path, section, begin, end))
 
 
+def replace_section(text: str, section: str, begin: str, end: str) -> str:
+    """A text with what stands between its markers replaced, the markers too.
+
+    Raises:
+        ValueError: the markers are missing, doubled or in the wrong order.
+
+    Example:
+        >>> replace_section("a <b> old </b> c", "<b> new </b>", "<b>", "</b>")
+        'a <b> new </b> c'
+    """
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"must hold {begin} and {end} once each, in this order")
+    before, _, rest = text.partition(begin)
+    return before + section + rest.partition(end)[2]
+
+
 def _put_between(path: Path, section: str, begin: str, end: str) -> str:
     try:
-        return put_into(path.read_text(encoding="utf-8"), section, begin, end)
+        return replace_section(path.read_text(encoding="utf-8"), section, begin, end)
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:

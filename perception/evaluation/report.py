@@ -117,18 +117,6 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
     return "\n".join([*head, *table, *tail])
 
 
-def put_into(text: str, section: str, begin: str = BEGIN, end: str = END) -> str:
-    """A README with its section between the markers replaced.
-
-    Raises:
-        ValueError: the markers are missing, doubled or in the wrong order.
-    """
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise ValueError(f"must hold {begin} and {end} once each, in this order")
-    before, _, rest = text.partition(begin)
-    return before + section + rest.partition(end)[2]
-
-
 _RULE = """\
 **How verdicts are reached** (`perception/evaluation/verdict.py`, which tells what was fixed when). A difference is
 significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
