@@ -251,7 +251,11 @@ def test_a_golden_outcome_that_is_not_compared_is_skipped(tmp_path: Path) -> Non
         ("{name: x, fleet: {drones: 2}, expect: [{metric: switches, at_most: 9}]}", True),
         ('\ufeff# a note\n---\n{ "expect_decisions" : [],\n  "name" : x}', True),
         ('"name": x\n"expect": []', True),
-        ("{name: x, expect: [}", True),  # broken: told when it is collected
+        ("{name: x, expect: [}", True),  # broken: reported when it is collected
+        ("{name: x, fleet: {drones: ], expect: []}", True),
+        ("fleet: [\nname: x\nexpect: []", True),
+        ("services: {{ all }}\n  - {name: x, expect: 1}", False),  # a template
+        ("{services: [{name: x, expect: 1}}", False),
         ("{name: x}", False),
         ("{services: {name: x, expect: []}}", False),
         ("{expect: 1, services: [{name: x}]}", False),
@@ -268,6 +272,20 @@ def test_a_scenario_is_told_from_other_yaml(tmp_path: Path, text: str, is_one: b
     assert is_scenario(path) is is_one
     golden_path(path).write_text("{}")
     assert is_scenario(path) is (is_one or text == "{name: x}")
+
+
+def test_yaml_of_other_projects_loads_nothing_heavy(tmp_path: Path) -> None:
+    """The plugin runs in every project of whoever installed Sortie."""
+    (tmp_path / "some.yaml").write_text("services: [{name: x, expect: 1}]")
+    look = (
+        "import sys, pathlib; from sortie.sim.check.discovery import is_scenario\n"
+        "assert not is_scenario(pathlib.Path(sys.argv[1]))\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    command = [sys.executable, "-c", look, str(tmp_path / "some.yaml")]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert "yaml" in loaded
+    assert not {"torch", "numpy", "pyarrow", "pydantic", "simpy"} & set(loaded)
 
 
 def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:
