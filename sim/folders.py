@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from sortie.scenarios.errors import SortieError
 
@@ -100,10 +101,21 @@ def write_durably(path: Path, data: bytes) -> None:
     Raises:
         OSError: the disk refuses.
     """
+    with writing_durably(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def writing_durably(path: Path) -> Iterator[BinaryIO]:
+    """A file to write, as `write_durably` does, piece by piece; where the block fails, an older file stays.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     partial = partial_file(path)
     try:
         with partial.open("wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)

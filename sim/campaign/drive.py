@@ -62,7 +62,9 @@ def run_campaign(
     """
     store = CampaignStore(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
-        return _drive(plan, store, engine, progress)
+        done = _drive(plan, store, engine, progress)
+        store.export()
+        return done
     finally:
         store.close()
 
@@ -75,9 +77,12 @@ def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: C
     def enough() -> bool:
         """Look at finished parts in their order, so that it is the same whoever finished first."""
         nonlocal frontier
-        while frontier < store.shards and store.is_done(frontier):
+        while frontier < store.parts and store.is_done(frontier):
             frontier += 1
-            if plan.campaign.stop_when is not None and stop.enough(store.rows(frontier - 1)):
+            if plan.campaign.stop_when is None:
+                continue
+            rows = store.part(frontier - 1)
+            if rows is not None and stop.enough(rows):
                 store.drop_after(frontier - 1)
                 return True
         return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, 
 from sortie.sim.campaign.rows import CampaignRows, figure, figures, is_accuracy, judged, read_rows
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.statistics import Estimate, Floats, estimate, paired
+from sortie.sim.campaign.store import CampaignTable
 from sortie.sim.campaign.winners import contexts, rule, winner
 from sortie.sim.folders import RunError, write_text
 
@@ -22,13 +24,15 @@ MAX_FAILED = 20
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.md and figures into a campaign's folder; returns the report's path.
+    """Write report.md, figures and the Parquet table into a campaign's folder; returns the report's path.
 
     Raises:
         RunError: no campaign there, nothing finished, or the disk refuses.
         ImportError: matplotlib is missing.
     """
     rows = read_rows(folder)
+    with closing(CampaignTable(folder)) as store:
+        store.export()
     try:
         pictures = {VARIED: False, PARETO: False}
         if _sampled(rows):

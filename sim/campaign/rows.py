@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sortie.sim.campaign.parts import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
 from sortie.sim.campaign.plan import CampaignPlan
+from sortie.sim.campaign.store import CampaignTable
 from sortie.sim.folders import RunError
 
 Floats = NDArray[np.float64]
@@ -118,14 +119,14 @@ def read_rows(folder: Path) -> CampaignRows:
     """The finished parts of a campaign's folder.
 
     Raises:
-        RunError: no campaign there, no unit of it finished at all its grid points, or a part that is broken.
+        RunError: no campaign there, no unit of it finished at all its grid points, or a row that is broken.
     """
-    plan = read_plan(folder)
-    numbers = range(shards(plan))
-    parts = [part for n in numbers if (part := read_part(folder, plan, n)) is not None]
-    if not parts:
-        waiting = any(journal_file(folder, n).is_file() for n in numbers)
-        raise RunError(f"{folder}: no part is finished yet" + (", go on with the campaign" if waiting else ""))
+    with closing(CampaignTable(folder)) as store:
+        plan = store.plan
+        parts = [part for n in range(store.parts) if (part := store.part(n)) is not None]
+        if not parts:
+            go_on = "" if store.is_empty() else ", go on with the campaign"
+            raise RunError(f"{folder}: no part is finished yet{go_on}")
     table = pa.concat_tables(parts)
     unit = table["unit"].to_numpy()
     whole = np.bincount(unit)[unit] == plan.runs // plan.units
@@ -155,21 +156,16 @@ def is_accuracy(metric: str) -> bool:
     return "ap50" in parts and parts[-1] in ACCURACIES
 
 
-def find_row(folder: Path, run: int) -> dict[str, Any] | None:
-    """One run's row; None where it is not flown yet.
+def find_row(folder: Path, run: int) -> tuple[CampaignPlan, dict[str, Any] | None]:
+    """A campaign's plan and one run's row; None for a run that has not been flown yet.
 
     Raises:
-        RunError: no campaign there, no such run, or its part is broken.
+        RunError: no campaign there, no such run, or its row is broken.
     """
-    plan = read_plan(folder)
-    if not 0 <= run < plan.runs:
-        raise RunError(f"--run {run}: {folder} has runs 0 … {plan.runs - 1}")
-    table = read_part(folder, plan, run // plan.shard)
-    if table is None:
-        found = find_in_journal(folder, plan, run)
-        return None if found is None else row_of(plan, columns(plan), found)
-    row: dict[str, Any] = table.slice(run % plan.shard, 1).to_pylist()[0]
-    return row
+    with closing(CampaignTable(folder)) as store:
+        if not 0 <= run < store.plan.runs:
+            raise RunError(f"--run {run}: {folder} has runs 0 … {store.plan.runs - 1}")
+        return store.plan, store.row(run)
 
 
 def judged(metrics: Sequence[str]) -> list[str]:

@@ -95,7 +95,6 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     Raises:
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
-    from sortie.sim.campaign.parts import read_plan
     from sortie.sim.campaign.rows import find_row
     from sortie.sim.campaign.work import unpack
     from sortie.sim.folders import RunError
@@ -105,7 +104,7 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         raise RunError("--from-campaign DIR and --run ID go together")
     if any(other is not None and other != [] for other in others):
         raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
-    row, plan = find_row(folder, run), read_plan(folder)
+    plan, row = find_row(folder, run)
     if code_version() != plan.code:
         err.print(f"[yellow]this is Sortie {code_version()}, the campaign was flown with {plan.code}[/yellow]")
     if row is None:

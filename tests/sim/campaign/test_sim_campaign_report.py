@@ -175,7 +175,7 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     soc = [p.varied(2 * u)["fleet.battery.initial_soc"] for u in range(6)]
     assert means[:, 0] == pytest.approx([10 + s for s in soc])
     assert means[:, 1] == pytest.approx(soc)
-    assert find_row(folder, 3)["error"] == "ValueError: planted"
+    assert find_row(folder, 3)[1]["error"] == "ValueError: planted"
     with pytest.raises(RunError, match=r"--run 48: .* has runs 0 … 47"):
         find_row(folder, 48)
     assert pq.read_table(folder / "runs").num_rows == 48
