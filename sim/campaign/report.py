@@ -10,11 +10,12 @@ from typing import Any
 
 import pyarrow.compute as pc
 
+from sortie.scenarios.report_text import NONE, number, prefixed, table
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
-from sortie.sim.campaign.rows import CampaignRows, figure, figures, is_accuracy, judged, read_rows
+from sortie.sim.campaign.rows import CampaignRows, is_accuracy, judged, read_rows
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
-from sortie.sim.campaign.statistics import Estimate, Floats, estimate, paired
+from sortie.sim.campaign.statistics import Estimate, Floats, Paired, estimate, paired
 from sortie.sim.campaign.store import CampaignTable
 from sortie.sim.campaign.winners import contexts, rule, winner
 from sortie.sim.folders import RunError, write_text
@@ -97,25 +98,20 @@ def _lost(rows: CampaignRows) -> Iterator[str]:
 def _by_policy(rows: CampaignRows) -> Iterator[str]:
     labels = rows.plan.policies
     yield "\n## Metrics by policy\n"
-    yield _header("metric", *labels)
-    for metric in rows.plan.campaign.metrics:
-        means = rows.by_unit(metric)
-        yield _row(metric, *(_mean(rows, means[:, p]) for p in range(len(labels))))
+    yield from table(
+        ("metric", *labels),
+        ((metric, *(_mean(rows, m) for m in rows.by_unit(metric).T)) for metric in rows.plan.campaign.metrics),
+    )
     valued = with_values(rows)
     if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
         yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
     if len(labels) > 1 and _sampled(rows):
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
-        yield _header("metric", *labels[1:])
-        for metric in valued:
-            found = [paired(*rows.pair(metric, 0, p)) for p in range(1, len(labels))]
-            yield _row(
-                metric,
-                *(
-                    f"{_interval(f.difference, signed=True)}" + ("" if math.isnan(f.saved) else f" ×{f.saved:.3g}")
-                    for f in found
-                ),
-            )
+        others = range(1, len(labels))
+        yield from table(
+            ("metric", *labels[1:]),
+            ((metric, *(_difference(paired(*rows.pair(metric, 0, p))) for p in others)) for metric in valued),
+        )
 
 
 def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
@@ -130,11 +126,14 @@ def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
         if missing := [name for name in (*valued, *rows.plan.campaign.vary) if name not in in_it]:
             yield f"Not in the figure, which has no more room: {', '.join(missing)}.\n"
     for metric in metrics:
-        yield _header(metric, "part", *rows.plan.policies)
-        for field in rows.plan.campaign.vary:
-            for label, _, mask in rows.bins(field):
-                means = rows.by_unit(metric, mask)
-                yield _row(field, label, *(_interval(estimate(means[:, p])) for p in range(means.shape[1])))
+        yield from table(
+            (metric, "part", *rows.plan.policies),
+            (
+                (field, label, *(_interval(estimate(m)) for m in rows.by_unit(metric, mask).T))
+                for field in rows.plan.campaign.vary
+                for label, _, mask in rows.bins(field)
+            ),
+        )
         yield ""
 
 
@@ -167,14 +166,19 @@ def _sensitivity(rows: CampaignRows) -> Iterator[str]:
     if method == "other":
         if words := [f for f in rows.plan.campaign.vary if f not in found[0].fields]:
             yield f"Fields of text have no ranks and are left out: {', '.join(words)}.\n"
-        yield _header("metric", "policy", *found[0].fields)
-        for s in found:
-            yield _row(s.metric, s.policy, *(f"{v:+.2f}" if not math.isnan(v) else "–" for v in s.figures[:, 0]))
+        yield from table(
+            ("metric", "policy", *found[0].fields),
+            ((s.metric, s.policy, *(number(v, "+.2f") for v in s.figures[:, 0])) for s in found),
+        )
         return
-    yield _header("metric", "policy", "field", *COLUMNS[method])
-    for s in found:
-        for field, row in zip(s.fields, s.figures.tolist(), strict=True):
-            yield _row(s.metric, s.policy, field, *(figure(v) for v in row))
+    yield from table(
+        ("metric", "policy", "field", *COLUMNS[method]),
+        (
+            (s.metric, s.policy, field, *(prefixed(v)[0] for v in row))
+            for s in found
+            for field, row in zip(s.fields, s.figures.tolist(), strict=True)
+        ),
+    )
 
 
 def _winners(rows: CampaignRows) -> Iterator[str]:
@@ -249,22 +253,19 @@ def _stopped(rows: CampaignRows) -> bool:
 
 def _mean(rows: CampaignRows, values: Floats) -> str:
     found = estimate(values)
-    return _interval(found) if _sampled(rows) else figure(found.mean)
+    return _interval(found) if _sampled(rows) else prefixed(found.mean)[0]
+
+
+def _difference(compared: Paired) -> str:
+    saved = "" if math.isnan(compared.saved) else f" ×{compared.saved:.3g}"
+    return _interval(compared.difference, signed=True) + saved
 
 
 def _interval(e: Estimate, *, signed: bool = False) -> str:
     if math.isnan(e.mean):
-        return "–"
+        return NONE
     plus = "+" if signed and e.mean >= 0 else ""
     if math.isnan(e.low) or e.low == e.high:
-        return f"{plus}{figure(e.mean)}"
-    mean, low, high = figures(e.mean, e.low, e.high)
+        return f"{plus}{prefixed(e.mean)[0]}"
+    mean, low, high = prefixed(e.mean, e.low, e.high)
     return f"{plus}{mean} [{low}, {high}]"
-
-
-def _header(*cells: str) -> str:
-    return f"{_row(*cells)}\n|{'---|' * len(cells)}"
-
-
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"

@@ -171,15 +171,3 @@ def find_row(folder: Path, run: int) -> tuple[CampaignPlan, dict[str, Any] | Non
 def judged(metrics: Sequence[str]) -> list[str]:
     """The metrics by which a winner is told: accuracies, or the first one of which it is known what is better."""
     return [m for m in metrics if is_accuracy(m)] or [m for m in metrics if sign(m)][:1]
-
-
-def figures(*values: float) -> list[str]:
-    """Four digits that count, with one unit prefix for all of them beyond a thousand."""
-    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
-    limit, prefix = next(((x, p) for x, p in ((1e9, " G"), (1e6, " M"), (1e3, " k")) if largest >= x), (1.0, ""))
-    return ["–" if math.isnan(v) else f"{v / limit:.4g}{prefix}" for v in values]
-
-
-def figure(value: float) -> str:
-    """One of them."""
-    return figures(value)[0]

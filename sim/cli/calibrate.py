@@ -12,9 +12,9 @@ from rich.table import Table
 
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load, load_contexts
+from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import ensure_files
-from sortie.sim.results.numbers import points
 from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 from sortie.sim.user_errors import user_errors
 

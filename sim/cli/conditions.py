@@ -16,10 +16,10 @@ from rich.table import Table
 from sortie.perception.detectors import make_detector
 from sortie.policies.catalogue.adaptive import ARMS
 from sortie.policies.registry import resolve
+from sortie.scenarios.report_text import number, points, size
 from sortie.scenarios.schema.conditions import Contexts
 from sortie.sim.cli.console import bars, out
 from sortie.sim.folders import RunError, ensure_files, write_text
-from sortie.sim.results.numbers import number, points, size
 from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
 from sortie.sim.studies.in_flight import torch_answers
 

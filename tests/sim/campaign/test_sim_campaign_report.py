@@ -14,10 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import CampaignRows, figures, find_row, judged, read_rows, sign
+from sortie.sim.campaign.rows import CampaignRows, find_row, judged, read_rows, sign
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
@@ -282,9 +283,9 @@ def test_a_winner_is_told_by_what_is_known_to_be_better() -> None:
 
 
 def test_figures_of_an_interval_share_their_prefix() -> None:
-    assert figures(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
-    assert figures(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
-    assert figures(math.nan, 12.0) == ["–", "12"]
+    assert prefixed(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
+    assert prefixed(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
+    assert prefixed(math.nan, 12.0) == ["–", "12"]
 
 
 def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:

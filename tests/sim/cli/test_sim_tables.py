@@ -10,10 +10,10 @@ from rich.table import Table
 from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.scenarios.report_text import points
 from sortie.sim.check.expectations import Verdict
 from sortie.sim.cli.tables import transitions_table, verdict_table
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.numbers import points
 from sortie.sim.results.outcome import outcome
 
 REASON = "as in [roi] and [/roi]"
