@@ -33,7 +33,7 @@ SHARED = frozenset({"sortie.scenarios.disc", "sortie.scenarios.representation", 
 FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip
-_ONLY = {"random": {"Random"}, "sortie": {"policies"}}
+_ONLY = {"random": {"Random"}}
 """Modules of which a policy may use so much: a generator with a seed of its own."""
 _EXCEPT = {
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
@@ -79,7 +79,7 @@ class _Part:
 
 
 class _OwnModule:
-    """A module of the policy's own, whose functions are confined as well."""
+    """A module whose names are judged one by one: the policy's own, whose functions are confined as well, and `sortie`."""
 
     __slots__ = ("_allowed", "_module")
 
@@ -158,7 +158,7 @@ class _Rebuilding:
         home = module.__name__
         if home in _EXCEPT or home in _ONLY:
             return _Part(module)
-        if is_users(home):
+        if is_users(home) or home == "sortie":  # the public API: each name is judged by where it is at home
             return _OwnModule(module, self._allowed)
         return _Forbidden(home) if _far(home) else module
 
