@@ -34,7 +34,7 @@ from sortie.policies.contract import (
     check_directives,
     nothing,
 )
-from sortie.policies.damping import LinkState, believed, damp
+from sortie.policies.damping import LinkState, apply_hysteresis, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -211,7 +211,7 @@ class Agent:
         known, sender = self._known, descriptor.agent_id
         self._claims[sender] = descriptor
         if sender in known:
-            known[sender] = believed(known[sender], descriptor, self._rules.hysteresis)
+            known[sender] = apply_hysteresis(known[sender], descriptor, self._rules.hysteresis)
         else:  # by ascending id, so that the order of hearing decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = self.env.now

@@ -235,17 +235,17 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
     Raises:
         PolicyError: naming the directive, the field and what it must be.
     """
-    if _plainly_sound(directives, view):
+    if _is_plainly_valid(directives, view):
         return
     seen = {view.ego}
     for d in directives:
-        fault = _fault(d, view, seen)
+        fault = _find_fault(d, view, seen)
         if fault is not None:
             raise PolicyError(fault)
         seen.add(d.destination)
 
 
-def _plainly_sound(directives: Sequence[Directive], view: FleetView) -> bool:
+def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
     """Whether all is sound and of the plain types that nearly every policy uses: it runs thousands of times a sortie."""
     ego, peers, seen, sound_roi = view.ego, view.descriptors, {view.ego}, None
     add = seen.add
@@ -310,7 +310,7 @@ def check_reposition(asked: object, view: FleetView) -> None:
         raise PolicyError(f"{where}: {far_m:.1f} m from where it is, must be at most {MAX_REPOSITION_M:g} m")
 
 
-def kind_fault(d: object) -> str | None:
+def find_wrong_type(d: object) -> str | None:
     """What is no number, disc or text where a directive must have one, whatever the bounds; None where all are."""
     if not isinstance(d, Directive):
         return f"a policy returns Directive, got {type(d).__name__}"
@@ -332,9 +332,9 @@ def kind_fault(d: object) -> str | None:
     return None
 
 
-def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
+def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
     """What is wrong with a directive; None where it is sound and only made of rarer types, such as numpy's."""
-    wrong = kind_fault(d)
+    wrong = find_wrong_type(d)
     if wrong is not None:
         return wrong
     where = f"directive {d.source}→{d.destination}"

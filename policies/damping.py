@@ -1,6 +1,6 @@
 """Damping about a policy: small changes of context are not read, passing ones do not switch the link.
 
-Before the policy a hysteresis band (`believed`): of what can flicker, what a policy reads falls at once and rises only
+Before the policy a hysteresis band (`apply_hysteresis`): of what can flicker, what a policy reads falls at once and rises only
 by more than the band, so that a threshold switches up that much higher than it switches down. After it a dwell time
 (`damp`): reductions at once, upgrades once they were asked for without a break for so long, repeats for free. The
 number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both.
@@ -20,7 +20,7 @@ EPSILON_S = 1e-9
 """Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
 
 
-def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
+def apply_hysteresis(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
     """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
 
     The play operator (backlash) of width h in the logarithm: for a quantity u the value read is
@@ -45,7 +45,7 @@ def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descri
 
 
 _last_results: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
-"""By drone: what was asked of `believed` last, and its answer."""
+"""By drone: what was asked of `apply_hysteresis` last, and its answer."""
 
 
 def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
@@ -98,7 +98,7 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
         return state
     elif _level(proposed) == _level(current):
         # A disc that follows its target, a deadline: no step on the ladder.
-        return state if _hardly_moved(proposed, current) else LinkState(proposed)
+        return state if _is_small_move(proposed, current) else LinkState(proposed)
     lower = _lower_of(current, proposed)
     if lower == proposed:
         return LinkState(proposed)
@@ -135,7 +135,7 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
     return reduced._replace(reason=current.reason) if _level(reduced) == _level(current) else reduced
 
 
-def _hardly_moved(proposed: Directive, current: Directive) -> bool:
+def _is_small_move(proposed: Directive, current: Directive) -> bool:
     """Whether two directives of one level are equal, or differ by a small step of their disc alone."""
     a, b = proposed.roi, current.roi
     if proposed.deadline_s != current.deadline_s:

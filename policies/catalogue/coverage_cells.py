@@ -66,6 +66,6 @@ def sees(d: Descriptor, disc: Disc) -> bool:
 
 
 @lru_cache(maxsize=65536)
-def answered(key: Cells, known: Cells) -> float:
+def new_share(key: Cells, known: Cells) -> float:
     """Share of what one sees well that another does not, 0 … 1: how far a key answers a query."""
     return len(key - known) / len(key) if key else 0.0

@@ -147,7 +147,7 @@ class _Rebuilding:
         home: str = getattr(value, "__module__", None) or type(value).__module__
         if home in SHARED or (home in _ONLY and name in _ONLY[home]):
             return value
-        if _far(home):
+        if _is_forbidden(home):
             return _Forbidden(f"{home}.{name}")
         own = home.split(".")[0] not in ALLOWED
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
@@ -160,14 +160,14 @@ class _Rebuilding:
             return _Part(module)
         if is_users(home) or home == "sortie":  # the public API: each name is judged by where it is at home
             return _OwnModule(module, self._allowed)
-        return _Forbidden(home) if _far(home) else module
+        return _Forbidden(home) if _is_forbidden(home) else module
 
     def _builtins(self, own: Any) -> dict[str, Any]:
         """Builtins for the functions of a module that has `own`; its imports find what they find without confinement."""
         find = own["__import__"] if isinstance(own, dict) else __import__
 
         def importing(name: str, *rest: Any) -> Any:
-            if _far(name) and name not in _ONLY:
+            if _is_forbidden(name) and name not in _ONLY:
                 raise Reached(name)
             return self._module(find(name, *rest))
 
@@ -179,7 +179,7 @@ _FROZEN = ("__setattr__", "__delattr__")
 """What `dataclass` writes into a frozen class; they ask for the class's own type."""
 
 
-def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
+def uses_builtin(policy: Callable[..., Any], builtin: object) -> bool:
     """Whether a policy's own code, or what it names outside installed packages, names a builtin such as `type`."""
     met: dict[int, object] = {}
     waiting: list[Any] = [policy]
@@ -195,7 +195,7 @@ def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
         elif isinstance(value, types.MethodType):
             waiting += [value.__func__, value.__self__]
         elif isinstance(value, types.FunctionType):
-            waiting += _named_by(value) if _is_own(value.__module__) else ()
+            waiting += _references(value) if _is_own(value.__module__) else ()
         elif isinstance(value, staticmethod | classmethod):
             waiting.append(value.__func__)
         elif isinstance(value, property):
@@ -210,7 +210,7 @@ def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
     return False
 
 
-def _named_by(found: types.FunctionType) -> list[Any]:
+def _references(found: types.FunctionType) -> list[Any]:
     """What a function names: globals and builtins, parts of its modules, what it closes over, its defaults."""
     names, parts, codes = set(), set(), [found.__code__]
     for code in codes:  # grows
@@ -244,7 +244,7 @@ def _names(code: types.CodeType) -> set[str]:
     return set(code.co_names).union(*inner)
 
 
-def _far(home: str) -> bool:
+def _is_forbidden(home: str) -> bool:
     """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
     parts = home.split(".")
     root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])

@@ -27,11 +27,11 @@ from sortie.policies.contract import (
     PolicyError,
     check_directives,
     check_reposition,
-    kind_fault,
+    find_wrong_type,
 )
 from sortie.policies.registry import viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
-from sortie.policies.verification.views import draw_view, draw_views, smaller
+from sortie.policies.verification.views import draw_view, draw_views, shrink
 
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)
@@ -75,7 +75,7 @@ def conform(
         One check a rule, always in the same order; a rule that no view could judge does not hold.
     """
     tried = list(draw_views(seed, count) if views is None else views)
-    checks = [_judge(name, rule, policy, tried) for name, rule in RULES.items()]
+    checks = [_check_rule(name, rule, policy, tried) for name, rule in RULES.items()]
     return [*checks, _decides_in_time(policy)]
 
 
@@ -84,7 +84,7 @@ def failing(checks: Sequence[Check]) -> list[Check]:
     return [c for c in checks if not c.holds]
 
 
-def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
+def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
     def complaint(view: FleetView) -> str | None:
         try:
             return rule(policy, _copied(view))
@@ -99,25 +99,27 @@ def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) ->
             continue
         judged += 1
         if found is not None:
-            small = smaller(view, lambda v: complaint(v) is not None)
+            small = shrink(view, lambda v: complaint(v) is not None)
             return Check(name, False, complaint(small) or found, small)
     return Check(
-        name, judged > 0, f"{judged} views" if judged else "could be judged on no view: see answers, bounds kept"
+        name,
+        judged > 0,
+        f"{judged} views" if judged else "no view could be checked: see returns directives, bounds kept",
     )
 
 
 # --- the rules -----------------------------------------------------------------------------------
 
 
-def _ask(policy: Policy, view: FleetView) -> list[Directive]:
+def _decide(policy: Policy, view: FleetView) -> list[Directive]:
     """What the policy decides on a copy of the view: one that changes its input spoils no other rule."""
-    directives = _answer(policy, view)
-    if any(kind_fault(d) is not None for d in directives):
+    directives = _decide_unchecked(policy, view)
+    if any(find_wrong_type(d) is not None for d in directives):
         raise _Raised
     return directives
 
 
-def _answer(policy: Policy, view: FleetView) -> list[Directive]:
+def _decide_unchecked(policy: Policy, view: FleetView) -> list[Directive]:
     """The same, whatever its directives are made of."""
     try:
         return list(policy(_copied(view)))
@@ -125,7 +127,7 @@ def _answer(policy: Policy, view: FleetView) -> list[Directive]:
         raise _Raised from error
 
 
-def _answers(policy: Policy, view: FleetView) -> str | None:
+def _returns_a_sequence(policy: Policy, view: FleetView) -> str | None:
     try:
         answer = policy(view)
     except Exception as error:
@@ -137,14 +139,14 @@ def _answers(policy: Policy, view: FleetView) -> str | None:
 
 def _keeps_bounds(policy: Policy, view: FleetView) -> str | None:
     try:
-        check_directives(_answer(policy, view), view)
+        check_directives(_decide_unchecked(policy, view), view)
     except PolicyError as error:
         return str(error)
     return None
 
 
-def _one_a_link(policy: Policy, view: FleetView) -> str | None:
-    return missing_links(_ask(policy, view), view)
+def _one_directive_per_link(policy: Policy, view: FleetView) -> str | None:
+    return missing_links(_decide(policy, view), view)
 
 
 def missing_links(directives: Iterable[Directive], view: FleetView) -> str | None:
@@ -153,12 +155,12 @@ def missing_links(directives: Iterable[Directive], view: FleetView) -> str | Non
     return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
 
 
-def _says_why(policy: Policy, view: FleetView) -> str | None:
-    silent = [f"{d.source}→{d.destination}" for d in _ask(policy, view) if not d.reason]
+def _gives_reasons(policy: Policy, view: FleetView) -> str | None:
+    silent = [f"{d.source}→{d.destination}" for d in _decide(policy, view) if not d.reason]
     return f"no reason given for {', '.join(silent)}" if silent else None
 
 
-def _leaves_its_input(policy: Policy, view: FleetView) -> str | None:
+def _keeps_its_input(policy: Policy, view: FleetView) -> str | None:
     before = _copied(view)
     with contextlib.suppress(Exception):  # one that raises half-way may have changed it all the same
         policy(view)
@@ -168,36 +170,36 @@ def _leaves_its_input(policy: Policy, view: FleetView) -> str | None:
     return f"the policy changed its input: {', '.join(changed) or 'the order of drones'}"
 
 
-def _same_in_same_out(policy: Policy, view: FleetView) -> str | None:
-    first = _spelt(_ask(policy, view))
-    if _spelt(_ask(policy, view)) != first:
+def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
+    first = _as_tuples(_decide(policy, view))
+    if _as_tuples(_decide(policy, view)) != first:
         return "two calls with the same view differ"
-    _ask(policy, draw_view(1, 0))
-    return None if _spelt(_ask(policy, view)) == first else "differs after another view: it remembers"
+    _decide(policy, draw_view(1, 0))
+    return None if _as_tuples(_decide(policy, view)) == first else "differs after another view: it remembers"
 
 
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
-    usual = _spelt(_ask(policy, view))
+    usual = _as_tuples(_decide(policy, view))
     try:
-        alone = _spelt(_ask(confined(policy), view))
+        alone = _as_tuples(_decide(confined(policy), view))
     except Reached as error:
         return str(error)
     return None if alone == usual else "decides otherwise where only its view is in reach"
 
 
 def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
-    usual = _by_peer(_ask(policy, view))
+    usual = _by_peer(_decide(policy, view))
     ids = list(view.descriptors)
     for order in (ids[::-1], sorted(ids), ids[1:] + ids[:1]):
         other = view._replace(
             descriptors={i: view.descriptors[i] for i in order}, age_s={i: view.age_s[i] for i in order}
         )
-        if _by_peer(_ask(policy, other)) != usual:
+        if _by_peer(_decide(policy, other)) != usual:
             return f"drones in the order {order} get other directives than in the order {ids}"
     return None
 
 
-def _alone_and_empty(policy: Policy, view: FleetView) -> str | None:
+def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
     alone = {i: d for i, d in view.descriptors.items() if i == view.ego}
     for few in (
         view._replace(descriptors=alone, age_s={i: view.age_s[i] for i in alone}),
@@ -212,7 +214,7 @@ def _alone_and_empty(policy: Policy, view: FleetView) -> str | None:
     return None
 
 
-def _stands_stale(policy: Policy, view: FleetView) -> str | None:
+def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
     stale = view._replace(age_s=dict.fromkeys(view.age_s, _STALE_PERIODS * view.period_s))
     try:
         check_directives(list(policy(stale)), stale)
@@ -226,9 +228,9 @@ def age_monotone(policy: Policy, view: FleetView) -> str | None:
 
     Each descriptor's age is raised by itself, and all together, to beyond each of the plane's two thresholds.
     """
-    before = _ask(policy, view)
+    before = _decide(policy, view)
     for who, add_s, older in older_views(view):
-        raised = raised_part(before, _ask(policy, older))
+        raised = raised_part(before, _decide(policy, older))
         if raised is not None:
             return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
     return None
@@ -263,22 +265,22 @@ def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
     parameter = inspect.signature(policy).parameters.get("rho")
     if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
-        _ask(policy, view)
+        _decide(policy, view)
         return None
     takes_rho: Callable[..., Any] = policy
     for rho in BUDGETS:
         bound = partial(takes_rho, rho=rho)
-        spent, allowed = sum(d.rho for d in _ask(bound, view)), rho * len(view.peers)
+        spent, allowed = sum(d.rho for d in _decide(bound, view)), rho * len(view.peers)
         if not spent <= allowed * (1 + _ROUNDING):
             return f"rho={rho:g}: its links sum to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
     return None
 
 
-def _looks(policy: Policy, view: FleetView) -> str | None:
+def _viewpoint_keeps_rules(policy: Policy, view: FleetView) -> str | None:
     """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
     look = viewpoint_of(policy)
     if look is None:
-        _ask(policy, view)
+        _decide(policy, view)
         return None
     shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
     try:
@@ -288,7 +290,7 @@ def _looks(policy: Policy, view: FleetView) -> str | None:
             return "its viewpoint changed its input"
         others = {
             "two calls with the same view differ": look(_copied(view)),
-            "drones in another order get another place": look(view._replace(descriptors=_turned(view.descriptors))),
+            "drones in another order get another place": look(view._replace(descriptors=_reversed(view.descriptors))),
             "decides otherwise where only its view is in reach": confined(look)(view),
         }
         for few in (alone, {}):
@@ -303,25 +305,25 @@ def _looks(policy: Policy, view: FleetView) -> str | None:
     return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
 
 
-def _turned(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
+def _reversed(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
     """The same in the opposite order."""
     return dict(reversed(list(descriptors.items())))
 
 
 RULES: dict[str, Rule] = {
-    "answers": _answers,
+    "returns directives": _returns_a_sequence,
     "bounds kept": _keeps_bounds,
-    "one directive a link": _one_a_link,
-    "says why": _says_why,
-    "input unchanged": _leaves_its_input,
-    "same in, same out": _same_in_same_out,
+    "one directive per link": _one_directive_per_link,
+    "gives reasons": _gives_reasons,
+    "input unchanged": _keeps_its_input,
+    "deterministic": _is_deterministic,
     "reads only its view": _reads_only_its_view,
     "order of drones irrelevant": _order_is_irrelevant,
-    "one drone and empty views": _alone_and_empty,
-    "stale views": _stands_stale,
+    "one drone and empty views": _accepts_small_views,
+    "stale views": _accepts_stale_views,
     "age-monotone": age_monotone,
     "budget kept": _keeps_budget,
-    "viewpoint kept": _looks,
+    "viewpoint kept": _viewpoint_keeps_rules,
 }
 """The kit's rules by name; a policy without a parameter `rho` has no budget to break."""
 
@@ -361,7 +363,7 @@ def _copied(view: FleetView) -> FleetView:
     return view._replace(descriptors=dict(view.descriptors), age_s=dict(view.age_s))
 
 
-def _spelt(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
+def _as_tuples(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
     return [tuple(d) for d in directives]  # with the reasons, which equality leaves out
 
 

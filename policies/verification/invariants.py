@@ -195,7 +195,7 @@ class Invariant:
     @property
     def of_link(self) -> bool:
         """Whether it must hold for each link by itself."""
-        return any(_speaks_of_link(n) for n in (self.when, self.then) if n is not None)
+        return any(_needs_link(n) for n in (self.when, self.then) if n is not None)
 
     @property
     def needs_fresh(self) -> bool:
@@ -206,11 +206,11 @@ class Invariant:
 def walk(node: Node) -> Iterator[Node]:
     """The node and all below it."""
     yield node
-    for below in _below(node):
+    for below in _children(node):
         yield from walk(below)
 
 
-def _below(node: Node) -> tuple[Node, ...]:
+def _children(node: Node) -> tuple[Node, ...]:
     match node:
         case Binary():
             return (node.left, node.right)
@@ -222,14 +222,14 @@ def _below(node: Node) -> tuple[Node, ...]:
             return ()
 
 
-def _speaks_of_link(node: Node) -> bool:
+def _needs_link(node: Node) -> bool:
     if isinstance(node, LinksTerm):
         return False  # it binds the link itself
     if isinstance(node, Fresh):
         return True
     if isinstance(node, Name):
         return node.word in WORDS and WORDS[node.word].of_link
-    return any(_speaks_of_link(below) for below in _below(node))
+    return any(_needs_link(below) for below in _children(node))
 
 
 # --- from text -----------------------------------------------------------------------------------
@@ -260,14 +260,14 @@ def _parse_line(line: str) -> Invariant:
         condition, colon, requirement = line.removeprefix("when ").partition(":")
         if not colon:
             raise InvariantError("a condition ends with a colon, as in `when battery < 0.3: rate_hz <= 2`")
-        when = _truth(condition)
-    return Invariant(line, when, _truth(requirement))
+        when = _parse_expression(condition)
+    return Invariant(line, when, _parse_expression(requirement))
 
 
-def _truth(text: str) -> Node:
+def _parse_expression(text: str) -> Node:
     try:
         tree = ast.parse(text.strip(), mode="eval").body
-        node = _node(tree)
+        node = _to_node(tree)
     except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
         if isinstance(error, InvariantError):
             raise
@@ -277,7 +277,7 @@ def _truth(text: str) -> Node:
     return node
 
 
-def _node(tree: ast.expr) -> Node:
+def _to_node(tree: ast.expr) -> Node:
     """The allow-list: what is not named here is refused."""
     match tree:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
@@ -291,29 +291,31 @@ def _node(tree: ast.expr) -> Node:
         case ast.Attribute(value=ast.Name(id="fresh"), attr=word) if word in DECISIONS:
             return Fresh(word)
         case ast.UnaryOp(op=ast.Not(), operand=operand):
-            return Logic("not", (_of_kind("truth", operand),))
+            return Logic("not", (_to_node_of_kind("truth", operand),))
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return Binary("-", Number(0), _of_kind("number", operand))
+            return Binary("-", Number(0), _to_node_of_kind("number", operand))
         case ast.BoolOp(op=op, values=values):
-            return Logic("and" if isinstance(op, ast.And) else "or", tuple(_of_kind("truth", v) for v in values))
+            return Logic(
+                "and" if isinstance(op, ast.And) else "or", tuple(_to_node_of_kind("truth", v) for v in values)
+            )
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
-            return Binary(_SIGNS[type(op)], _of_kind("number", left), _of_kind("number", right))
+            return Binary(_SIGNS[type(op)], _to_node_of_kind("number", left), _to_node_of_kind("number", right))
         case ast.Compare(left=first, ops=ops, comparators=rest) if all(type(op) in _SIGNS for op in ops):
-            sides = [_of_kind("number", side) for side in (first, *rest)]
+            sides = [_to_node_of_kind("number", side) for side in (first, *rest)]
             pairs = [
                 Binary(_SIGNS[type(op)], left, right) for op, left, right in zip(ops, sides, sides[1:], strict=False)
             ]
             return pairs[0] if len(pairs) == 1 else Logic("and", tuple(pairs))
         case ast.Call(func=ast.Name(id=function), args=[body], keywords=[]) if function in LINK_FUNCTIONS:
-            inner = _of_kind(LINK_FUNCTIONS[function][0], body)
+            inner = _to_node_of_kind(LINK_FUNCTIONS[function][0], body)
             if any(isinstance(n, LinksTerm) for n in walk(inner)):
                 raise InvariantError(f"{function}(…) holds another function over links")
             return LinksTerm(function, inner)
     raise InvariantError(f"{ast.unparse(tree)!r} has no place in an invariant")
 
 
-def _of_kind(kind: Kind, tree: ast.expr) -> Node:
-    node = _node(tree)
+def _to_node_of_kind(kind: Kind, tree: ast.expr) -> Node:
+    node = _to_node(tree)
     if _kind(node) != kind:
         wanted = "a number" if kind == "number" else "true or false"
         raise InvariantError(f"{ast.unparse(tree)!r} must be {wanted}")
@@ -392,7 +394,7 @@ def evaluate(node: Node, scope: Scope) -> Any:
             return sum(1 if v else 0 for v in links) if node.function == "count_links" else sum(links)
 
 
-def complaint(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
+def find_violation(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
     """What a policy breaks on a view, in words; None where it keeps every invariant."""
     directives = list(policy(view))
     fresh: list[Directive] | None = None
@@ -403,7 +405,7 @@ def complaint(invariants: Iterable[Invariant], policy: Policy, view: FleetView) 
             where = (
                 "the directives break" if broken is None else f"directive {broken.source}→{broken.destination} breaks"
             )
-            return f"{where} {invariant.text!r}: {spelt(directives if broken is None else [broken])}"
+            return f"{where} {invariant.text!r}: {describe_directives(directives if broken is None else [broken])}"
     return None
 
 
@@ -412,7 +414,7 @@ def just_heard(view: FleetView) -> FleetView:
     return view._replace(age_s=dict.fromkeys(view.age_s, 0.0))
 
 
-def spelt(directives: Iterable[Directive]) -> str:
+def describe_directives(directives: Iterable[Directive]) -> str:
     """Directives in a few words each."""
     return "; ".join(
         f"→{d.destination} {NAME_OF[Representation(d.representation)]} ρ {d.rho:g} {d.rate_hz:g} Hz "

@@ -29,13 +29,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, kind_fault
-from sortie.policies.verification.confine import looks_up
+from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, find_wrong_type
+from sortie.policies.verification.confine import uses_builtin
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part
-from sortie.policies.verification.invariants import Invariant, just_heard, spelt, violations
+from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
 from sortie.policies.verification.ranges import FleetOfRanges
 from sortie.policies.verification.symbols import Path, Refused, explore
-from sortie.policies.verification.views import draw_views, smaller
+from sortie.policies.verification.views import draw_views, shrink
 
 MAX_DRONES = 4
 MAX_CELLS = 200_000
@@ -127,14 +127,14 @@ def property_of(invariant: Invariant) -> Property:
         directives = list(policy(view.now()))
         fresh = list(policy(view.just_heard())) if invariant.needs_fresh else []
         for broken in violations(invariant, view.now(), directives, fresh):
-            return f"decided {spelt(directives if broken is None else [broken])}"
+            return f"decided {describe_directives(directives if broken is None else [broken])}"
         return None
 
     return Property(invariant.text, complaint)
 
 
 PLANE: tuple[Property, ...] = (
-    Property("contract: bounds, one directive a link", keeps_contract),
+    Property("contract: bounds, one directive per link", keeps_contract),
     Property("age-monotone: older descriptors raise no rung, budget or rate", only_falls_with_age),
 )
 """What every policy owes the plane, whatever its invariants."""
@@ -173,7 +173,7 @@ def _verdict(
     policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int, seed: int
 ) -> ProofVerdict:
     def fails(view: FleetView) -> bool:
-        return complaint_on(prop, policy, view) is not None
+        return check_property(prop, policy, view) is not None
 
     try:
         cells, system = _search(policy, prop, max_drones, period_s, max_cells)
@@ -183,35 +183,35 @@ def _verdict(
         if system is not None:
             found = system.example()
             raised = system.raised_example()
-            confirmed = complaint_on(prop, policy, found, raised)
+            confirmed = check_property(prop, policy, found, raised)
             if confirmed is not None:
                 return ProofVerdict(prop.name, "refuted", confirmed, found, raised)
             reason = "the search meets a fault that no plain view shows"
-        elif looks_up(policy, type):
+        elif uses_builtin(policy, type):
             reason = "asks for a type(…), which is another one in the search"
         else:
             return ProofVerdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
     for view in draw_views(seed, TRIED_VIEWS):
         if fails(view):
-            small = smaller(view, fails)
-            return ProofVerdict(prop.name, "refuted", complaint_on(prop, policy, small) or "", small)
+            small = shrink(view, fails)
+            return ProofVerdict(prop.name, "refuted", check_property(prop, policy, small) or "", small)
     return ProofVerdict(prop.name, "not proved", f"{reason}; {TRIED_VIEWS} drawn views keep it")
 
 
-def complaint_on(
+def check_property(
     prop: Property, policy: Policy, view: FleetView, raised: Mapping[int, float] | None = None
 ) -> str | None:
     """What is wrong with a policy on one plain view; raising is."""
     try:
         return prop.complaint(policy, RepeatableView(plain=view, raised=raised))
     except Exception as error:
-        return _unsound(policy, view) or f"raises {type(error).__name__}: {error}"
+        return _invalid_directive(policy, view) or f"raises {type(error).__name__}: {error}"
 
 
-def _unsound(policy: Policy, view: FleetView) -> str | None:
+def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
     """What in the policy's answer is no directive, over which a property stumbles; None where that is not the cause."""
     try:
-        return next((wrong for d in policy(view) if (wrong := kind_fault(d)) is not None), None)
+        return next((wrong for d in policy(view) if (wrong := find_wrong_type(d)) is not None), None)
     except Exception:
         return None
 

@@ -216,7 +216,7 @@ class _Flags:
         return int
 
 
-def _of_all_bits(name: str) -> Callable[..., Any]:
+def _by_value(name: str) -> Callable[..., Any]:
     def operator(*operands: Any) -> Any:
         return getattr(int, name)(*(x._bits(-1) if type(x) is _Flags else x for x in operands))
 
@@ -225,7 +225,7 @@ def _of_all_bits(name: str) -> Callable[..., Any]:
 
 _OWN_METHODS = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
 for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _OWN_METHODS:
-    setattr(_Flags, _asked, _of_all_bits(_asked))  # where Python looks for operators
+    setattr(_Flags, _asked, _by_value(_asked))  # where Python looks for operators
 
 
 def _flag(bit: int, agent_id: int) -> str:

@@ -50,7 +50,7 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
         InvariantError: an invariant sums or counts links: which of them should yield is not the shield's to say; nor
             `every_link(…)`, which says the same as its requirement alone.
     """
-    rules = checked(invariants)
+    rules = check_shieldable(invariants)
     asks_fresh = any(rule.needs_fresh for rule in rules)
 
     def shielded(view: FleetView, /) -> list[Directive]:
@@ -62,7 +62,7 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     return shielded
 
 
-def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
+def check_shieldable(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
     """The invariants, all of them such that a shield can keep them.
 
     Raises:
@@ -99,30 +99,30 @@ def enforce(
     of_link = [rule for rule in rules if rule.of_link]
     scope = Scope(view, me, directives, {d.destination: d for d in fresh})
     for k, directive in enumerate(directives):
-        broken = [r for r in of_link if not _keeps(r, scope, directive)]
+        broken = [r for r in of_link if not _satisfies(r, scope, directive)]
         if broken:
-            directives[k] = _mended(scope, k, of_link, broken)
+            directives[k] = _nearest_valid(scope, k, of_link, broken)
     for rule in rules:
-        if not rule.of_link and not _keeps(rule, scope, None):
-            _mend_together(scope, directives, rule, of_link)
+        if not rule.of_link and not _satisfies(rule, scope, None):
+            _replace_one_link(scope, directives, rule, of_link)
     return directives
 
 
-def _keeps(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
+def _satisfies(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
     here = scope._replace(link=link)
     return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
 
 
-def _mended(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
+def _nearest_valid(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
     """The nearest directive on this link that keeps every rule of links."""
     before = scope.directives[k]
-    for _, after in _nearest(before, rules, scope):
-        if all(_keeps(r, scope, after) for r in rules):
-            return _told(before, after, broken)
-    return _unkept(before, broken)
+    for _, after in _candidates(before, rules, scope):
+        if all(_satisfies(r, scope, after) for r in rules):
+            return _replaced(before, after, broken)
+    return _not_replaced(before, broken)
 
 
-def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
+def _replace_one_link(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
     """Change one link, the least change of all links', so that a rule over all of them holds.
 
     Args:
@@ -130,28 +130,28 @@ def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, o
     """
     best: tuple[tuple[int, float], int, Directive] | None = None
     for k, before in enumerate(list(directives)):
-        for far, after in _nearest(before, [*of_link, rule], scope):
+        for far, after in _candidates(before, [*of_link, rule], scope):
             if best is not None and far >= best[0]:
                 break
             directives[k] = after
-            if _keeps(rule, scope, None) and all(_keeps(r, scope, after) for r in of_link):
+            if _satisfies(rule, scope, None) and all(_satisfies(r, scope, after) for r in of_link):
                 best = (far, k, after)
                 break
         directives[k] = before
     if best is None:
-        directives[:] = [_unkept(d, [rule]) for d in directives]
+        directives[:] = [_not_replaced(d, [rule]) for d in directives]
     else:
         _, k, after = best
-        directives[k] = _told(directives[k], after, [rule])
+        directives[k] = _replaced(directives[k], after, [rule])
 
 
-def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
+def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
     because = "; ".join(rule.text for rule in broken)
     was = f"{NAME_OF[Representation(before.representation)]} at {before.rate_hz:g} Hz"
     return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
 
 
-def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
+def _not_replaced(before: Directive, broken: Sequence[Invariant]) -> Directive:
     note = f"{MARK}cannot keep {'; '.join(rule.text for rule in broken)} "
     return before if before.reason.startswith(note) else before._replace(reason=f"{note}({before.reason})")
 
@@ -159,7 +159,7 @@ def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
 # --- candidates ----------------------------------------------------------------------------------
 
 
-def _nearest(
+def _candidates(
     before: Directive, rules: Sequence[Invariant], scope: Scope
 ) -> Iterator[tuple[tuple[int, float], Directive]]:
     """How far, and which: directives that differ in the decisions that the rules speak of, nearest first."""
@@ -168,7 +168,7 @@ def _nearest(
     for rule in rules:
         for top in (rule.when, rule.then):
             if top is not None:
-                _collect(top, here, values)
+                _collect_boundaries(top, here, values)
     now = {word: _value(before, word) for word in values}
     steps = {w: sorted(({0.0, _HIGHEST[w]} | values[w]) - {now[w]}) for w in sorted(values)}
     waiting: list[tuple[tuple[int, float], Directive]] = []
@@ -176,7 +176,7 @@ def _nearest(
     for changes in range(1, len(steps) + 2):
         for words in itertools.combinations(steps, changes):
             for pick in itertools.product(*(steps[w] for w in words)):
-                found = _with(before, dict(zip(words, pick, strict=True)), scope.me.region)
+                found = _changed(before, dict(zip(words, pick, strict=True)), scope.me.region)
                 if found is not None:
                     waiting.append((_distance(before, found), found))
         near = [w for w in waiting if w[0][0] <= changes]
@@ -184,7 +184,7 @@ def _nearest(
         yield from sorted(near, key=lambda w: w[0])
 
 
-def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
+def _collect_boundaries(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
     """Into `values`: for each decision spoken of, where the comparisons about it change their answer."""
     for node in walk(top):
         if isinstance(node, Name) and node.word in _HIGHEST:
@@ -210,7 +210,7 @@ def _value(d: Directive, word: str) -> float:
     return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
 
 
-def _with(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
+def _changed(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
     """The directive with decisions changed; None where there is no such directive."""
     changed: dict[str, Any] = {}
     for word, value in wanted.items():

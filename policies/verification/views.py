@@ -99,7 +99,7 @@ _PLAIN: dict[str, Any] = {
 }
 
 
-def smaller(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
+def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
     """A view that still fails, with as few drones and as plain fields as one pass over them finds.
 
     Args:

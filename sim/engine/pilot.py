@@ -28,8 +28,15 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part
-from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
-from sortie.policies.verification.shield import MARK, checked, enforce
+from sortie.policies.verification.invariants import (
+    Invariant,
+    InvariantError,
+    describe_directives,
+    just_heard,
+    parse,
+    violations,
+)
+from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.schema import PolicyChange, PolicySection
 from sortie.sim.engine.world import at, with_frame
@@ -74,7 +81,7 @@ def plan_of(section: PolicySection, first: Named | None = None) -> PolicyPlan:
         rules = parse(section.invariants)
         replays = tuple((r.at_s, r.drone, from_json(r.view)) for r in section.replays)
         if section.shield:
-            checked(rules)
+            check_shieldable(rules)
     except InvariantError as error:
         raise PolicyError(f"policy.invariants: {error}") from error
     except ViewError as error:
@@ -218,9 +225,9 @@ class Pilot:
         for rule in self._rules:
             for broken in violations(rule, view, directives, fresh):
                 if broken is None:
-                    audit.broke(self.drone, -1, name, f"{rule.text}: {spelt(directives)}")
+                    audit.broke(self.drone, -1, name, f"{rule.text}: {describe_directives(directives)}")
                 else:
-                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {spelt([broken])}")
+                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {describe_directives([broken])}")
         return directives
 
     def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:

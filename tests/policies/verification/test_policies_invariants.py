@@ -6,7 +6,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
-from sortie.policies.verification.invariants import WORDS, InvariantError, complaint, just_heard, parse, violations
+from sortie.policies.verification.invariants import WORDS, InvariantError, find_violation, just_heard, parse, violations
 
 VIEW = fleet_of(3, soc=0.2, goodput=4.0)
 SHARED = [
@@ -109,11 +109,11 @@ def test_what_is_refused(line: str, message: str) -> None:
 
 
 def test_a_complaint_names_the_directive_the_rule_and_what_was_decided() -> None:
-    found = complaint(parse("rate_hz <= 5"), lambda view: SHARED, VIEW)
+    found = find_violation(parse("rate_hz <= 5"), lambda view: SHARED, VIEW)
     assert found == "directive 0→1 break 'rate_hz <= 5': →1 features ρ 0.25 10 Hz duty 40 % (one)".replace(
         "break", "breaks"
     )
-    assert complaint(parse("rate_hz <= 10"), lambda view: SHARED, VIEW) is None
+    assert find_violation(parse("rate_hz <= 10"), lambda view: SHARED, VIEW) is None
 
 
 def test_every_word_is_explained() -> None:

@@ -12,7 +12,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
 from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, complaint_on, property_of, prove
+from sortie.policies.verification.proof import ProofVerdict, check_property, property_of, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import from_json, to_json
 
@@ -66,7 +66,7 @@ def test_a_policy_that_drops_below_detections_is_found_out() -> None:
     assert verdict.counterexample is not None
     assert 0.4 < verdict.counterexample.descriptors[verdict.counterexample.ego].battery_soc < 0.4000001
     again = from_json(to_json(verdict.counterexample))
-    assert complaint_on(property_of(parse(HUMANE)[0]), drops_below_detections, again) == verdict.what
+    assert check_property(property_of(parse(HUMANE)[0]), drops_below_detections, again) == verdict.what
     assert last(worked, HUMANE).outcome == "proved"
 
 
