@@ -1,11 +1,11 @@
-"""Descriptors in, directives out: the types that every policy sees, and nothing else.
+"""The policy contract: the types that go into a policy and come out of it, and the check of its output.
 
-A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (ages are
-attached to the view), no I/O and no payloads. Frames: positions ENU, orientation quaternion x, y, z, w
-of FLU in ENU. One that also chooses where to look from has a second function, marked by `looks_from`.
+A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (the view has the ages), no
+input or output, and no payloads. Positions are ENU. An orientation is a quaternion x, y, z, w of FLU in ENU. A policy
+that also chooses where its drone looks from has a second function, marked by `looks_from`.
 
-The types are named tuples: frozen, and made in a third of a frozen dataclass's time, which a fleet feels that
-makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that differs.
+The types are named tuples. They are frozen, and creating one takes a third of the time of a frozen dataclass; a fleet
+creates tens of thousands a minute. `d._replace(rate_hz=5.0)` is a changed copy.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ class Coverage(IntEnum):
 
 
 class Descriptor(NamedTuple):
-    """One drone's context, as it stands in the paper's schema (180 B as CDR at N = 5)."""
+    """One drone's context, with the fields of the paper's schema (180 B as CDR with five drones)."""
 
     stamp_ns: int
-    """Publisher's clock, ns since the sortie's begin."""
+    """The publisher's clock, ns since the begin of the sortie."""
     agent_id: int
     position_m: tuple[float, float, float]
     orientation_xyzw: tuple[float, float, float, float]
@@ -85,7 +85,7 @@ class Descriptor(NamedTuple):
 
     @property
     def coverage_corner(self) -> tuple[int, int]:
-        """Row and column, in the world's lattice, of the grid's south-west cell: where the grid lies."""
+        """Row and column, in the world's lattice, of the coverage grid's south-west cell."""
         x_m, y_m, _ = self.position_m
         half = COVERAGE_CELLS // 2
         return math.floor(y_m / COVERAGE_CELL_M) - half, math.floor(x_m / COVERAGE_CELL_M) - half
@@ -98,9 +98,9 @@ class Descriptor(NamedTuple):
 
 
 class FleetView(NamedTuple):
-    """What a policy reads: the latest descriptor of every drone heard so far, however stale.
+    """A policy's input: the latest descriptor of every drone heard so far, of whatever age.
 
-    `descriptors` and `age_s` have the same keys; both hold the ego.
+    `descriptors` and `age_s` have the same keys. The ego is one of them.
     """
 
     ego: int
@@ -123,24 +123,24 @@ class FleetView(NamedTuple):
 class Directive(NamedTuple):
     """One policy decision for one outgoing link (36 B on the wire).
 
-    Directives are equal where all but their reasons are.
+    Two directives are equal if all fields but `reason` are equal.
     """
 
     source: int
     destination: int
     representation: Representation = Representation.NONE
     rho: float = 0.0
-    """Budget: at most this fraction of all feature cells, 0 … 1."""
+    """At most this share of the source's feature cells is sent on the link, 0 … 1."""
     roi: Disc | None = None
     """Only cells, boxes or tracks inside; None is everywhere."""
     rate_hz: float = 0.0
     deadline_s: float = 0.1
     fusion_weight: float = 1.0
-    """Trust × freshness that the receiver gives this link's payloads, 0 … 1."""
+    """The weight that the receiver gives this link's payloads (trust × freshness), 0 … 1."""
     duty_percent: int = 100
     """Share of frames in which the source runs perception at all, 0 … 100."""
     reason: str = ""
-    """Why, in words; for the record, not on the wire, no part of equality."""
+    """Why, as text for the record. It is not on the wire and no part of equality."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Directive) and self[:-1] == other[:-1]
@@ -154,7 +154,7 @@ class Directive(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def nothing(source: int, destination: int, reason: str) -> Directive:
-    """The directive to send nothing; one object for equal arguments, since policies say it most often."""
+    """The directive to send nothing. Equal arguments give one object, because it is the most frequent directive."""
     return Directive(source, destination, reason=reason)
 
 
@@ -165,21 +165,21 @@ class Policy(Protocol):
 
 
 class Reposition(NamedTuple):
-    """Where a drone asks to look from, instead of from its slot in the formation.
+    """A request of a drone to look from another place than its slot in the formation.
 
-    A wish, not a command: `fleet.viewpoints` grants as much of it as separation, fence, speed and acceleration allow.
-    It stands until the drone's next decision; a wish for where the drone already is moves nothing.
+    `fleet.viewpoints` grants as much of it as separation, fence, speed and acceleration allow. The request is valid
+    until the drone's next decision. A request for the place where the drone already is moves nothing.
     """
 
     x_m: float
-    """The place over ground where it would be now, ENU; the formation carries it on."""
+    """The place over ground where the drone would be now, ENU; it moves on with the formation."""
     y_m: float
     reason: str = ""
-    """Why, in words; for the record."""
+    """Why, as text for the record."""
 
 
 class Viewpoint(Protocol):
-    """The optional second half of a policy: asked with the view of every decision; None is the drone's slot."""
+    """The optional second part of a policy. It is called with the view of every decision; None means the drone's slot."""
 
     def __call__(self, view: FleetView, /) -> Reposition | None: ...
 
@@ -188,7 +188,7 @@ AnyPolicy = TypeVar("AnyPolicy", bound=Callable[..., Sequence[Directive]])
 
 
 def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPolicy], AnyPolicy]:
-    """Mark a policy as one that also chooses viewpoints; the keyword parameters that both name are given to both."""
+    """Mark a policy as one that also chooses viewpoints. Keyword parameters that both functions have are given to both."""
 
     def mark(policy: AnyPolicy) -> AnyPolicy:
         marked: Any = policy
@@ -230,7 +230,7 @@ MAX_REPOSITION_M = 200.0
 
 
 def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
-    """Hold a policy's output to the contract, once, where it enters the fleet.
+    """Check a policy's output against the contract, once, where it enters the fleet.
 
     Raises:
         PolicyError: naming the directive, the field and what it must be.
@@ -246,11 +246,11 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
-    """Whether all is sound and of the plain types that nearly every policy uses: it runs thousands of times a sortie."""
+    """Whether all is valid and of the plain types that nearly every policy uses. Fast: it runs thousands of times a sortie."""
     ego, peers, seen, sound_roi = view.ego, view.descriptors, {view.ego}, None
     add = seen.add
     try:
-        links = len(directives)  # what has no length is not used up here
+        links = len(directives)  # a generator has no length, and is not consumed here
         for d in directives:
             source, destination, rung, rho, roi, rate_hz, deadline_s, weight, duty_percent, reason = d
             if not (
@@ -284,34 +284,34 @@ def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
     return len(seen) == links + 1  # no link twice, none to the ego itself
 
 
-def check_reposition(asked: object, view: FleetView) -> None:
-    """Hold what a viewpoint returned to the contract, once, where it enters the fleet.
+def check_reposition(request: object, view: FleetView) -> None:
+    """Check what a viewpoint returned against the contract, once, where it enters the fleet.
 
     Raises:
         PolicyError: naming the drone, the field and what it must be.
     """
-    if asked is None:
+    if request is None:
         return
-    if not isinstance(asked, Reposition):
-        raise PolicyError(f"a viewpoint returns Reposition or None, got {type(asked).__name__}")
+    if not isinstance(request, Reposition):
+        raise PolicyError(f"a viewpoint returns Reposition or None, got {type(request).__name__}")
     where, me = f"reposition of drone {view.ego}", view.me
     if me is None:
-        raise PolicyError(f"{where}: asked for in a view without it, must be None")
-    if not isinstance(asked.reason, str):
-        raise PolicyError(f"{where}: reason is {asked.reason!r}, must be text")
+        raise PolicyError(f"{where}: the view has no descriptor of it, must be None")
+    if not isinstance(request.reason, str):
+        raise PolicyError(f"{where}: reason is {request.reason!r}, must be text")
     away_m = []
-    for name, value, here_m in (("x_m", asked.x_m, me.position_m[0]), ("y_m", asked.y_m, me.position_m[1])):
+    for name, value, here_m in (("x_m", request.x_m, me.position_m[0]), ("y_m", request.y_m, me.position_m[1])):
         try:
             away_m.append(math.fabs(value - here_m))
         except Exception as error:  # only a number does this; the message names what came instead
             raise PolicyError(f"{where}: {name} is {value!r}, must be a number") from error
     far_m = math.hypot(*away_m)
     if not far_m <= MAX_REPOSITION_M:  # also catches NaN
-        raise PolicyError(f"{where}: {far_m:.1f} m from where it is, must be at most {MAX_REPOSITION_M:g} m")
+        raise PolicyError(f"{where}: {far_m:.1f} m from the drone, must be at most {MAX_REPOSITION_M:g} m")
 
 
 def find_wrong_type(d: object) -> str | None:
-    """What is no number, disc or text where a directive must have one, whatever the bounds; None where all are."""
+    """The first field of a directive that is of a wrong type, as an error text; None if all types are right."""
     if not isinstance(d, Directive):
         return f"a policy returns Directive, got {type(d).__name__}"
     where = f"directive {d.source}→{d.destination}"
@@ -333,7 +333,7 @@ def find_wrong_type(d: object) -> str | None:
 
 
 def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
-    """What is wrong with a directive; None where it is sound and only made of rarer types, such as numpy's."""
+    """What is wrong with a directive; None if it is valid and only has rarer types, such as numpy's."""
     wrong = find_wrong_type(d)
     if wrong is not None:
         return wrong
@@ -356,7 +356,7 @@ def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
 
 
 def _compares(value: Any, low: float, high: float) -> bool:
-    """Whether it is a number, of whatever type: one that can be held against its bounds."""
+    """Whether a value can be compared with its bounds: a number of any type."""
     try:
         bool(low <= value <= high)
     except Exception:  # whatever a foreign type raises
@@ -365,7 +365,7 @@ def _compares(value: Any, low: float, high: float) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether it is an int of whatever type, as the wire needs it: 2 and numpy's 2, not 2.0."""
+    """Whether a value is an integer of any type, as the wire needs it: 2 and numpy's 2, not 2.0."""
     try:
         operator.index(value)
     except TypeError:

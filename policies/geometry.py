@@ -1,4 +1,4 @@
-"""Plane geometry that policies share: overlaps of footprints, from descriptor fields alone."""
+"""Overlap of footprints, from descriptor fields alone, for several policies."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
 
 
 def peers_by_overlap(view: FleetView) -> list[int]:
-    """Peers by falling footprint overlap with the ego, in steps of `OVERLAP_STEP`.
+    """Peers in order of footprint overlap with the ego, largest first, in steps of `OVERLAP_STEP`.
 
-    Ties go round by id, beginning after the ego, so that drones in one place do not all choose the same peers.
+    Ties are broken by id, beginning after the ego, so that drones in one place do not all choose the same peers.
     """
     me = view.me
     if me is None:

@@ -1,4 +1,4 @@
-"""The table of policies, and the way from a name in a scenario to a callable."""
+"""The registered policies, and `resolve`: from a policy's name in a scenario to its function."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "vantage": vantage,
     **{name: method.policy for name, method in METHODS.items()},
 }
-"""One line a policy. Keyword-only arguments are its parameters."""
+"""One line for each policy. Its keyword-only arguments are its parameters."""
 
 
 class Bound(NamedTuple):
-    """What a parameter must be."""
+    """The allowed values of a parameter, and the text for its error message."""
 
-    words: str
+    text: str
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
@@ -58,8 +58,8 @@ BOUNDS: dict[str, Bound] = {
     "sharpness": Bound("a number in [0, 100]", 0, 100),  # e to the power of some 700 is no float any more
     "trusted_for_s": Bound("a number in [0.001, 3600]", 0.001, 3600),
 }
-"""Of the registered policies' parameters, by name; one that has none here is its function's to judge, as all are that a
-user's file declares."""
+"""The bounds of the registered policies' parameters, by name. A policy checks all other parameters itself, and so does a
+user's file."""
 
 
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
@@ -79,7 +79,7 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
             raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
         bound = BOUNDS.get(key) if name in POLICIES else None
         if bound is not None and not bound.holds(value):
-            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.words}")
+            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.text}")
     return functools.partial(function, **params) if params else function
 
 
@@ -101,19 +101,19 @@ def describe_error(error: Exception) -> str:
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
-    """What a drone under this policy sends to each peer and frame before any payload; 0 where it asks for nothing."""
+    """Bytes that a drone under this policy sends to each peer in each frame before any payload; 0 without a handshake."""
     method = METHODS.get(name)
     return 0 if method is None else method.handshake_bytes(params or {})
 
 
 def own_fusion(name: str) -> str | None:
-    """The fusion that a prior method was published with, a value of `perception.fusion`; None where it has none."""
+    """The fusion with which a prior method was published (a value of `perception.fusion`), or None."""
     method = METHODS.get(name)
     return None if method is None else method.fusion
 
 
 def viewpoint_of(policy: Policy) -> Viewpoint | None:
-    """The function by which a policy chooses where to look from, its parameters bound; None where it has none."""
+    """The function by which a policy chooses where to look from, with its parameters bound; None if it has none."""
     bound = policy.keywords if isinstance(policy, functools.partial) else {}
     found = getattr(policy.func if isinstance(policy, functools.partial) else policy, "viewpoint", None)
     shared = {k: v for k, v in bound.items() if k in parameters(found)} if found is not None else {}

@@ -1,8 +1,8 @@
-"""A policy that reads all four context axes and makes all six decisions: who serves whom, by what is not yet seen.
+"""A policy that reads all four context axes and makes all six decisions: each receiver is served by a few drones.
 
-For each receiver the fleet appoints the k drones that add most to what it sees, as far as link and battery carry
-them. Every drone works out the same appointment from the same descriptors, so nothing is negotiated; a drone whose
-claims are false can take a place from a better one, which is what trust (`sortie.fleet.trust`) is for.
+For each receiver, the k drones are appointed that add most to what it sees, weighted by link and battery. Every drone
+computes the same appointment from the same descriptors, so nothing is negotiated. A drone with false claims can take
+the place of a better one; trust (`sortie.fleet.trust`) is for that.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directiv
 
 
 def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> Directive:
-    """How the ego serves a peer."""
+    """The directive by which the ego serves a peer."""
     roi = me.region if me.task_phase == TaskPhase.TRACK else None
     weight = freshness(view.age_s[peer], view.period_s)
     goodput_mbps = me.goodput_to(peer)
@@ -62,7 +62,7 @@ def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> 
 
 
 def _appointed(view: FleetView, receiver: int) -> list[int]:
-    """All other drones, those that add most to the receiver first."""
+    """All drones but the receiver, those that add most to it first."""
     served = view.descriptors[receiver]
     known = seen_well(served)
 

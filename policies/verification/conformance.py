@@ -1,10 +1,10 @@
-"""The conformance kit: what every policy must keep, tried on drawn views; no policy is exempt.
+"""The conformance kit: rules that every policy must keep, tested on drawn views. No policy is exempt.
 
     checks = conform(my_policy)
     assert all(c.holds for c in checks)
 
-A rule is a function of a policy and a view that returns a complaint, or None where the policy keeps it. A rule
-that fails comes with the smallest view found on which it fails.
+A rule is a function of a policy and a view. It returns a complaint, or None if the policy keeps the rule. A check that
+fails has the smallest failing view that was found.
 """
 
 from __future__ import annotations
@@ -36,43 +36,43 @@ from sortie.policies.verification.views import draw_view, draw_views, shrink
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)
 DECISION_LIMIT_S = 0.010
-"""A tenth of a frame at 10 Hz, at 20 drones: generous, since machines differ; the figure itself is reported."""
+"""A tenth of a frame at 10 Hz, at 20 drones. The limit is generous, because machines differ; the time is reported."""
 _STALE_PERIODS = 20.0  # beyond the plane's ten, at which a peer is detached
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One rule's verdict on one policy."""
+    """The verdict of one rule on one policy."""
 
     name: str
     holds: bool
     what: str
-    """The complaint where it fails, otherwise what was tried."""
+    """The complaint if the rule fails, otherwise what was tested."""
     counterexample: FleetView | None = None
-    """The smallest failing view found; None where the rule holds or needs no view."""
+    """The smallest failing view found; None if the rule holds or needs no view."""
 
 
 Rule = Callable[[Policy, FleetView], str | None]
 
 
 class _Raised(Exception):
-    """The policy itself raised, or gave no directives; `answers` and `bounds kept` report it, no other rule does."""
+    """The policy itself raised, or returned no directives. Only the rules `returns directives` and `bounds kept` report it."""
 
 
 def conform(
     policy: Policy, views: Iterable[FleetView] | None = None, *, seed: int = 0, count: int = VIEWS
 ) -> list[Check]:
-    """Hold a policy to every rule of the kit.
+    """Check a policy against every rule of the kit.
 
     Args:
-        policy: any callable of the contract's shape; a keyword parameter `rho` is taken for its budget.
-        views: what to try it on; left out, the first `count` views of `seed`.
+        policy: any callable of the contract; a keyword parameter `rho` is its budget.
+        views: the views to test it on; without them, the first `count` views of `seed`.
         seed: of the drawn views.
         count: how many.
 
     Returns:
-        One check a rule, always in the same order; a rule that no view could judge does not hold.
+        One check for each rule, always in the same order. A rule that no view could check does not hold.
     """
     tried = list(draw_views(seed, count) if views is None else views)
     checks = [_check_rule(name, rule, policy, tried) for name, rule in RULES.items()]
@@ -112,7 +112,7 @@ def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView
 
 
 def _decide(policy: Policy, view: FleetView) -> list[Directive]:
-    """What the policy decides on a copy of the view: one that changes its input spoils no other rule."""
+    """The policy's directives for a copy of the view, so that a policy that changes its input affects no other rule."""
     directives = _decide_unchecked(policy, view)
     if any(find_wrong_type(d) is not None for d in directives):
         raise _Raised
@@ -120,7 +120,7 @@ def _decide(policy: Policy, view: FleetView) -> list[Directive]:
 
 
 def _decide_unchecked(policy: Policy, view: FleetView) -> list[Directive]:
-    """The same, whatever its directives are made of."""
+    """The same, without a check of the directives' types."""
     try:
         return list(policy(_copied(view)))
     except Exception as error:
@@ -162,7 +162,7 @@ def _gives_reasons(policy: Policy, view: FleetView) -> str | None:
 
 def _keeps_its_input(policy: Policy, view: FleetView) -> str | None:
     before = _copied(view)
-    with contextlib.suppress(Exception):  # one that raises half-way may have changed it all the same
+    with contextlib.suppress(Exception):  # a policy that raises may have changed its input before
         policy(view)
     if view == before and list(view.descriptors) == list(before.descriptors) and list(view.age_s) == list(before.age_s):
         return None
@@ -175,7 +175,7 @@ def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
     if _as_tuples(_decide(policy, view)) != first:
         return "two calls with the same view differ"
     _decide(policy, draw_view(1, 0))
-    return None if _as_tuples(_decide(policy, view)) == first else "differs after another view: it remembers"
+    return None if _as_tuples(_decide(policy, view)) == first else "differs after another view: it has a memory"
 
 
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
@@ -184,7 +184,7 @@ def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
         alone = _as_tuples(_decide(confined(policy), view))
     except Reached as error:
         return str(error)
-    return None if alone == usual else "decides otherwise where only its view is in reach"
+    return None if alone == usual else "decides differently if it can only use its view"
 
 
 def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
@@ -224,9 +224,9 @@ def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
 
 
 def age_monotone(policy: Policy, view: FleetView) -> str | None:
-    """The plane's second rule: raising any descriptor's age raises no directive's fidelity or rate.
+    """The plane's second rule: an older descriptor raises no directive's representation, budget or rate.
 
-    Each descriptor's age is raised by itself, and all together, to beyond each of the plane's two thresholds.
+    Each descriptor's age is raised by itself, and all together, beyond each of the plane's two thresholds.
     """
     before = _decide(policy, view)
     for who, add_s, older in older_views(view):
@@ -245,7 +245,7 @@ def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, Fleet
 
 
 def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str | None:
-    """The first directive of `after` that is above its link's in `before` in rung, budget (at one rung) or rate."""
+    """The first directive of `after` with a higher representation, budget (of the same representation) or rate than `before`."""
     usual = _by_peer(before)
     for d in after:
         old = usual.get(d.destination)
@@ -272,41 +272,43 @@ def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
         bound = partial(takes_rho, rho=rho)
         spent, allowed = sum(d.rho for d in _decide(bound, view)), rho * len(view.peers)
         if not spent <= allowed * (1 + _ROUNDING):
-            return f"rho={rho:g}: its links sum to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
+            return f"rho={rho:g}: its links add up to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
     return None
 
 
 def _viewpoint_keeps_rules(policy: Policy, view: FleetView) -> str | None:
-    """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
-    look = viewpoint_of(policy)
-    if look is None:
+    """A viewpoint keeps the same rules: bounds, input unchanged, no memory, any order of drones, nothing but its view."""
+    viewpoint = viewpoint_of(policy)
+    if viewpoint is None:
         _decide(policy, view)
         return None
     shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
     try:
-        asked = look(shown)
-        check_reposition(asked, view)
+        request = viewpoint(shown)
+        check_reposition(request, view)
         if shown != view:
             return "its viewpoint changed its input"
         others = {
-            "two calls with the same view differ": look(_copied(view)),
-            "drones in another order get another place": look(view._replace(descriptors=_reversed(view.descriptors))),
-            "decides otherwise where only its view is in reach": confined(look)(view),
+            "two calls with the same view differ": viewpoint(_copied(view)),
+            "drones in another order get another place": viewpoint(
+                view._replace(descriptors=_reversed(view.descriptors))
+            ),
+            "decides differently if it can only use its view": confined(viewpoint)(view),
         }
         for few in (alone, {}):
             fewer = view._replace(descriptors=few, age_s={i: view.age_s[i] for i in few})
-            check_reposition(look(fewer), fewer)
+            check_reposition(viewpoint(fewer), fewer)
     except PolicyError as error:
         return str(error)
     except Reached as error:
         return f"its viewpoint {error}"
     except Exception as error:
         return f"its viewpoint raises {type(error).__name__}: {error}"
-    return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
+    return next((f"its viewpoint: {what}" for what, other in others.items() if other != request), None)
 
 
 def _reversed(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
-    """The same in the opposite order."""
+    """The same descriptors in the opposite order."""
     return dict(reversed(list(descriptors.items())))
 
 
@@ -325,11 +327,11 @@ RULES: dict[str, Rule] = {
     "budget kept": _keeps_budget,
     "viewpoint kept": _viewpoint_keeps_rules,
 }
-"""The kit's rules by name; a policy without a parameter `rho` has no budget to break."""
+"""The kit's rules by name. A policy without a parameter `rho` always keeps `budget kept`."""
 
 
 def _decides_in_time(policy: Policy) -> Check:
-    """CPU time of a decision, the median of many, at 5 and at 20 drones."""
+    """Median CPU time of a decision, at 5 and at 20 drones."""
     name, took_s = "time per decision", {}
     for drones in (5, 20):
         view = full_view(drones)
@@ -349,7 +351,7 @@ def _decides_in_time(policy: Policy) -> Check:
 
 
 def full_view(drones: int) -> FleetView:
-    """A view of so many drones, all heard, in drawn states: what decisions are timed on."""
+    """A view of this many drones, all heard, in drawn states, for measuring the time of a decision."""
     drawn = next(v for v in draw_views(2, 10_000) if len(v.descriptors) >= 3)
     some = list(drawn.descriptors.values())
     descriptors = {
@@ -359,12 +361,12 @@ def full_view(drones: int) -> FleetView:
 
 
 def _copied(view: FleetView) -> FleetView:
-    """The view with mappings of its own; all below them is immutable."""
+    """The view with new mappings; everything in them is immutable."""
     return view._replace(descriptors=dict(view.descriptors), age_s=dict(view.age_s))
 
 
 def _as_tuples(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
-    return [tuple(d) for d in directives]  # with the reasons, which equality leaves out
+    return [tuple(d) for d in directives]  # with the reasons, which `==` ignores
 
 
 def _by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:

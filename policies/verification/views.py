@@ -1,4 +1,4 @@
-"""Fleet views to try a policy on: drawn from a seed, made smaller where one fails, kept as JSON."""
+"""Fleet views for testing a policy: drawn from a seed, shrunk if the policy fails on one, written as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PERIODS_S = (0.1, 0.2, 1.0)
 
 
 class ViewError(SortieError):
-    """A view's file is not one; the message names the field."""
+    """A file that is not a valid view; the message names the field."""
 
 
 # --- drawing -------------------------------------------------------------------------------------
@@ -31,7 +31,7 @@ class ViewError(SortieError):
 def draw_view(seed: int, number: int) -> FleetView:
     """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
 
-    Half of all numbers are drawn evenly, the other half from values where rules tend to change their mind.
+    Half of all numbers are drawn uniformly. The other half are values at which rules often change their decision.
     """
     rng = stream(seed, number, (), "verify.view")
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
@@ -80,7 +80,7 @@ def _mixed(rng: np.random.Generator, low: float, high: float, special: tuple[flo
     return float(rng.uniform(low, high)) if rng.random() < 0.5 else float(rng.choice(special))
 
 
-# --- making smaller ------------------------------------------------------------------------------
+# --- shrinking -----------------------------------------------------------------------------------
 
 _PLAIN: dict[str, Any] = {
     "stamp_ns": 0,
@@ -100,11 +100,11 @@ _PLAIN: dict[str, Any] = {
 
 
 def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
-    """A view that still fails, with as few drones and as plain fields as one pass over them finds.
+    """A view that still fails, with fewer drones and plainer fields, as found by one pass over them.
 
     Args:
         view: a view that fails.
-        fails: whether a view fails; asked some twenty times a drone.
+        fails: whether a view fails; called about twenty times for each drone.
     """
 
     def kept(candidate: FleetView) -> bool:
@@ -133,7 +133,7 @@ def _without(mapping: Mapping[int, Any], key: int) -> dict[int, Any]:
 
 
 def to_json(view: FleetView) -> str:
-    """The view as JSON, one drone a line; every number comes back exactly."""
+    """The view as JSON, one drone on each line; every number can be read back exactly."""
     drones = []
     for i, d in view.descriptors.items():
         fields = d._asdict() | {
@@ -169,7 +169,7 @@ def from_json(text: str) -> FleetView:
             raise ViewError(f"drones[{k}] must be an object")
         descriptor = _descriptor(entry, f"drones[{k}]")
         if descriptor.agent_id in descriptors:
-            raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id} for the second time")
+            raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id}, which another drone has already")
         descriptors[descriptor.agent_id] = descriptor
         age_s[descriptor.agent_id] = _number(entry, "age_s", f"drones[{k}]", 0.0)
     ego = _number(data, "ego", "view", 0, 255)

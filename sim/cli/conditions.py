@@ -131,7 +131,7 @@ def learn(
     table = Table("arm", "mean AP", "best in")
     for k, arm in enumerate(ARMS):
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
-        table.add_row(arm.words, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
+        table.add_row(arm.text, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
     out.print(table)
     table = Table("over the first arm, AP points", *(f"rho {rho:g}" for rho in BUDGETS))
     for k, arm in enumerate(ARMS[1:], start=1):
@@ -139,7 +139,7 @@ def learn(
         for phase in ("search", "track"):
             cells = (found.get((phase, rho)) for rho in BUDGETS)
             table.add_row(
-                f"{arm.words}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
+                f"{arm.text}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
             )
     out.print(table)
     enough = ", ".join(f"{name} {rho:.3f}" for name, rho in thresholds(lessons).items())

@@ -1,4 +1,4 @@
-"""What prior methods do where they decide nothing: full maps to every peer, every frame, fused at weight 1."""
+"""Full sharing: full maps to every peer, every frame, fused at weight 1. It is what prior methods do by default."""
 
 from __future__ import annotations
 

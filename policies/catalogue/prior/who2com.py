@@ -1,7 +1,7 @@
-"""Who2com (Liu et al., ICRA 2020): every drone is served by exactly one other, the one that answers it best.
+"""Who2com (Liu et al., ICRA 2020): every drone is served by exactly one other, the one that adds most to it.
 
-The handshake is When2com's (a request, a score from each, a choice); the softmax leaves the drone itself out, so that
-somebody always sends.
+The handshake is When2com's (a request, a score from each, a choice). The choice leaves the drone itself out, so one
+drone always sends.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from sortie.policies.contract import AGENT_IDS, Directive, FleetView, nothing
 
 
 def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
-    """Who2com: full maps to the peers for whom the ego is the best of all drones; ties go round by id."""
+    """Who2com: full maps to the peers for which the ego is the best of all drones; ties are broken by id."""
     if view.me is None:
         return []
     directives = []

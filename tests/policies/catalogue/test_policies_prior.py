@@ -123,7 +123,7 @@ def test_the_disc_holds_its_cells() -> None:
     x_m, y_m, radius_m = disc_around(cells)
     corners = [(c + i, r + j) for r, c in cells for i in (0, 1) for j in (0, 1)]
     assert all(math.hypot(c * COVERAGE_CELL_M - x_m, r * COVERAGE_CELL_M - y_m) <= radius_m + 1e-9 for c, r in corners)
-    with pytest.raises(ValueError, match="cells is empty, must hold at least one"):
+    with pytest.raises(ValueError, match="cells is empty, must have at least one"):
         disc_around(frozenset())
 
 

@@ -326,9 +326,9 @@ def holds_the_fleet(gate: Gate) -> Policy:
     ids=lambda p: getattr(p, "__name__", ""),
 )
 def test_a_policy_that_reaches_elsewhere_is_caught(policy: Policy, what: str) -> None:
-    with pytest.raises(Reached, match=rf"^reaches for {what}, which is not in its view$"):
+    with pytest.raises(Reached, match=rf"^uses {what}, which is not in its view$"):
         confined(policy)(FLEET)
-    assert RULES["reads only its view"](policy, FLEET) == f"reaches for {what}, which is not in its view"
+    assert RULES["reads only its view"](policy, FLEET) == f"uses {what}, which is not in its view"
 
 
 def remembers(view: FleetView) -> list[Directive]:

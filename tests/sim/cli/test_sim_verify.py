@@ -106,7 +106,7 @@ def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: p
     assert "rate_hz <= 4" in capsys.readouterr().out
     rules.write_text("rate_hz <=\n")
     assert command("verify", "worked", *QUICK, "--invariants", rules) == 2
-    assert "line 1, 'rate_hz <=': 'rate_hz <=' is no expression" in capsys.readouterr().err
+    assert "line 1, 'rate_hz <=': 'rate_hz <=' is not an expression" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["too_fast", "eager", "forgetful"])
