@@ -97,6 +97,7 @@ def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
     figures = _saltelli(3, y)
     assert figures[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.03)
     assert figures[:, 2] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.03)
+    assert np.array_equal(_saltelli(3, y), figures)  # its bootstrap draws the same each time
 
 
 def test_morris_of_a_plane_is_its_slopes() -> None:
