@@ -183,14 +183,14 @@ def _ensure_place(path: Path) -> None:
 
 def _others(folder: Path, written: Collection[str], within: str = "") -> list[str]:
     """What a folder holds and `written` does not name, by its path in it; a folder of such things by its name alone."""
-    found = []
+    names = []
     for entry in sorted(folder.iterdir()):
         name = within + entry.name
         if entry.is_dir() and any(w.startswith(f"{name}/") for w in written):
-            found += _others(entry, written, f"{name}/")
+            names += _others(entry, written, f"{name}/")
         elif entry.is_dir() or (name not in written and entry.name != ".DS_Store"):  # a desktop that looked in
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def _replace(new: Path, path: Path) -> None:

@@ -184,11 +184,11 @@ def make_plan(study: Study) -> CampaignPlan:
         (label or base.policy.name, with_files({"policy": _policy(study, i)}, place)["policy"])
         for i, label in enumerate(campaign.policies)
     ]
-    asked, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
+    spec, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
     reading = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
     for field in sorted(campaign.vary.keys() & set(FIELDS)):
         room, _, key = field.partition(".")
-        holder, within = (columns, field) if field in columns else (asked["vary"][field], "values")
+        holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
         varied = [with_files({room: {key: name}}, place) for name in holder[within]]
         holder[within] = [section[room][key] for section in varied]
         reading += varied
@@ -196,7 +196,7 @@ def make_plan(study: Study) -> CampaignPlan:
     return CampaignPlan(
         {
             "format": FORMAT,
-            "campaign": asked,
+            "campaign": spec,
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
@@ -234,19 +234,19 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
     return {name: section[name] for name in ("name", "params", "changes", "commands")}
 
 
-def _files(named: list[str]) -> dict[str, str]:
+def _files(names: list[str]) -> dict[str, str]:
     """Digests of the files that runs read beside the code, by path; of Python files also of those that they import."""
-    found = {}
-    for path in map(Path, named):
+    digests = {}
+    for path in map(Path, names):
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
         if path.suffix == ".py" and path.is_file():
             inside = list(imported_files(path))
         for file in inside:
             try:
-                found[str(file)] = file_digest(file)
+                digests[str(file)] = file_digest(file)
             except OSError as error:
                 raise RunError(f"{file}: cannot be read: {error.strerror}") from None
-    return found
+    return digests
 
 
 def _check_metrics(study: Study, policies: Sequence[Mapping[str, Any]]) -> None:

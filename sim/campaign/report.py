@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from sortie.scenarios.report_text import NONE, number, prefixed, table
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
-from sortie.sim.campaign.rows import CampaignRows, is_accuracy, judged, read_rows
+from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.statistics import Estimate, Floats, Paired, estimate, paired
 from sortie.sim.campaign.store import CampaignTable
@@ -59,8 +59,8 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
         f"{len(plan.policies)} policies on the same draws; {failed} failed. Base scenario `{plan.campaign.base}`, "
         f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )
-    if (asked := plan.campaign.stop_when) is not None and _stopped(rows):
-        yield f"`stop_when` ended it: the interval of {asked.metric} is narrow enough."
+    if (stop := plan.campaign.stop_when) is not None and _stopped(rows):
+        yield f"`stop_when` ended it: the interval of {stop.metric} is narrow enough."
     if left := rows.all.num_rows - rows.table.num_rows:
         yield f"{left} of the runs are left out of all that follows: their {plan.unit} is not finished at every grid point."
     yield from _lost(rows)
@@ -116,7 +116,7 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
 
 def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
     valued = with_values(rows)
-    metrics = judged(valued) or valued[:1]
+    metrics = winner_metrics(valued) or valued[:1]
     if not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## By varied field\n"
@@ -153,36 +153,36 @@ def _pareto(rows: CampaignRows, picture: bool) -> Iterator[str]:
 
 
 def _sensitivity(rows: CampaignRows) -> Iterator[str]:
-    found = [
+    results = [
         s
         for metric in rows.plan.campaign.metrics
         for p in range(len(rows.plan.policies))
         if (s := sensitivity(rows, metric, p)) is not None
     ]
-    if not found:
+    if not results:
         return
-    method = found[0].method
+    method = results[0].method
     yield f"\n## Sensitivity\n\n{MEANING[method]}\n"
     if method == "other":
-        if words := [f for f in rows.plan.campaign.vary if f not in found[0].fields]:
-            yield f"Fields of text have no ranks and are left out: {', '.join(words)}.\n"
+        if texts := [f for f in rows.plan.campaign.vary if f not in results[0].fields]:
+            yield f"Fields of text have no ranks and are left out: {', '.join(texts)}.\n"
         yield from table(
-            ("metric", "policy", *found[0].fields),
-            ((s.metric, s.policy, *(number(v, "+.2f") for v in s.figures[:, 0])) for s in found),
+            ("metric", "policy", *results[0].fields),
+            ((s.metric, s.policy, *(number(v, "+.2f") for v in s.figures[:, 0])) for s in results),
         )
         return
     yield from table(
         ("metric", "policy", "field", *COLUMNS[method]),
         (
             (s.metric, s.policy, field, *(prefixed(v)[0] for v in row))
-            for s in found
+            for s in results
             for field, row in zip(s.fields, s.figures.tolist(), strict=True)
         ),
     )
 
 
 def _winners(rows: CampaignRows) -> Iterator[str]:
-    metrics = judged(with_values(rows))
+    metrics = winner_metrics(with_values(rows))
     if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## Where the winner changes\n"
@@ -194,10 +194,10 @@ def _winners(rows: CampaignRows) -> Iterator[str]:
         for c in other:
             sure = "surely" if c.sure else "not surely"
             yield f"- {c.field} {c.part}: {c.winner}, {sure}: {_interval(c.gain, signed=True)} over {best}"
-        if (found := rule(rows, metric)) is not None:
+        if (best_rule := rule(rows, metric)) is not None:
             yield (
-                f"\nBest one-threshold rule: {found.field} below {found.threshold:.3g} → {found.below}, above → "
-                f"{found.above}. Rules found on one half of the {rows.plan.unit}s gained {_interval(found.gain, signed=True)} over "
+                f"\nBest one-threshold rule: {best_rule.field} below {best_rule.threshold:.3g} → {best_rule.below}, above → "
+                f"{best_rule.above}. Rules found on one half of the {rows.plan.unit}s gained {_interval(best_rule.gain, signed=True)} over "
                 "the best fixed policy on the other half."
             )
     yield "\nIntervals of parts are widened for all parts looked at (Bonferroni)."
@@ -252,8 +252,8 @@ def _stopped(rows: CampaignRows) -> bool:
 
 
 def _mean(rows: CampaignRows, values: Floats) -> str:
-    found = estimate(values)
-    return _interval(found) if _sampled(rows) else prefixed(found.mean)[0]
+    result = estimate(values)
+    return _interval(result) if _sampled(rows) else prefixed(result.mean)[0]
 
 
 def _difference(compared: Paired) -> str:

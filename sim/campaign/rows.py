@@ -67,10 +67,10 @@ class CampaignRows:
         values = self.values(metric)
         mask = np.ones(len(values), bool) if mask is None else mask
         use = mask & ~np.isnan(values)
-        told = self._count(use)
+        counts = self._count(use)
         with np.errstate(invalid="ignore"):
-            of_points = self._count(use, values) / told
-            means = np.nansum(of_points, axis=1) / (told > 0).sum(axis=1)
+            of_points = self._count(use, values) / counts
+            means = np.nansum(of_points, axis=1) / (counts > 0).sum(axis=1)
         means[self.lost(mask).any(axis=1)] = math.nan
         return np.asarray(means[~np.isnan(means).all(axis=1)])
 
@@ -168,6 +168,6 @@ def find_row(folder: Path, run: int) -> tuple[CampaignPlan, dict[str, Any] | Non
         return store.plan, store.row(run)
 
 
-def judged(metrics: Sequence[str]) -> list[str]:
-    """The metrics by which a winner is told: accuracies, or the first one of which it is known what is better."""
+def winner_metrics(metrics: Sequence[str]) -> list[str]:
+    """The metrics that decide a winner: accuracies, or else the first metric with a known better direction."""
     return [m for m in metrics if is_accuracy(m)] or [m for m in metrics if sign(m)][:1]

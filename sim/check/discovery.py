@@ -22,10 +22,10 @@ def scenario_files(place: str | Path) -> list[str]:
     folder = Path(place)
     if str(place) in library() or not folder.is_dir():
         return [str(place)]
-    found = sorted(str(path) for path in folder.rglob("*.y*ml") if is_scenario(path))
-    if not found:
+    files = sorted(str(path) for path in folder.rglob("*.y*ml") if is_scenario(path))
+    if not files:
         raise RunError(f"{folder}: no scenario below it expects anything")
-    return found
+    return files
 
 
 def is_scenario(path: Path) -> bool:

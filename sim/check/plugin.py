@@ -30,7 +30,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Both options at once would write the outcome of another sortie than the scenario's."""
+    """Refuse both options together: they would write the outcome of a changed scenario as its golden outcome."""
     if config.getoption("sortie_update") and config.getoption("sortie_set"):
         from sortie.sim.check.checking import ensure_own
         from sortie.sim.folders import RunError
@@ -98,7 +98,7 @@ class ScenarioItem(pytest.Item):
         self.number = number
 
     def runtest(self) -> None:
-        """Fly if nobody has, and look at the verdict."""
+        """Fly the scenario if this is its first test, and raise where the verdict is a failure."""
         assert isinstance(self.parent, ScenarioFile)  # noqa: S101
         checked = self.parent.checked()
         if self.number >= len(checked.verdicts):  # the golden outcome
@@ -110,7 +110,7 @@ class ScenarioItem(pytest.Item):
             raise ExpectationFailed(verdict, checked.replay(verdict))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """An expectation in its own words; what a user can mend in one line."""
+        """A failed expectation in words; an error that the user can correct in one line."""
         if isinstance(excinfo.value, ExpectationFailed):
             return excinfo.value.in_words()
         if isinstance(excinfo.value, ValueError):  # scenarios, policies and files tell what is wrong in one line
@@ -118,7 +118,7 @@ class ScenarioItem(pytest.Item):
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where the test stands."""
+        """The test's file and name."""
         return self.path, None, f"{self.path.name}: {self.name}"
 
 
@@ -130,7 +130,13 @@ class ExpectationFailed(AssertionError):
         self.verdict, self.replay = verdict, replay
 
     def in_words(self) -> str:
-        """Expected, got, why, and how to see it."""
+        """The expected and the actual value, the reason, and the command that shows it."""
         v = self.verdict
-        lines = {"expected": v.expected, "got": v.got, "because": v.because, "the record": v.why, "see it": self.replay}
+        lines = {
+            "expected": v.expected,
+            "got": v.got,
+            "because": v.because,
+            "the record": v.explanation,
+            "see it": self.replay,
+        }
         return "\n".join(f"{name:>10}  {text}" for name, text in lines.items() if text)

@@ -176,7 +176,7 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for column in ("", "expected", "got", "because"):
         table.add_column(column)
     for v in verdicts:
-        because = escape(v.because) + (f"\n[dim]the record: {escape(v.why)}[/dim]" if v.why else "")
+        because = escape(v.because) + (f"\n[dim]the record: {escape(v.explanation)}[/dim]" if v.explanation else "")
         verdict = "[green]ok[/green]" if v.holds else "[red]FAILED[/red]"
         table.add_row(verdict, escape(v.expected), escape(v.got), because)
     return table

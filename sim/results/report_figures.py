@@ -155,9 +155,9 @@ def _edges(record: SortieRecord) -> Floats:
 
 def _accuracy(axes: Axes, record: SortieRecord) -> None:
     for mission, label, ink in ((False, "full scene", "#2f6fd0"), (True, "mission disc", MISSION)):
-        found = matched(record, mission=mission)
-        t_s = np.array([t for t, _ in found])
-        frames = list(found.values())
+        fusions = matched(record, mission=mission)
+        t_s = np.array([t for t, _ in fusions])
+        frames = list(fusions.values())
         points = []
         for end_s in _edges(record)[1:]:
             within = [frames[k] for k in np.flatnonzero((t_s >= end_s - WINDOW_S) & (t_s < end_s))]

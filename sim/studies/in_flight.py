@@ -80,12 +80,14 @@ def flights(
             if progress is not None:
                 progress(f"{name} by both detectors", flown, count)
             there = _in_town(scenario, town, rate_hz)
-            found = [both_matched(run_sortie(there, None, contexts.seeds[0] + town, detector_of=make)) for make in both]
+            matches = [
+                both_matched(run_sortie(there, None, contexts.seeds[0] + town, detector_of=make)) for make in both
+            ]
             flown += 1
             for region in REGIONS:
                 theirs, ours = matched.setdefault((policy, region), ([], []))
-                theirs += found[0][region].values()
-                ours += found[1][region].values()
+                theirs += matches[0][region].values()
+                ours += matches[1][region].values()
         for (policy, region), (theirs, ours) in matched.items():
             torch = average_precision(theirs)
             if not np.isnan(torch):  # there is such a region, and there are cars in it
@@ -116,9 +118,9 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
     last: list[tuple[object, Detector]] = []
 
     def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-        asked = scene.made_of, config, seed, replication
-        if not last or last[0][0] != asked:
-            last[:] = [(asked, TorchDetector(scene, config, seed, weights, replication))]
+        key = scene.made_of, config, seed, replication
+        if not last or last[0][0] != key:
+            last[:] = [(key, TorchDetector(scene, config, seed, weights, replication))]
         return BothDetectors(last[0][1], ours(scene, config, seed, replication))
 
     return make

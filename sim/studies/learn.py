@@ -138,7 +138,7 @@ def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
 
 def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[float, float, int]]:
     """AP of an arm over the first by phase and budget: mean, its standard error, and how many contexts."""
-    found: dict[tuple[str, float], tuple[float, float, int]] = {}
+    gains: dict[tuple[str, float], tuple[float, float, int]] = {}
     for phase in ("search", "track"):
         for rho in BUDGETS:
             gained = np.array(
@@ -149,8 +149,8 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
                 ]
             )
             if len(gained):
-                found[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
-    return found
+                gains[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
+    return gains
 
 
 def thresholds(lessons: list[Lesson]) -> dict[str, float]:

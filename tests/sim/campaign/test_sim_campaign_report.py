@@ -18,7 +18,7 @@ from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import CampaignRows, find_row, judged, read_rows, sign
+from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, sign, winner_metrics
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
@@ -278,9 +278,9 @@ def test_what_is_better_of_a_metric(metric: str, better: int) -> None:
 
 
 def test_a_winner_is_told_by_what_is_known_to_be_better() -> None:
-    assert judged(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
-    assert judged(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
-    assert judged(["policies.changes"]) == []
+    assert winner_metrics(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
+    assert winner_metrics(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
+    assert winner_metrics(["policies.changes"]) == []
 
 
 def test_figures_of_an_interval_share_their_prefix() -> None:

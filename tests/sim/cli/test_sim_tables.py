@@ -39,7 +39,9 @@ def test_brackets_in_a_policys_reason_are_brackets() -> None:
 
 
 def test_brackets_in_an_expectation_are_brackets() -> None:
-    verdict = Verdict(f"expected {REASON}", f"got {REASON}", False, f"because {REASON}", why=f"the record {REASON}")
+    verdict = Verdict(
+        f"expected {REASON}", f"got {REASON}", False, f"because {REASON}", explanation=f"the record {REASON}"
+    )
     said = printed(verdict_table("mine", [verdict]))
     for text in (f"expected {REASON}", f"got {REASON}", f"because {REASON}", f"the record {REASON}"):
         assert text in said
