@@ -1,4 +1,6 @@
-"""The bird's-eye grids: level, aligned with the drone's heading, the drone in the middle. Free of torch.
+"""The bird's-eye grids, the cameras' view angles, and the change between world and drone frames. Free of torch.
+
+A grid is level and aligned with the drone's heading, with the drone in the middle.
 
 x points forward along rows, y left along columns, row 0 the rearmost and column 0 the rightmost. Three
 resolutions cover the same square: the image that the encoder sees, the cells that are exchanged (UAV3D's

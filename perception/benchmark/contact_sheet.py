@@ -1,4 +1,4 @@
-"""A frame of the benchmark on one page: what five drones saw, what the lift makes of it, and what was there."""
+"""A frame of the benchmark on one page: five drones' views, their bird's-eye images, and the cars."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SEEN_COLOUR, PEER_COLOUR, HIDDEN_COLOUR = "#ffd23f", "#4cc9f0", "#ff3b5c"
 
 
-def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
+def draw(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
     """A row of views for each drone; below, a bird's-eye image for each with the cars in its square.
 
     Yellow: the drone sees it; blue: only another does; red: none. By straight lines (`visibility.py`), not by a network.
@@ -53,16 +53,16 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
         ax = axes[DRONES, d]
         # row 0 is the rearmost, column 0 the rightmost: shown with forward up and left to the left
         ax.imshow(ground[d, :3].transpose(1, 2, 0)[::-1, ::-1], extent=(half, -half, -half, half))
-        asked = inside(capture, cars, half)
+        counted = inside(capture, cars, half)
         c, s = np.cos(capture.true_yaw_rad), np.sin(capture.true_yaw_rad)
-        for k in np.flatnonzero(asked):
+        for k in np.flatnonzero(counted):
             corners = _corners(cars.length_m[k], cars.width_m[k], cars.yaw_rad[k])
             corners += (cars.x_m[k] - capture.position_m[0], cars.y_m[k] - capture.position_m[1])
             local = corners @ np.array([[c, -s], [s, c]])  # forward, left
             colour = SEEN_COLOUR if seen[d, k] else PEER_COLOUR if seen[:, k].any() else HIDDEN_COLOUR
             ax.add_patch(Polygon(local[:, ::-1], closed=True, fill=False, edgecolor=colour, linewidth=0.9))
         others = seen.any(axis=0)
-        counts = f"drone {d}: {asked.sum()} cars: sees {(asked & seen[d]).sum()}, fleet {(asked & others).sum()}"
+        counts = f"drone {d}: {counted.sum()} cars: sees {(counted & seen[d]).sum()}, fleet {(counted & others).sum()}"
         ax.set_title(counts, fontsize=9)
         ax.set_xlim(half, -half)
         ax.set_ylim(-half, half)

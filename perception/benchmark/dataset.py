@@ -70,11 +70,11 @@ class Benchmark:
         if data["format"] != FORMAT:
             raise BenchmarkError(f"{path}: format is {data['format']}, must be {FORMAT}: make it anew")
         try:
-            told = data["benchmark"]
+            stored = data["benchmark"]
             known = {f.name for f in fields(Difficulty)}
-            if set(told["difficulty"]) != known:
-                raise ValueError(f"difficulty has {sorted(set(told['difficulty']) ^ known)} too many or too few")
-            bench = cls(told["seed"], _difficulty(told["difficulty"]), Geometry(**told["geometry"]))
+            if set(stored["difficulty"]) != known:
+                raise ValueError(f"difficulty has {sorted(set(stored['difficulty']) ^ known)} too many or too few")
+            bench = cls(stored["seed"], _difficulty(stored["difficulty"]), Geometry(**stored["geometry"]))
         except (KeyError, TypeError, ValueError) as error:
             raise BenchmarkError(f"{path}: cannot be understood: {error}") from error
         if bench.key() != data["key"]:
@@ -86,7 +86,7 @@ class Benchmark:
         return root / f"seed{self.seed}-{self.difficulty.density}-{self.geometry.half_extent_m:g}m-{self.key()}"
 
 
-def _difficulty(told: dict[str, Any]) -> Difficulty:
+def _difficulty(stored: dict[str, Any]) -> Difficulty:
     """From JSON, which knows lists but no tuples."""
 
     def plain(value: Any) -> Any:
@@ -94,7 +94,7 @@ def _difficulty(told: dict[str, Any]) -> Difficulty:
             return Layout(**{k: plain(v) for k, v in value.items()})
         return tuple(value) if isinstance(value, list) else value
 
-    return Difficulty(**{k: plain(v) for k, v in told.items()})
+    return Difficulty(**{k: plain(v) for k, v in stored.items()})
 
 
 def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> Path:

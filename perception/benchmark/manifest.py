@@ -1,4 +1,4 @@
-"""What a benchmark's files are: `manifest.json` beside the splits, with every parameter, every scene, and hashes of content.
+"""`manifest.json` of a benchmark: every parameter, every scene, and hashes of the files' content.
 
 Hashes are of arrays, not of files, so that another zip library does not make the same data look different. Free of torch.
 """
@@ -26,7 +26,7 @@ COLUMNS = ("images", "true_pose", "est_pose", "cars")
 
 
 class BenchmarkError(SortieError):
-    """A benchmark on disk is missing, broken, or not what it says; the message names the file."""
+    """A benchmark on disk is missing, broken or changed; the message names the file."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -100,8 +100,8 @@ def add(
     part.replace(folder / MANIFEST)
 
 
-def complaints(folder: Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """What is wrong with a benchmark's files, a line each that names the file; empty where all is as the manifest says.
+def problems(folder: Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
+    """The problems of a benchmark's files, one line each that names the file; empty where all agree with the manifest.
 
     Raises:
         BenchmarkError: no readable manifest.

@@ -1,4 +1,4 @@
-"""What is in scene k of a split, and where the fleet is in each of its frames: draws by name, nothing rendered."""
+"""Draw scene k of a split and the fleet's poses in each of its frames; nothing is rendered."""
 
 from __future__ import annotations
 

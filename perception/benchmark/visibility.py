@@ -1,7 +1,7 @@
 """Who can see which car, by geometry: straight lines from a drone to points on roofs, past houses and trees.
 
 Houses are boxes and crowns are domes, in closed form: nothing is rasterised, and no code is shared with the renderer
-but the cameras' axes. It says how hard a frame is before any network looks: a car that no drone sees is still asked for by AP.
+but the cameras' axes. It measures how hard a frame is without any network. A car that no drone sees still counts for AP.
 """
 
 from __future__ import annotations

@@ -110,8 +110,8 @@ def measure(
         ValueError: weights that are missing or do not fit.
     """
     rows = moves()
-    told = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
-    mark = CarNetInstrument.load(weights).fingerprint + json.dumps(told, sort_keys=True)
+    setup = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
+    mark = CarNetInstrument.load(weights).fingerprint + json.dumps(setup, sort_keys=True)
     folder = store / hashlib.blake2b(mark.encode(), digest_size=6).hexdigest()
     paths = [folder / f"scene_{k}.npz" for k in range(scenes)]
     todo = [k for k, path in enumerate(paths) if not path.exists()]

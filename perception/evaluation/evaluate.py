@@ -1,7 +1,7 @@
-"""Conditions over frames: what each ego finds under each way of sharing, matched to what was there. Free of torch.
+"""Evaluate conditions over frames: each ego's boxes under each way of sharing, matched to ground truth. Free of torch.
 
 Scores are kept down to a low floor, and a threshold τ is applied afterwards (`Evaluation.at`): suppression and
-matching go best first, so what a box below τ does concerns boxes below τ alone.
+matching go best first, so a box below τ affects only boxes below τ.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The paper's data figure of one frame by matplotlib: camera views above, below them truth and detections, and the shared cells."""
+"""The paper's data figure of one frame by matplotlib: camera views, ground truth and detections, and the shared cells."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an evaluation found: matched detections per ego and frame under every condition; to and from Parquet. Free of torch."""
+"""The results of an evaluation: matched detections per ego and frame under every condition; Parquet. Free of torch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FLOOR = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the numbers depend on beside the instrument, the frames and the condition."""
+    """Settings that the results depend on, beside instrument, frames and condition."""
 
     egos: int = 5
     """The first so many drones of a frame are egos."""
@@ -245,7 +245,7 @@ def _from_table(table: pa.Table) -> dict[str, FrameResult]:
         units = frame.units.setdefault((condition, region), [])
         units.append(Matched(score[here], hit[here], truths))
         cost = frame.cost.setdefault(condition, [])
-        if len(cost) == ego:  # said once for each region
+        if len(cost) == ego:  # repeated for each region
             cost.append((cells, payload, index))
     return out
 

@@ -1,4 +1,4 @@
-"""What is measured for a claim, as data, and how it is worked out from bootstrapped APs. Pure.
+"""The measures that claims refer to, and how they follow from bootstrapped APs. Pure.
 
 All of a table's figures come from one bootstrap: the same resampled frames for every condition, so that any
 difference is paired and any arithmetic of APs has its interval by doing it to every draw.
@@ -288,7 +288,7 @@ class UnequalBytes:
 
 @dataclass(frozen=True, slots=True)
 class Elsewhere:
-    """Measured outside this room, under this name."""
+    """A quantity measured outside this room, under this name."""
 
     name: str
 
@@ -303,7 +303,7 @@ Measure = Accuracy | Counted | Elsewhere
 
 
 def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence") -> Sharing:
-    """A claim's condition under another instrument; where every cell is sent, or none asked for, it is the same."""
+    """A claim's condition under another instrument; unchanged where every cell is sent, or none."""
     everything = condition.peers == "none" or (condition.rule == "all" and condition.rho >= 1.0)
     return condition if everything else replace(condition, unsent=unsent, cells_by=cells_by)
 

@@ -21,7 +21,7 @@ from sortie.perception.scene.render import Renderer
 def measure(
     instrument: Instrument,
     frames: FleetFrames,
-    asked: TableSettings,
+    settings: TableSettings,
     *,
     store: Path | None = None,
     workers: int = 1,
@@ -35,10 +35,10 @@ def measure(
         workers: frames worked on side by side; the numbers do not depend on it.
         progress: called with frames done and frames in all.
     """
-    every = dict.fromkeys(under(c, unsent, asked.cells_by) for unsent in asked.unsent for c in conditions())
+    every = dict.fromkeys(under(c, unsent, settings.cells_by) for unsent in settings.unsent for c in conditions())
     regions: tuple[Region, ...] = ("full", "mission", "ego")
     found = evaluate(instrument, frames, tuple(every), regions=regions, store=store, workers=workers, progress=progress)
-    return TableResults(found, asked)
+    return TableResults(found, settings)
 
 
 def bench_frames(

@@ -1,4 +1,4 @@
-"""One frame as the paper's data figure shows it: what was there, what an ego found, which cells its peers shared at two budgets.
+"""The content of the paper's data figure for one frame: ground truth, detections, and the cells shared at two budgets.
 
 Free of torch; drawn by `figure_frame.draw` and, in Rerun, by the simulator's playback.
 """
@@ -24,7 +24,7 @@ PAPER_BUDGETS = (0.25, 0.02)
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What there is to draw of one frame and ego; world frame ENU, metres."""
+    """The data to draw for one frame and ego; world frame ENU, metres."""
 
     name: str
     ego: int
@@ -68,8 +68,8 @@ def picture(
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)
     view, geometry = instrument.look(frames, f), instrument.geometry
-    asked = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
-    given = [e for e, _ in exchanges(view, frames, f, key, asked, settings, geometry, target) if e.ego == ego]
+    conditions = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
+    given = [e for e, _ in exchanges(view, frames, f, key, conditions, settings, geometry, target) if e.ego == ego]
     found = Boxes.placed(view.detect(given[:1], tau)[0], tuple(frames.est_pose[f, ego].tolist()))
     return Picture(
         name=f"scene {key[0]}, frame {f}",

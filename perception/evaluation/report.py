@@ -69,7 +69,7 @@ def report(
 ) -> str:
     """The whole report; `figures` are file names beside it and what they show, `varied` claims at other settings."""
     shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
-    lines = ["# The paper's Evaluation, claim by claim", "", _made(facts), ""]
+    lines = ["# The paper's Evaluation, claim by claim", "", _provenance(facts), ""]
     lines += [f"- {INSTRUMENTS[i]}: {tally(r for r in rows if r.instrument == i)}." for i in shown]
     lines += [f"- measured on a flown sortie: {tally(r for r in rows if not r.instrument)}.", "", _RULE, ""]
     for name, caption in figures:
@@ -84,7 +84,7 @@ def report(
 def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
     """The README's section: the headline claims, between its markers."""
     chosen = [r for r in rows if r.headline]
-    head = [BEGIN, "", _made(facts), ""]
+    head = [BEGIN, "", _provenance(facts), ""]
     for i, name in INSTRUMENTS.items():
         if its := [r for r in rows if r.instrument == i]:
             head.append(f"- {name}: {tally(its)}.")
@@ -110,10 +110,10 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
 
 
 _RULE = """\
-**How verdicts are reached** (`perception/evaluation/verdict.py`, which tells what was fixed when). A difference is
+**How verdicts are reached** (`perception/evaluation/verdict.py`, which says what was fixed when). A difference is
 significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
 or in neither, or not in the paper and here wholly within half a point of zero; *opposite*: significant in both, with
-other signs; *not reproduced*: significant in one alone. The size is told apart: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
+other signs; *not reproduced*: significant in one alone. The size is reported separately: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
 That *most* of the gain is kept asks for an interval above one half. Absolute APs are not comparable between benchmarks, as the paper says itself. Counted bytes have to round to the
 paper's print; times and rates have to lie within half an order of magnitude, or beyond it on the side that makes the
 claim stronger. Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of
@@ -175,7 +175,7 @@ def _by_claim(rows: Iterable[ClaimRow]) -> list[dict[str, ClaimRow]]:
     return list(claims.values())
 
 
-def _made(facts: Mapping[str, Any]) -> str:
+def _provenance(facts: Mapping[str, Any]) -> str:
     """One paragraph: on what, by what, how exactly."""
     return (
         f"Made by `{facts['command']}`: {facts['frames']} frames of {facts['scenes']} scenes of the benchmark's test split "

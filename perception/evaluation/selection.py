@@ -42,7 +42,7 @@ def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] =
     """The peers that share with `ego`, most overlapping first.
 
     Args:
-        condition: its `peers` is asked.
+        condition: gives the rule for `peers`.
         ego: the receiver.
         overlap: [d] of each drone's footprint with the ego's; equal ones go by the lower id.
         key: names the frame, so that random peers are its own whatever else is evaluated.

@@ -99,7 +99,7 @@ class Window:
         self._stamp(scene.parked_cars)
         self.coarse = _grown(_blocks(self.height, COARSE), 1)
         self.far = _grown(_blocks(self.coarse, FAR // COARSE), FAR_REACH)
-        """Of scenery alone: it is asked above all cars."""
+        """For scenery alone, as rays are followed above all cars."""
         self.top_m = float(self.height.max())
 
     def pixel(self, x_m: FloatOrArray, y_m: FloatOrArray) -> tuple[FloatOrArray, FloatOrArray]:

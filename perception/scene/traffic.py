@@ -2,7 +2,7 @@
 
 Every lane of every road carries a stream of cars that all drive at the lane's own speed, so that none
 overtakes; the stream repeats every 1,280 m. Position along a lane is closed-form in t: nothing is
-stepped, and any moment may be asked for in any order. Cars drive straight over crossings without
+stepped, and moments may be computed in any order. Cars drive straight over crossings without
 giving way, so two crossing cars may touch there for a moment (about one crossing in fifty at 10 cars/km).
 """
 

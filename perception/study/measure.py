@@ -1,4 +1,4 @@
-"""What the study asks of an evaluation: the fall below a single drone, the flip, the oracle's gain. Free of torch."""
+"""What the study measures: the fall below a single drone, the flip, the oracle's gain. Free of torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study told by rule: what each network shows of the flip, as Markdown, and the README's sentences. Pure text."""
+"""The study's report, written by rule from its rows: Markdown, and the README's sentences. Pure text."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FixedSettings:
 
 
 class StudyRows:
-    """Rows of the study, asked for one at a time."""
+    """Rows of the study, looked up one at a time."""
 
     def __init__(self, rows: Iterable[StudyRow]) -> None:
         self.rows = tuple(rows)
@@ -76,7 +76,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
         if table := _table(plan, found, "network", others):
             lines += [f"## {title}", "", *table, ""]
     lines += ["## The variants", ""]
-    lines += [f"- `{v.name}` (seeds {', '.join(map(str, v.seeds))}): {v.why}" for v in plan.variants]
+    lines += [f"- `{v.name}` (seeds {', '.join(map(str, v.seeds))}): {v.reason}" for v in plan.variants]
     if missing:
         lines += [
             "",
@@ -125,7 +125,7 @@ def on_frames(rows: Sequence[StudyRow]) -> str:
 
 
 def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
-    """What the rows say of the paper's observation and of each part of the hypothesis."""
+    """What the rows show about the paper's observation and about each part of the hypothesis."""
     m, networks = plan.measured, found.networks()
     first = plan.variants[0].name
     seeds = [s for v, s in networks if v == first]

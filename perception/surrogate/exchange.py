@@ -1,4 +1,4 @@
-"""What an exchange brings to each car of an ego: who sent the cell that holds it, how sure they were, how far off it lies. Free of torch."""
+"""What an exchange brings for each car of an ego: who sent its cell, with which confidence, and how misplaced. Free of torch."""
 
 from __future__ import annotations
 
@@ -250,8 +250,8 @@ def alarm_covariates(
     exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], scene: Scene
 ) -> NDArray[np.float32]:
     """What the number of false alarms depends on, [m, 18] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
-    light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was asked
-    for, how many cars move, how old the maps are, and both multiplied: a moving car has a second box where an older map shows
+    light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was requested,
+     how many cars move, how old the maps are, and both multiplied: a moving car has a second box where an older map shows
     it."""
     m = len(exchange.ego)
     cars = np.diff(looks.first)[exchange.ego]

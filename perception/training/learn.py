@@ -1,4 +1,4 @@
-"""What a training step is: batches of frames, what the head should say about them, losses and gradients."""
+"""One training step: batches of frames, targets for the head, losses and gradients."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64], geometry: G
 def targets(
     cars: NDArray[np.float64], geometry: Geometry = FULL
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """What the head should say: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
+    """The head's targets: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
 
-    Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are asked for on the 3 × 3 cells around it.
+    Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are learned on the 3 × 3 cells around it.
     """
     heat = np.zeros((HEAD_PX, HEAD_PX), np.float32)
     at = (cars[:, :2] + geometry.half_extent_m) / geometry.head_m - 0.5

@@ -1,4 +1,4 @@
-"""What weights are worth on the validation split, and the card that says so."""
+"""The AP of weights on the validation split, and their card."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def publish(
 
 
 def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
-    """The model card, Markdown, from what the weights file says of itself."""
+    """The model card, Markdown, from the facts in the weights file."""
     bench = facts["benchmark"]
     made = "\n".join(
         f"| {k} | `{command(r, model, bench['seed'], name)}` | {r['done']} | {r['loss']:.3f} | {r['minutes']:.0f} |"

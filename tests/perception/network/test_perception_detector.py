@@ -12,7 +12,7 @@ from places import HELPERS
 
 from sortie.perception.detectors import make_detector
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import told
+from sortie.perception.joining import source_of
 from sortie.perception.metrics.ap import match
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene import render
@@ -134,7 +134,7 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
     assert len(joined) >= len(single)
     assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
-    tracks = told(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
+    tracks = source_of(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
     assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
 
