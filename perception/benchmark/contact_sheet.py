@@ -11,6 +11,7 @@ from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
 from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
+from sortie.perception.files import replacing
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import CAMERAS, Renderer
 
@@ -80,10 +81,8 @@ def draw(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """As a PNG, under a temporary name first."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.stem}.part.png")
-    figure.savefig(part, dpi=110)
-    part.replace(path)
+    with replacing(path) as part:
+        figure.savefig(part, format="png", dpi=110)
 
 
 def _corners(length: float, width: float, yaw: float) -> np.ndarray:

@@ -21,6 +21,7 @@ from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.difficulty import Difficulty, Layout, Split
 from sortie.perception.benchmark.manifest import COLUMNS, BenchmarkError
 from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
+from sortie.perception.files import replacing
 from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import Renderer
@@ -117,10 +118,8 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
     table = np.full((frames, max(len(c) for c in cars), 5), np.nan)
     for row, c in zip(table, cars, strict=True):
         row[: len(c)] = c
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-    np.savez(part, images=images, true_pose=true_pose, est_pose=est_pose, cars=table)
-    part.replace(path)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, images=images, true_pose=true_pose, est_pose=est_pose, cars=table)
     return path
 
 

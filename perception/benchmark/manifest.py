@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.difficulty import Split
+from sortie.perception.files import replacing
 from sortie.scenarios.errors import SortieError
 
 MANIFEST = "manifest.json"
@@ -95,9 +95,8 @@ def add(
         "made_with": {name: version(name) for name in ("sortie-sim", "numpy", "torch")},
         "splits": {s: splits[s] for s in known},
     }
-    part = folder / f".{MANIFEST}.{os.getpid()}.part"
-    part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
-    part.replace(folder / MANIFEST)
+    with replacing(folder / MANIFEST) as part:
+        part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
 
 
 def problems(folder: Path, progress: Callable[[int, int], None] | None = None) -> list[str]:

@@ -26,6 +26,7 @@ from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.files import replacing
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.bev import lift
@@ -160,10 +161,8 @@ def evaluate_scene(weights: Path, index: int, rows: Sequence[ParameterShift], pa
             for c, condition in enumerate(CONDITIONS):
                 for e, unit in enumerate(result.matched(condition)):
                     arrays |= {f"{r}.{c}.{e}.{f}": getattr(unit, f) for f in Matched.__slots__}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-    np.savez(part, **arrays)
-    part.replace(path)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def _read(path: Path, rows: int) -> list[list[list[Matched]]]:
@@ -213,6 +212,5 @@ def write_table(readme: Path, text: str) -> None:
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise ValueError(f"{readme}: {BEGIN} and {END} are missing, the table goes between them")
-    part = readme.with_name(f".{readme.name}.part")
-    part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")
-    part.replace(readme)
+    with replacing(readme) as part:
+        part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.files import replacing
 from sortie.perception.joining import NMS_IOU
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, average_precision
 
@@ -251,7 +252,5 @@ def _from_table(table: pa.Table) -> dict[str, FrameResult]:
 
 
 def _write(table: pa.Table, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    pq.write_table(table, part, compression="zstd")
-    part.replace(path)
+    with replacing(path) as part:
+        pq.write_table(table, part, compression="zstd")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.files import replacing
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
@@ -94,9 +95,8 @@ def calibrate(
     verdict = judge(parameters, judged, seed)
     parameters = replace(parameters, card={**facts, **verdict.facts()})
     save(out, parameters)
-    part = out.with_suffix(".md.part")
-    part.write_text(card(parameters, verdict))
-    part.replace(out.with_suffix(".md"))
+    with replacing(out.with_suffix(".md")) as part:
+        part.write_text(card(parameters, verdict))
     return parameters, verdict
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.files import replacing
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.plan import (
@@ -90,17 +90,15 @@ def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weigh
         return path
     probe = Probe(scene_model(seed, split, scene), scene_seed(seed, split, scene), weights)
     boxes = [probe.detect_job(job) for job in jobs]
-    folder.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
     joined = Boxes.join(boxes)
-    np.savez(
-        part,
-        of=np.array([seed, scene, index]),
-        count=np.array([len(b) for b in boxes]),
-        boxes=np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
-        ranks=np.stack([probe.ranks(c) for c in captures_of(jobs)]),
-    )
-    part.replace(path)
+    arrays = {
+        "of": np.array([seed, scene, index]),
+        "count": np.array([len(b) for b in boxes]),
+        "boxes": np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
+        "ranks": np.stack([probe.ranks(c) for c in captures_of(jobs)]),
+    }
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
     return path
 
 

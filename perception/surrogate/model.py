@@ -24,6 +24,7 @@ from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
 from sortie.perception.errors import InputError
+from sortie.perception.files import replacing
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
@@ -234,11 +235,9 @@ def save(path: Path, parameters: Parameters) -> None:
         for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
             tensors[f"{name}.{k}.weight"], tensors[f"{name}.{k}.bias"] = w, b
     tensors = {k: np.ascontiguousarray(v, np.float32) for k, v in tensors.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    save_file(tensors, part, metadata={"surrogate": json.dumps({"format": FORMAT, **parameters.card})})
-    part.chmod(0o644)
-    part.replace(path)
+    with replacing(path) as part:
+        save_file(tensors, part, metadata={"surrogate": json.dumps({"format": FORMAT, **parameters.card})})
+        part.chmod(0o644)  # the library makes it private
 
 
 def load(path: Path) -> Parameters:

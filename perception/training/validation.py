@@ -15,6 +15,7 @@ from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.results import TAU
+from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
@@ -81,9 +82,8 @@ def publish(
     """Write the weights with their history, and the card beside them (`<name>.md`)."""
     facts = {"runs": runs, "benchmark": of_benchmark(bench), "validation": [asdict(level) for level in levels]}
     save_weights(net, path, facts)
-    part = path.with_suffix(".md.part")
-    part.write_text(card(path.name, asdict(net.config), facts))
-    part.replace(path.with_suffix(".md"))
+    with replacing(path.with_suffix(".md")) as part:
+        part.write_text(card(path.name, asdict(net.config), facts))
 
 
 def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
