@@ -59,6 +59,8 @@ def violations(source: str, path: str) -> list[str]:
                 found.append((node, f"{room} must not import {other}"))
             if top == "sortie" and other not in MAY_IMPORT and not path.startswith("sim/cli/"):
                 found.append((node, f"{room} must not import the public API, which stands on it"))
+            if room == "radio" and name.startswith("sortie.scenarios.schema"):
+                found.append((node, "radio takes plain values, not a section of the schema"))
             if top == "tests":
                 found.append((node, f"{room} must not import tests"))
             if top in HOMES and not any(fnmatch(path, home) for home in HOMES[top]):
@@ -146,6 +148,11 @@ def test_every_package_at_the_root_is_a_room() -> None:
         ("radio/rates.py", "import sortie.fleet", "radio must not import fleet"),
         ("radio/rates.py", "from sortie.policies.contract import Disc", "radio must not import policies"),
         ("radio/rates.py", "import sortie.perception.metrics.ap as ap", "radio must not import perception"),
+        (
+            "radio/air.py",
+            "from sortie.scenarios.schema import Radio",
+            "radio takes plain values, not a section of the schema",
+        ),
         ("policies/catalogue/worked.py", "from sortie.perception import ap", "policies must not import perception"),
         ("perception/metrics/ap.py", "from sortie.radio.air import Air", "perception must not import radio"),
         ("scenarios/reading/load.py", "import sortie.policies", "scenarios must not import policies"),

@@ -25,6 +25,7 @@ from sortie.perception.types import Capture
 from sortie.policies.contract import Disc, Policy
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
@@ -107,7 +108,7 @@ def run_sortie(
     batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n, charges)
     air = Air(
         env,
-        scenario.radio,
+        AirSettings.of(scenario.radio.model_dump(exclude={"framing"})),
         motion.position_m,
         seed=seed,
         replication=replication,
