@@ -17,7 +17,7 @@ from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winne
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.statistics import Estimate, Floats, Paired, estimate, paired
 from sortie.sim.campaign.store import CampaignTable
-from sortie.sim.campaign.winners import contexts, rule, winner
+from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.folders import RunError, write_text
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
@@ -187,7 +187,7 @@ def _winners(rows: CampaignRows) -> Iterator[str]:
         return
     yield "\n## Where the winner changes\n"
     for metric in metrics:
-        best, other = winner(rows, metric), contexts(rows, metric)
+        best, other = winner(rows, metric), other_winners(rows, metric)
         yield f"\n**{metric}**: {best} has the best mean over everything."
         if not other:
             yield "It has it in every part of every varied field, too."

@@ -1,4 +1,4 @@
-"""In which contexts another policy wins: the flip, looked for in a campaign's own rows."""
+"""In which conditions another policy wins: the flip, looked for in a campaign's own rows."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def winner(rows: CampaignRows, metric: str) -> str:
     return rows.plan.policies[_first(sign(metric) * rows.by_unit(metric))]
 
 
-def contexts(rows: CampaignRows, metric: str) -> list[OtherWinner]:
+def other_winners(rows: CampaignRows, metric: str) -> list[OtherWinner]:
     """Every part of every varied field in which another policy than the overall winner has the best mean."""
     policies = rows.plan.policies
     best = policies.index(winner(rows, metric))

@@ -192,7 +192,7 @@ def test_the_plan_survives_its_json(tmp_path: Path) -> None:
             "base: base.yaml", "base: link_battery",
             "3: base: link_battery, must be a scenario, it is a campaign itself",
         ),
-        ("base: base.yaml", "base: contexts", "3: base: contexts, must be a scenario, it is a set of contexts"),
+        ("base: base.yaml", "base: conditions", "3: base: conditions, must be a scenario, it is a set of conditions"),
         (
             "fleet.formation.spacing_m:", "mission.phases.3.at_s:",
             "6: mission.phases.3: no such entry, mission.phases has 0 … 0",

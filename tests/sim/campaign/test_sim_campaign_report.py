@@ -22,7 +22,7 @@ from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, sign, wi
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
-from sortie.sim.campaign.winners import contexts, rule, winner
+from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
@@ -72,7 +72,7 @@ def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
 
     rows = rows_of(tmp_path, text, value)
     assert winner(rows, "bytes.data_sent") == "worked"
-    (found,) = contexts(rows, "bytes.data_sent")
+    (found,) = other_winners(rows, "bytes.data_sent")
     assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", True)
     assert found.part.startswith("0.2")
     made = rule(rows, "bytes.data_sent")
@@ -85,7 +85,7 @@ def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
 def test_where_nothing_flips_no_rule_gains(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     rows = rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 80}"), lambda f, p: p + rng.normal(0, 0.1))
-    assert contexts(rows, "bytes.data_sent") == []
+    assert other_winners(rows, "bytes.data_sent") == []
     made = rule(rows, "bytes.data_sent")
     assert made is None or made.gain.low <= 0
 
