@@ -34,7 +34,7 @@ from sortie.scenarios.reading.nodes import (
     plain,
     problems,
 )
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
 from sortie.scenarios.schema.conditions import ConditionSet
 
 __all__ = ["Overrides", "ScenarioError", "build", "dump", "library", "load", "loads"]
@@ -215,7 +215,16 @@ def _assigned(root: Node, key: object, new: Node, source: str) -> Node:
         raise ScenarioError(f"{source}: {key!r} is no field, must be key.path")
     if len(parts) > MAX_DEPTH:
         raise ScenarioError(f"{source}: {len(parts)} levels deep, must be at most {MAX_DEPTH}")
-    return assign(root, parts, new)
+    return assign(_without_presets(root), parts, new)
+
+
+def _without_presets(root: Node) -> Node:
+    """A preset's name above the overridden field becomes the preset's values, so that the override changes one of them."""
+    for path, section in ((("fleet", "airframe"), Airframe), (("context", "form"), DescriptorForm)):
+        node = child(child(root, path[0]) or root, path[1])
+        if node is not None and isinstance(node.value, str) and node.value in section.presets:
+            root = assign(root, path, as_node(section.presets[node.value], node.source, node.line))
+    return root
 
 
 def _first(issues: Sequence[Issue]) -> ScenarioError:

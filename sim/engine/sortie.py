@@ -138,7 +138,7 @@ def run_sortie(
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=scenario.context.trust,
         publish_every=scenario.context.publish_every,
-        form=Form(scenario.context.grid_cells, scenario.context.grid_bits, scenario.context.number_bits),
+        form=Form(**scenario.context.form.model_dump()),
     )
     audit = Audit(env, recorder)
     choreography: Choreography | None = None

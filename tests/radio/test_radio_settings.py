@@ -25,7 +25,7 @@ def test_a_section_becomes_settings() -> None:
 def test_choices_of_the_schema_are_those_of_the_settings() -> None:
     for name in ("standard", "antenna", "path_loss", "rate_control"):
         for value in Radio.model_json_schema()["properties"][name]["enum"]:
-            assert getattr(AirSettings(**{name: value}), name) == value
+            assert getattr(AirSettings(**{"bandwidth_mhz": 20, name: value}), name) == value
 
 
 @pytest.mark.parametrize(
