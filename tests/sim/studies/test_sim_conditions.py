@@ -307,5 +307,5 @@ def test_one_lesson_leaves_no_slope() -> None:
 def test_a_model_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(json.dumps({"mean": [0] * 5, "scale": [1] * 5, "weights": [[0] * 6] * 2}))
-    with pytest.raises(ValueError, match=r"must hold 3 arms of 1 \+ 5 finite weights"):
+    with pytest.raises(ValueError, match=r"must have 3 arms of 1 \+ 5 finite weights"):
         read_model(path)
