@@ -288,6 +288,36 @@ def test_what_cannot_be_read_is_told_in_a_line(tmp_path: Path) -> None:
         read_log(written(tmp_path, "bin", WHOLE["bin"][:400]))
 
 
+# --- beside the readers that others use ------------------------------------------------------------
+
+
+def as_pyulog_reads_it(path: Path) -> None:
+    from pyulog import ULog
+
+    ours, theirs = read_ulog(path.read_bytes()), ULog(str(path))
+    names = {f"{d.name}.{d.multi_id}" if d.multi_id else d.name: d for d in theirs.data_list}
+    assert set(names) == set(ours.tables) - {"PARM"}
+    for name, topic in names.items():
+        for field, values in ours.tables[name].items():
+            if values.dtype.kind in "VS":  # a type within a type, or letters
+                continue
+            columns = [f"{field}[{k}]" for k in range(values.shape[1])] if values.ndim > 1 else [field]
+            for k, column in enumerate(columns):
+                mine = values[:, k] if values.ndim > 1 else values
+                np.testing.assert_array_equal(mine, topic.data[column], err_msg=f"{name}.{column}")
+    parameters = dict(zip(*(ours.tables["PARM"][c].tolist() for c in ("Name", "Value")), strict=True))
+    assert {k.decode(): v for k, v in parameters.items()} == {k[:16]: v for k, v in theirs.initial_parameters.items()}
+
+
+def test_an_intact_ulog_is_read_as_pyulog_reads_it(tmp_path: Path) -> None:
+    as_pyulog_reads_it(written(tmp_path, "ulg", WHOLE["ulg"]))
+
+
+@needs_logs
+def test_every_topic_of_a_real_ulog_as_pyulog_reads_it() -> None:
+    as_pyulog_reads_it(LOGS / "sample_log_small.ulg")
+
+
 # --- the real ones ---------------------------------------------------------------------------------
 
 
