@@ -1,4 +1,4 @@
-"""Folders that commands write: refused before the work when they cannot be used, replaced whole when it is done."""
+"""Folders and files that commands write: checked before the work starts, replaced whole when it is done."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sortie.scenarios.errors import SortieError
 
 
 class RunError(SortieError):
-    """What a user asked of files or folders and cannot be done; the message names the path."""
+    """A file or folder that cannot be used as the user asked; the message names the path."""
 
 
 def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = ()) -> None:
@@ -173,7 +173,7 @@ def _put_between(path: Path, section: str, begin: str, end: str) -> str:
 
 
 def _ensure_place(path: Path) -> None:
-    """Refuse a path whose folder cannot be made or written to."""
+    """Refuse a path if its folder cannot be made or written to."""
     there = next(p for p in path.absolute().parents if p.exists())
     if not there.is_dir():
         raise RunError(f"{path}: cannot make its folder: {there} is a file")

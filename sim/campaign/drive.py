@@ -1,4 +1,4 @@
-"""Drive a campaign: hand out what is missing, keep what comes back, stop when enough is known."""
+"""Drive a campaign: hand out missing runs, store their results, stop when `stop_when` is reached."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Progress:
     """How far a campaign is."""
 
     finished: int
-    """Runs whose rows are on disk, those of earlier drivers too."""
+    """Runs with rows on disk, including those of earlier drivers."""
     of: int
     failed: int
     """Of those."""
@@ -107,7 +107,7 @@ def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: C
 
 
 class Stop:
-    """Whether the intervals that `stop_when` names are narrow enough; asked part by part, in their order.
+    """Whether the intervals that `stop_when` names are narrow enough; evaluated part by part, in their order.
 
     Units are what is averaged over (draws, or replications where nothing is drawn), so that replications of one draw
     do not count as independent. Intervals are Student's. Stopping at a narrow interval favours samples that look

@@ -1,4 +1,4 @@
-"""Where runs are flown: in this process, on a local cluster, or on one that is there already. One code path for all.
+"""Where runs are flown: in this process, on a local cluster, or on a cluster that is already running.
 
 An engine takes tasks as it can use them and gives results as they come; it never holds more than what is in flight.
 """
@@ -36,7 +36,7 @@ class Engine(Protocol):
     def workers(self) -> int: ...
 
     def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
-        """Results of tasks, in any order. Raises RunError where runs would not be the campaign's, or nobody flies them."""
+        """Results of tasks, in any order. Raises RunError where workers have other code or files, or where there are no workers."""
 
 
 class InProcess:
@@ -59,11 +59,11 @@ class Dask:
 
     @property
     def workers(self) -> int:
-        """Threads of all workers, each of which flies one batch at a time."""
+        """Number of worker threads; each flies one batch at a time."""
         return sum(w["nthreads"] for w in self._client.scheduler_info(n_workers=-1)["workers"].values())
 
     def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
-        """As `Engine`. A batch on which workers died again and again is flown run by run, and the run at fault told."""
+        """As `Engine`. A batch on which workers died again and again is flown run by run, and the run at fault is reported."""
         from distributed import KilledWorker, as_completed
 
         flying: dict[Any, list[Task]] = {}

@@ -1,4 +1,4 @@
-"""What a campaign flies: a pure function from its specification and a run's number to that run's task.
+"""A campaign's plan: a pure function from its specification and a run's number to that run's task.
 
 Runs are numbered so that what is averaged over comes first: draws if fields are drawn, replications if not. Within,
 grid points, replications and policies; the policies of one scene stand together, on equal seeds, so that they are
@@ -167,7 +167,7 @@ class CampaignPlan:
 
 
 def make_plan(study: Study) -> CampaignPlan:
-    """A campaign's plan; what is wrong is found before anything is flown.
+    """A campaign's plan, checked before anything is flown.
 
     Raises:
         PolicyError: an unknown policy or parameter.

@@ -1,4 +1,4 @@
-"""What a campaign came to, as Markdown with figures: told by rule from its rows, so that equal rows tell the same."""
+"""A campaign's report, Markdown with figures. Fixed rules write it, so equal rows give equal text."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ duckdb.sql("from '{folder}/runs/*.parquet'")
 
 
 def _lost(rows: CampaignRows) -> Iterator[str]:
-    """What failed runs take out of the means, and by whose fault."""
+    """Units that failed runs remove from the means, counted by policy."""
     plan, lost = rows.plan, rows.lost()
     if units := int(lost.any(axis=1).sum()):
         whose = ", ".join(f"{label} {n}" for label, n in zip(plan.policies, lost.sum(axis=0), strict=True) if n)

@@ -1,4 +1,4 @@
-"""A campaign's rows as arrays, and what they come to by unit. The table is the truth; this reads it."""
+"""A campaign's rows as arrays, and their means by unit."""
 
 from __future__ import annotations
 

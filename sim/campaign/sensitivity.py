@@ -79,7 +79,7 @@ def _numeric(rows: CampaignRows) -> tuple[str, ...]:
 
 
 def _in_order(rows: CampaignRows, metric: str, policy: int) -> tuple[Floats, NDArray[np.int64]]:
-    """A policy's values by draw, 0, 1, 2, …, replications averaged; each row's fields held against the design's."""
+    """A policy's values by draw, 0, 1, 2, …, replications averaged; each row's fields are compared with the design's."""
     plan = rows.plan
     mine = np.flatnonzero(rows.policy == policy)
     unit = rows.unit[mine]

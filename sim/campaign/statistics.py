@@ -1,4 +1,4 @@
-"""Means that are sure of so much: Student's intervals, paired differences, and what pairing saved. Pure."""
+"""Student's intervals, paired differences, and the runs that pairing saved. Pure functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In which conditions another policy wins: the flip, looked for in a campaign's own rows."""
+"""Where the winner changes in a campaign's rows: parts of fields in which another policy leads."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _first(means: Floats) -> int:
 
 
 def rule(rows: CampaignRows, metric: str) -> Rule | None:
-    """The best one-threshold rule, found on every second unit and judged on the others, and the other way round.
+    """The best one-threshold rule, fitted on every second unit and evaluated on the others, and the other way round.
 
     Returns:
         The rule found on all units, with the gain that rules found on one half had on the other; None where no field

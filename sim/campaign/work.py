@@ -1,4 +1,4 @@
-"""What a worker does: flies runs from their tasks alone. The same function on every engine.
+"""A worker flies runs from their tasks alone, with the same function on every engine.
 
 A task is the JSON text of {scenario, seed, replication, metrics, files}; nothing else reaches a run, so that its key,
 a hash over the task and the code, says everything that its row depends on.

@@ -79,7 +79,7 @@ def slug(rule: str) -> str:
 
 
 def unused(folder: Path, stem: str) -> Path:
-    """A path in the folder (made if it is missing) whose `.json` and `.yaml` are free."""
+    """A free path in the folder for a `.json` and a `.yaml` file; the folder is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [stem, *(f"{stem}_{k}" for k in range(2, 1000))]
     return next(folder / name for name in names if not (folder / f"{name}.json").exists())

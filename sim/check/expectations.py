@@ -113,7 +113,7 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
 
 
 def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
-    """The mean over replications lies within each bound with the confidence asked for: Student's one-sided limit.
+    """The mean over replications lies within each bound with the expectation's confidence: Student's one-sided limit.
 
     An expectation that the replications leave open fails; more replications may settle it.
     """

@@ -1,4 +1,4 @@
-"""The outcome of a sortie: what the record comes to, as the plain values of outcome.json.
+"""The outcome of a sortie: the values of outcome.json, computed from the record.
 
 Everything here is computed from the record's tables; the README of this room lists every field.
 """
@@ -129,7 +129,7 @@ def both_matched(record: SortieRecord) -> Both:
 
 
 class _Fusions:
-    """The scored fusions of a record from `begin_s` to `end_s`; overlaps are worked out once, whatever is asked then."""
+    """The scored fusions of a record from `begin_s` to `end_s`; overlaps are computed once for all queries."""
 
     def __init__(self, record: SortieRecord, begin_s: float, end_s: float) -> None:
         tables = record.tables
@@ -211,7 +211,7 @@ def _counts(column: pa.ChunkedArray) -> dict[str, int]:
 
 
 def _distrusted_by(trust: pa.Table) -> dict[str, int]:
-    """How many drones came to doubt each drone that anyone did."""
+    """For each doubted drone, how many drones doubted it."""
     pairs = {(r["peer"], r["drone"]) for r in trust.to_pylist() if r["trust"] < 1.0}
     return {str(peer): sum(p == peer for p, _ in pairs) for peer in sorted({p for p, _ in pairs})}
 

@@ -1,4 +1,4 @@
-"""The fields of `outcome.json` and what they mean: the reference in `outcome.md` is made of this.
+"""The fields of `outcome.json` and their meanings; `outcome.md` is made from them.
 
 A test holds `sortie.sim.results.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
 """

@@ -136,7 +136,7 @@ class SortieRecord:
 
 
 def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
-    """Feed a column's values, not its buffers, whose padding and chunking may differ."""
+    """Hash a column's values, not its buffers: their padding and chunking may differ."""
     array = column.combine_chunks()
     if pa.types.is_list(array.type):
         digest.update(np.asarray(array.value_lengths(), np.int64).tobytes())

@@ -1,4 +1,4 @@
-"""The outcome and the record for people: `outcome.md`, made of `sortie.sim.results.outcome_fields` and `sortie.sim.results.record`.
+"""Make `outcome.md`, the reference of outcome and record, from `sortie.sim.results.outcome_fields` and `.record`.
 
 `python -m sortie.sim.results.reference` writes it anew; a test holds it to the code, and the code to what a sortie gives.
 """

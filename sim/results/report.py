@@ -1,4 +1,4 @@
-"""A run as one HTML page that needs nothing else: what was flown, what came out, figures, and who decided what, and why."""
+"""A run as one self-contained HTML page: the scenario, the outcome, figures, and the decisions with their reasons."""
 
 from __future__ import annotations
 

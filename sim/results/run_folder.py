@@ -1,4 +1,4 @@
-"""The run directory: outcome.json, the record's tables as Parquet, the resolved scenario; whole or not at all."""
+"""A run's folder: outcome.json, the record's tables as Parquet, the resolved scenario; written whole or not at all."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WRITTEN = frozenset(
 
 
 def default_path(scenario: Scenario, seed: int | None, replication: int) -> Path:
-    """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it; with other settings it is told."""
+    """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it, and a line says so where the settings differ."""
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
     rep = f"-rep{replication}" if replication else ""
     return Path("runs") / f"{scenario.name}-{policy}-seed{scenario.seed if seed is None else seed}{rep}"
@@ -87,7 +87,7 @@ def in_place_of(path: Path, fingerprint: str) -> str:
 
 
 def _is_of_the_run(page: Path) -> bool:
-    """Whether a page tells the run that it lies with: it names that run's fingerprint."""
+    """Whether a page belongs to the run in its folder, by that run's fingerprint."""
     try:
         fingerprint = json.loads((page.parent / OUTCOME).read_text())["fingerprint"]
         return str(fingerprint) in page.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Policies over a set of conditions: each flown in each, at the same budget, seeds and draws; summed up in pairs."""
+"""Policies over a set of conditions: each policy flies in each, at the same budget, seeds and draws, and is compared in pairs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Summary:
     gain: tuple[float, float, float]
     """Mean AP over that of the best fixed policy, with its 95 % interval: conditions resampled in pairs; NaN for a single one."""
     of_oracle: float | None
-    """Mean AP over that of the best fixed policy of each condition; None where those found nothing."""
+    """Mean AP relative to the best fixed policy of each condition; None where those have an AP of zero."""
     data_bytes: float
     energy_j: float
     miss_rate: float

@@ -1,4 +1,4 @@
-"""The surrogate against the torch detector on what drones ask in flight: formations, ages and discs as sorties have them.
+"""The surrogate against the torch detector on fusions of flown sorties, with their formations, data ages and mission discs.
 
 A sortie is flown by the surrogate, and again with the same traffic and the torch detector's answers at every scored moment.
 """
@@ -97,7 +97,7 @@ def flights(
 
 
 def _in_town(scenario: Scenario, town: int, rate_hz: float) -> Scenario:
-    """The scenario scored at a rate, in the town of its kind whose seed lies so far on."""
+    """The scenario scored at a rate, in another town of its kind, by an offset of the seed."""
     scene = scenario.perception.scene.model_copy(update={"seed": scenario.perception.scene.seed + TOWNS_APART * town})
     perception = scenario.perception.model_copy(
         update={"detector": "surrogate", "sample_rate_hz": rate_hz, "scene": scene}

@@ -1,4 +1,4 @@
-"""Learning to spend a budget: simulated sorties under every arm of `sortie.policies.catalogue.adaptive`, and what they teach.
+"""Learn how to spend a budget from simulated sorties under every arm of `sortie.policies.catalogue.adaptive`.
 
 An offline contextual bandit. Training conditions are drawn from ranges that the held-out set
 (`scenarios/library/conditions.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that

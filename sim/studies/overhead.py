@@ -1,4 +1,4 @@
-"""What the context plane costs, by the size of the fleet: bytes beside the data plane's, and time to decide."""
+"""The context plane's cost by fleet size: its bytes beside the data plane's, and the time to decide."""
 
 from __future__ import annotations
 

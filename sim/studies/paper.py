@@ -1,4 +1,4 @@
-"""`sortie paper`: the paper's Evaluation measured on the benchmark and on a flown sortie, judged, and written down."""
+"""`sortie paper`: measure the paper's claims on the benchmark and on a flown sortie, and write the verdicts."""
 
 from __future__ import annotations
 

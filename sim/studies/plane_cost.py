@@ -1,4 +1,4 @@
-"""What the paper says of the context plane's cost and of its replayed traces, measured on a flown sortie.
+"""The paper's claims about the context plane's cost and its replayed traces, measured on a flown sortie.
 
 The sortie is `paper_replay`: the paper's 120 s with five drones instead of four, its directives enforced by gates and
 its payloads handed to a radio. Names are those that the claims ask for (`sortie.perception.evaluation.measures.Elsewhere`).
@@ -160,7 +160,7 @@ def measured_live(path: Path) -> dict[str, MeasuredValue]:
 
 
 def machine() -> str:
-    """The processor's model, as far as the system tells."""
+    """The processor's model, where the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
