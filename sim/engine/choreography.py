@@ -53,8 +53,8 @@ class Choreography:
     def renew(self, frame: int) -> None:
         """Grant what can be granted, to begin with this frame; call it before anything else looks at the frame."""
         self._frame = frame
-        agents, again_at = self._world.agents, self._again_at
-        asking = [i for i in sorted(self._wishes) if agents[i].airborne and frame >= again_at.get(i, 0)]
+        drones, again_at = self._world.drones, self._again_at
+        asking = [i for i in sorted(self._wishes) if drones[i].airborne and frame >= again_at.get(i, 0)]
         if self._fixed:
             for drone in asking:
                 self._tell(drone, "holds its slot: a drone of the fleet flies a recorded pose")
@@ -74,7 +74,7 @@ class Choreography:
     def _granted(self, drone: int) -> Move | str | None:
         """What comes of a wish; a move is on the plan from here on."""
         x_m, y_m, _ = self._wishes[drone]
-        gone = [agent.drone for agent in self._world.agents if not agent.airborne]
+        gone = [i for i, status in enumerate(self._world.drones) if not status.airborne]
         answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame, gone)
         if isinstance(answer, Move):
             self.plans[drone] = (*self.plans[drone], answer)

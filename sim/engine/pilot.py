@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import simpy
 
-from sortie.fleet.agent import Agent
 from sortie.policies.contract import (
     Directive,
     FleetView,
@@ -131,7 +130,6 @@ class Pilot:
         """Args: `wish` takes where the drone asks to look from; None where no policy of the plan does."""
         self.drone, self.policy, self._wish = drone, plan.first, wish
         self._look = viewpoint_of(plan.first.decide)
-        self.agent: Agent | None = None
         changes = enumerate(plan.changes)
         self._by_phase = {_PHASES[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision
@@ -149,8 +147,10 @@ class Pilot:
             self.policy, self._look = policy, viewpoint_of(policy.decide)
             if self._look is None and self._wish is not None:
                 self._wish(self.drone, None)
-            if self.agent is not None:
-                self.agent.handshake_bytes = policy.handshake_bytes
+
+    def handshake_bytes(self) -> int:
+        """What the present policy's method puts on every link and frame before payloads."""
+        return self.policy.handshake_bytes
 
     def show(self, view: FleetView) -> None:
         """The next decision is made on this view."""
@@ -236,13 +236,9 @@ class Pilot:
                 self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
 
 
-def schedule_policies(
-    env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
-) -> None:
+def schedule_policies(env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], frame_s: float) -> None:
     """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
     two changes at one instant the later in the list comes last."""
-    for pilot, agent in zip(pilots, agents, strict=True):
-        pilot.agent = agent
     due: list[tuple[float, int, Callable[[], None]]] = []
     for place, (change, policy) in enumerate(plan.changes):
         if change.at_s is not None:

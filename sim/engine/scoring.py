@@ -10,7 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import simpy
 
-from sortie.fleet.agent import Agent, Received
+from sortie.fleet.agent import Agent
+from sortie.fleet.memory import Received
 from sortie.perception.detectors import DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Scenario
@@ -100,7 +101,7 @@ class Scorer:
         now_s = self._env.now
         moment: Moment = now_s, []
         for agent in self._agents:
-            if agent.airborne and agent.here is not None and agent.latest is not None:
+            if agent.status.airborne and agent.here is not None and agent.latest is not None:
                 moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
@@ -146,8 +147,9 @@ class Scorer:
         limit_s = config.max_age_s + 1e-9
         if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # what a look takes anyhow
             return None
-        held = [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
-        return look, [as_share(r, agent.trust_in(r.capture.drone)) for r in held]
+        memory = agent.memory
+        held = [received for _, received in sorted(memory.held.items()) if now_s - received.capture.t_s <= limit_s]
+        return look, [as_share(r, memory.trust_in(r.capture.drone)) for r in held]
 
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import dataclasses
 import gc
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import pyarrow as pa
 import simpy
 
-from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.agent import Agent
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
-from sortie.fleet.flight.motion import fly
+from sortie.fleet.gate import Gate
+from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
-from sortie.fleet.traces import follow, read_traces
+from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
@@ -32,8 +36,8 @@ from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import Audit, Named, Pilot, PolicyPlan, named, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
-from sortie.sim.engine.transport import Ether
-from sortie.sim.engine.world import World, route_bounds
+from sortie.sim.engine.transport import Transport
+from sortie.sim.engine.world import OwnSenses, World, route_bounds
 from sortie.sim.identity import code_version
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
@@ -96,76 +100,95 @@ def run_sortie(
     """
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
-    name, flight_plan = _policy(scenario, policy)
-    n, config, air_of = scenario.fleet.drones, scenario.perception, scenario.radio
+    name, policies = _policy(scenario, policy)
+    parts = build(scenario, policies, seed, replication, detector_of)
+    _fly(parts, progress, observer)
+    record = _collect(parts, name, seed, replication)
+    return dataclasses.replace(record, wall={"wall_s": time.perf_counter() - begin_s, **record.wall})
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Everything that flies in one sortie, wired and not yet started. No part is replaced or completed afterwards."""
+
+    scenario: Scenario
+    env: simpy.Environment
+    recorder: Recorder
+    scene: SceneModel
+    batteries: FleetBatteries
+    air: Air
+    world: World
+    transport: Transport
+    choreography: Choreography | None
+    """None where no policy chooses viewpoints."""
+    pilots: Sequence[Pilot]
+    agents: Sequence[Agent]
+    detector: Detector | None
+    scorer: Scorer | None
+    """None without a detector."""
+    audit: Audit
+    notes: AgentNotes
+
+
+def build(
+    scenario: Scenario, policies: PolicyPlan, seed: int, replication: int = 0, detector_of: DetectorOf = make_detector
+) -> Parts:
+    """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
     env, recorder = simpy.Environment(), Recorder()
+    drones, rules = range(scenario.fleet.drones), _rules(scenario)
+    statuses = [DroneStatus() for _ in drones]
+    memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
 
-    motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
-    traces = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, n)
-    motion = follow(motion, traces, scenario.frame_s)
+    motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
-    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n, charges)
+    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, len(drones), charges)
+    up = up_vector(motion.orientation_xyzw)
     air = Air(
-        env,
-        scenario.radio,
-        motion.position_m,
-        seed=seed,
-        replication=replication,
-        frame_s=scenario.frame_s,
-        up=up_vector(motion.orientation_xyzw),
+        env, scenario.radio, motion.position_m, seed=seed, replication=replication, frame_s=scenario.frame_s, up=up
     )
-    scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
-    plan = MissionPlan(scenario.mission)
-    world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
-    keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
-    rates_mbps = STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz] if air_of.trace is None else ()
-    ether = Ether(air, recorder, keys=keys, rates_mbps=rates_mbps)
-    detector = detector_of(scene, config, seed, replication)
-
-    def count_boxes(capture: Capture, roi: Disc | None) -> int:
-        assert detector is not None  # noqa: S101
-        return detector.count_boxes(capture, None if roi is None else (roi.x_m, roi.y_m, roi.radius_m))
-
-    rules = PlaneRules(
-        period_s=scenario.frame_s,
-        frames=scenario.frames,
-        degraded_after_periods=scenario.context.degraded_after_periods,
-        detached_after_periods=scenario.context.detached_after_periods,
-        dwell_s=scenario.policy.dwell_s,
-        hysteresis=scenario.policy.hysteresis,
-        compute_delay_s=config.compute_delay_s,
-        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
-        trust=scenario.context.trust,
-        publish_every=scenario.context.publish_every,
-        form=Form(scenario.context.grid_cells, scenario.context.grid_bits, scenario.context.number_bits),
+    scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
+    world = World(env, scenario, statuses, motion, batteries, air, scene, MissionPlan(scenario.mission), recorder)
+    key = group_key(seed) if scenario.context.authentication else None
+    transport = Transport(
+        env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)
     )
-    audit = Audit(env, recorder)
-    choreography: Choreography | None = None
-    if flight_plan.looks:
+
+    audit, choreography = Audit(env, recorder), None
+    if policies.looks:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
-        world.before_frame = choreography.renew
-    wish = None if choreography is None else choreography.ask
-    pilots = [Pilot(i, flight_plan, audit, wish) for i in range(n)]
+    pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.ask) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
+    detector = detector_of(scene, scenario.perception, seed, replication)
+    count_boxes = None if detector is None else partial(_count_boxes, detector)
     agents = [
         Agent(
             env,
-            i,
+            memories[i],
             rules=rules,
             policy=pilots[i],
-            senses=world.senses(i, count_boxes if detector is not None else None),
-            modem=ether.modem(i),
+            senses=OwnSenses(world, i, count_boxes),
+            modem=transport.modem(i),
+            gate=Gate(),
             log=notes,
-            sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
+            sealer=None if key is None else Sealer(key, KEY_ID),
             phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
-            handshake_bytes=flight_plan.first.handshake_bytes,
+            handshake_bytes=pilots[i].handshake_bytes,
         )
-        for i in range(n)
+        for i in drones
     ]
-    world.agents = ether.agents = agents
-
     scorer = None if detector is None else Scorer(env, scenario, detector, agents, recorder)
+    schedule(scenario, world, transport, seed=seed, replication=replication)
+    schedule_policies(env, policies, pilots, scenario.frame_s)
+    return Parts(
+        scenario, env, recorder, scene, batteries, air, world, transport, choreography, pilots, agents, detector, scorer,
+        audit, notes,
+    )  # fmt: skip
+
+
+def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Observer | None) -> None:
+    """Start every process, run the clock to the end, and record what is still in flight."""
+    world, scorer, recorder = parts.world, parts.scorer, parts.recorder
 
     def each_second(t_s: float) -> None:
         if progress is not None:
@@ -175,44 +198,67 @@ def run_sortie(
                 scorer.flush()
             observer.second(t_s, recorder.take_new())
 
-    world.on_second = each_second
     if observer is not None:
-        observer.begin(scenario, scene)
-    schedule(scenario, world, ether, seed=seed, replication=replication)
-    schedule_policies(env, flight_plan, pilots, agents, scenario.frame_s)
-    world.start()
-    for agent in agents:
+        observer.begin(parts.scenario, parts.scene)
+    world.start(each_second, None if parts.choreography is None else parts.choreography.renew)
+    for agent in parts.agents:
         agent.start()
     if scorer is not None:
         scorer.start()
-
-    env.run(until=scenario.duration_s)
+    parts.env.run(until=parts.scenario.duration_s)
     world.drain()
-    ether.finish()
-    recorder.rows["energy"].extend(
-        (i, cause, joules) for cause, per_drone in batteries.energy_j.items() for i, joules in enumerate(per_drone)
-    )
+    parts.transport.finish()
+    energy_j = parts.batteries.energy_j
+    recorder.rows["energy"].extend((i, cause, j) for cause, each in energy_j.items() for i, j in enumerate(each))
     if scorer is not None:
         scorer.flush()
-    each_second(env.now)
+    each_second(parts.env.now)
+
+
+def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRecord:
+    """The record of a sortie that has ended."""
+    air, notes, recorder = parts.air, parts.notes, parts.recorder
     tables = recorder.tables()
     recorder.rows.clear()  # agents and air hold one another, so that nothing else lets go of the rows at once
+    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
-        scenario=scenario,
-        policy=name,
+        scenario=parts.scenario,
+        policy=policy,
         seed=seed,
         replication=replication,
         version=code_version(),
         tables=tables,
-        totals={**notes.totals(), **audit.totals(), **_air_totals(air)},
-        calibration=detector.calibration if isinstance(detector, DetectsMany) else None,
-        wall={"wall_s": time.perf_counter() - begin_s, **notes.policy_eval_us()},
+        totals={**notes.totals(), **parts.audit.totals(), **counters, "medium_busy_fraction": air.utilisation},
+        calibration=parts.detector.calibration if isinstance(parts.detector, DetectsMany) else None,
+        wall=notes.policy_eval_us(),
     )
 
 
-def _air_totals(air: Air) -> dict[str, float]:
-    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
-    return {**counters, "medium_busy_fraction": air.utilisation}
+def _rules(scenario: Scenario) -> PlaneRules:
+    context = scenario.context
+    return PlaneRules(
+        period_s=scenario.frame_s,
+        frames=scenario.frames,
+        degraded_after_periods=context.degraded_after_periods,
+        detached_after_periods=context.detached_after_periods,
+        dwell_s=scenario.policy.dwell_s,
+        hysteresis=scenario.policy.hysteresis,
+        compute_delay_s=scenario.perception.compute_delay_s,
+        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
+        trust=context.trust,
+        publish_every=context.publish_every,
+        form=Form(context.grid_cells, context.grid_bits, context.number_bits),
+    )
+
+
+def _rates_mbps(scenario: Scenario) -> Sequence[float]:
+    """The channel's data rates by MCS; none where links are traced."""
+    radio = scenario.radio
+    return STANDARDS[radio.standard].rates_mbps[radio.bandwidth_mhz] if radio.trace is None else ()
+
+
+def _count_boxes(detector: Detector, capture: Capture, roi: Disc | None) -> int:
+    return detector.count_boxes(capture, None if roi is None else (roi.x_m, roi.y_m, roi.radius_m))
 
 
 def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, PolicyPlan]:

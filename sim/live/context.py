@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
-from sortie.fleet.flight.motion import fly
 from sortie.fleet.senses import FlightSenses, Sensed
-from sortie.fleet.traces import follow, read_traces
+from sortie.fleet.traces import flown_motion
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
@@ -69,9 +68,7 @@ class ReplaySenses:
     """One drone's own sensors (sortie.fleet.agent.Senses), frame 0 being the one of `begin_s`."""
 
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
-        motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
-        poses = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, scenario.fleet.drones)
-        motion = follow(motion, poses, scenario.frame_s)
+        motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
         self._flight = FlightSenses(motion, scenario.frame_s)
         self._scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
         self._plan = MissionPlan(scenario.mission)

@@ -7,7 +7,9 @@ import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.agent import Agent
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
@@ -85,23 +87,25 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
     pilot = Pilot(drone, plan, Audit(clock, recorder))
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
     phase_s = PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
+    # stamps are nanoseconds since 1970, as in ROS 2
+    memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
     agent = Agent(
         clock,
-        drone,
+        memory,
         rules=rules,
         policy=node.watched(pilot),
         senses=senses,
         modem=node,
+        gate=node.gate,
         log=node,
         sealer=None,
         phase_s=orders.begin_s + phase_s,
-        handshake_bytes=plan.first.handshake_bytes,
+        handshake_bytes=pilot.handshake_bytes,
     )
-    agent.clock_skew_s = go.unix_ns * 1e-9 - orders.begin_s  # stamps are ns since 1970, as ROS 2 has them
-    node.fly(agent, rules, senses.goodput_mbps)
-    schedule_policies(clock, plan, [pilot], [agent], scenario.frame_s)
+    node.fly(clock, memory, rules, senses.goodput_mbps)
+    schedule_policies(clock, plan, [pilot], scenario.frame_s)
     if orders.trace.end_s < orders.end_s:
-        at(clock, orders.trace.end_s, agent.stop)
+        at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
 
     def tell() -> None:
