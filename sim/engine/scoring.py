@@ -5,24 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import simpy
 
 from sortie.fleet.agent import Agent
 from sortie.fleet.memory import Received
-from sortie.perception.detectors import DetectsAhead, DetectsMany
+from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import REPRESENTATIONS, Recorder
-
-
-class Detector(Protocol):
-    """What a sortie needs of a detector."""
-
-    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]: ...
-    def truth(self, t_s: float, ego: Capture) -> Boxes: ...
 
 
 def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
