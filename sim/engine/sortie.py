@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -54,23 +52,10 @@ class Observer(Protocol):
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
 
 
-@contextmanager
-def _not_collecting() -> Iterator[None]:
-    """No look for reference cycles in a flight: it makes none, and every look goes over its record."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
 DetectorOf = Callable[[SceneModel, Perception, int, int], Detector | None]
 """As `sortie.perception.detectors.Constructor`; None flies without."""
 
 
-@_not_collecting()
 def run_sortie(
     scenario: Scenario,
     policy: str | Policy | None = None,

@@ -46,6 +46,13 @@ def test_no_part_gains_an_attribute_in_flight(monkeypatch: pytest.MonkeyPatch) -
     assert [d.airborne for d in parts.world.drones] == [i != 2 for i in range(len(parts.agents))]
 
 
+def test_a_flight_leaves_the_garbage_collector_alone() -> None:
+    """The collector belongs to the process, which may be somebody else's."""
+    before, seen = (gc.isenabled(), gc.get_threshold()), set()
+    run_sortie(load("track_target", SETS), progress=lambda _: seen.add((gc.isenabled(), gc.get_threshold())))
+    assert seen == {before} == {(gc.isenabled(), gc.get_threshold())}
+
+
 @pytest.mark.parametrize("name", ["world", "transport"])
 def test_neither_world_nor_transport_leads_to_an_agent(name: str) -> None:
     """Followed through everything that they hold, but for the clock, where every process waits."""
