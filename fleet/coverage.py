@@ -1,4 +1,4 @@
-"""What a drone says about what it sees: footprint and coverage grid, from geometry alone (no content).
+"""Footprint and coverage grid of a drone, from geometry alone.
 
 The grid is 16 × 16 cells of 12.8 m, north-aligned and snapped to the world's 12.8 m lattice, so that two drones'
 grids can be compared cell by cell. It covers the ±102.4 m that the perception covers.

@@ -28,7 +28,7 @@ CountBoxes = Callable[[Disc | None], int]
 
 
 class Payload(NamedTuple):
-    """What goes on the air for one link and frame; the content is named, not carried."""
+    """What one link sends in one frame: a description of the content and its exact size."""
 
     representation: Representation
     rho: float
@@ -45,7 +45,7 @@ class Payload(NamedTuple):
 
     @property
     def reliable(self) -> bool:
-        """Compact payloads go reliably, high-rate ones best effort (the paper's QoS mapping)."""
+        """Whether it is sent reliably: compact payloads are, others are sent best effort (the paper's QoS mapping)."""
         return _RELIABLE[self.representation]
 
 
@@ -59,7 +59,7 @@ def make_payload(
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
-    Args: `tile_limit_bytes`: features go as tiles of at most so many bytes (sortie.fleet.tiles); None: as one sample.
+    Args: `tile_limit_bytes`: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
@@ -87,7 +87,7 @@ class Gate:
         self._directives: dict[int, Directive] = {}  # by ascending peer
         self._last_slot_s: dict[int, float] = {}
         self.duty_percent = 100
-        """The duty cycle asked for: the highest over the links, 100 where there is no link."""
+        """The highest duty cycle of the links' directives, 100 where there is no link."""
 
     def enforce(self, directive: Directive) -> None:
         """Put a directive in force. Repeating one changes nothing: timers run from the last send, not from here."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
 from sortie.fleet.plane import DroneStatus, PlaneRules
-from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
+from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
 from sortie.policies.damping import believed
@@ -112,7 +112,7 @@ class PeerMemory:
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             claimed_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
-            arrivals[i], later = could_tell(came, claimed_s)
+            arrivals[i], later = split_arrivals(came, claimed_s)
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
         self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form)
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])

@@ -1,4 +1,4 @@
-"""Tiles: feature cells in fragments that are of use each alone.
+"""Tiles: feature cells cut into fragments that can each be used alone.
 
 A feature map sent as one sample is lost with any of its fragments. Cut into tiles, each fragment carries whole cells
 with their indices and a header of its own, best cells first, so that whatever arrives can be fused. It costs a header
@@ -19,7 +19,7 @@ _CELL_BYTES = budget.payload_bytes(1)
 
 
 class Tiles(NamedTuple):
-    """How many cells are cut into tiles."""
+    """Number and sizes of the tiles of one payload."""
 
     cells_each: int
     """Of every tile but the last."""

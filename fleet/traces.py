@@ -96,15 +96,15 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
             raise TraceError(f"{path}: {what} needs all of {', '.join(names)}")
     who = columns.get("drone", np.zeros(len(columns["t_s"])))
     check_whole(path, "drone", who)
-    found = {}
+    traces = {}
     for drone in np.unique(who).astype(int).tolist():
         if drone >= drones:
             raise TraceError(f"{path}: drone {drone}, must be below fleet.drones = {drones}")
         rows = np.flatnonzero(who == drone)
         check_increasing(path, columns["t_s"], rows, f"drone {drone}")
         own = {name: values[rows] for name, values in columns.items()}
-        found[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
-    return found
+        traces[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
+    return traces
 
 
 def flown_motion(

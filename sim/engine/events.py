@@ -1,4 +1,4 @@
-"""Scenario events: what goes wrong, when, put on the clock."""
+"""Puts scenario events (link drops, jammers, losses, faults, attacks, lies) on the clock."""
 
 from __future__ import annotations
 
@@ -41,8 +41,7 @@ def group_key(seed: int) -> bytes:
 def schedule(scenario: Scenario, world: World, transport: Transport, *, seed: int, replication: int) -> None:
     """Put every event of the scenario on the clock; call once, before anything else is scheduled.
 
-    Events come before the frame that begins at the same instant, and so do their ends: from now, the clock says all of
-    their times to the last digit.
+    Events and their ends come before the frame that begins at the same instant.
     """
     begins = [
         _Begin(scenario, world, transport, e, index, seed, replication) for index, e in enumerate(scenario.events)
@@ -110,7 +109,7 @@ class _Begin:
                 world.drones[event.drone].lies[self.index] = lie
 
     def end(self) -> None:
-        """What lasts is over."""
+        """End an event that lasts."""
         world, event = self.world, self.event
         match event:
             case LinkDrop():

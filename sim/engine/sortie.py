@@ -32,7 +32,7 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.mission import MissionPlan
-from sortie.sim.engine.pilot import Audit, Named, Pilot, PolicyPlan, named, plan_of, schedule_policies
+from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
@@ -41,8 +41,7 @@ from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
 KEY_ID = 1
 PHASE_SHARE, PHASE_S = 0.1, 0.01
-"""Drones act within the first tenth of a frame, and within its first 10 ms, each at its own moment: clocks disciplined,
-not locked."""
+"""Each drone acts at its own moment, within the first tenth of a frame and its first 10 ms."""
 
 
 class Observer(Protocol):
@@ -52,7 +51,7 @@ class Observer(Protocol):
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
 
 
-DetectorOf = Callable[[SceneModel, Perception, int, int], Detector | None]
+DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
 """As `sortie.perception.detectors.Constructor`; None flies without."""
 
 
@@ -64,18 +63,18 @@ def run_sortie(
     replication: int = 0,
     progress: Callable[[float], None] | None = None,
     observer: Observer | None = None,
-    detector_of: DetectorOf = make_detector,
+    detector_of: DetectorMaker = make_detector,
 ) -> SortieRecord:
     """Fly one sortie from 0 to `scenario.duration_s` (exclusive) and return its record.
 
     Args:
-        scenario: what is to be flown.
+        scenario: the scenario to fly.
         policy: a policy's name, `file.py:function`, or a callable; None takes the scenario's own.
         seed: None takes the scenario's own.
-        replication: another draw of everything random, for campaigns.
+        replication: number of the repetition; each has other random draws.
         progress: called with the simulated time once a simulated second.
         observer: gets the new rows once a simulated second.
-        detector_of: makes the detector; left out, the one that the scenario names.
+        detector_of: makes the detector; the default makes the one that the scenario names.
 
     Returns:
         The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
@@ -116,7 +115,11 @@ class Parts:
 
 
 def build(
-    scenario: Scenario, policies: PolicyPlan, seed: int, replication: int = 0, detector_of: DetectorOf = make_detector
+    scenario: Scenario,
+    policies: PolicyPlan,
+    seed: int,
+    replication: int = 0,
+    detector_of: DetectorMaker = make_detector,
 ) -> Parts:
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
     env, recorder = simpy.Environment(), Recorder()
@@ -139,10 +142,10 @@ def build(
     )
 
     audit, choreography = Audit(env, recorder), None
-    if policies.looks:
+    if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
-    pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.ask) for i in drones]
+    pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.request) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     detector = detector_of(scene, scenario.perception, seed, replication)
     count_boxes = None if detector is None else partial(_count_boxes, detector)
@@ -204,7 +207,7 @@ def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRe
     """The record of a sortie that has ended."""
     air, notes, recorder = parts.air, parts.notes, parts.recorder
     tables = recorder.tables()
-    recorder.rows.clear()  # agents and air hold one another, so that nothing else lets go of the rows at once
+    recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
         scenario=parts.scenario,
@@ -254,5 +257,9 @@ def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Polic
     section = scenario.policy
     if policy is None or policy == section.name:
         return section.name, plan_of(section)
-    first = named(policy, {}) if isinstance(policy, str) else Named(getattr(policy, "__name__", "policy"), policy)
+    first = (
+        named_policy(policy, {})
+        if isinstance(policy, str)
+        else NamedPolicy(getattr(policy, "__name__", "policy"), policy)
+    )
     return first.name, plan_of(section, first)

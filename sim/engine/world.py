@@ -1,6 +1,6 @@
-"""The physical side of a sortie: once a frame, drones have moved and drained, and the links are new.
+"""The physical side of a sortie: in each frame it moves the drones, drains their batteries and computes the links.
 
-Also where scenario events act on the physics: extra loss, jammers, battery faults, lost drones.
+Scenario events act on the physics here: extra loss, jammers, battery faults, lost drones.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LEAST_MBPS = 1e-6
 """A link that carries anything at all."""
 
 INSTANT_S = 1e-9
-"""Times so little apart are one, and differ by rounding."""
+"""Times closer together than this are equal but for rounding."""
 
 
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
@@ -50,8 +50,10 @@ def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
 
 
 def with_frame(t_s: float, frame_s: float) -> float:
-    """When what happens at `t_s` is due, so that it is no later than a frame that begins then: at 7.5 Hz the clock of
-    14.8 s says a last digit less."""
+    """Round `t_s` to the begin of a frame if it differs from it by rounding alone.
+
+    So an event is no later than a frame of the same instant: at 7.5 Hz the frame of 14.8 s begins a last digit earlier.
+    """
     frame_at_s = round(t_s / frame_s) * frame_s
     return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
 
@@ -123,16 +125,16 @@ class World:
                 on_second(env.now)
 
     def reroute(self, motion: Trajectories) -> None:
-        """From the frame that begins on the fleet flies another way; what was flown before must be the same."""
+        """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
         self._flight = FlightSenses(motion, self._scenario.frame_s)
         self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
 
     def drain(self) -> None:
-        """Drain the batteries for the time since the last call, and land who has to."""
+        """Drain the batteries for the time since the last call, and land the drones that are empty."""
         dt_s = self.env.now - self._stepped_to_s
-        if dt_s <= INSTANT_S:  # no time to tell shares of
+        if dt_s <= INSTANT_S:  # too short for shares of it
             return
         self._stepped_to_s = self.env.now
         airtime_s = list(self.air.airtime_s)
@@ -147,10 +149,10 @@ class World:
         self.ground_landed()
 
     def ground_landed(self) -> None:
-        """Take drones whose battery gave out off the plane and the air."""
+        """Remove the drones with a battery that gave out."""
         for drone, (status, landed) in enumerate(zip(self.drones, self.batteries.landed, strict=True)):
             if landed and status.airborne:
-                self.remove(drone, "landed", self.batteries.why_landed[drone])
+                self.remove(drone, "landed", self.batteries.landing_reason[drone])
 
     def remove(self, drone: int, kind: str, text: str) -> None:
         """A drone leaves the sortie: it is silent from now on, draws nothing, and stays where it is."""
@@ -187,7 +189,7 @@ class World:
             self._write_topology(flying)
 
     def _write_topology(self, flying: Sequence[int]) -> None:
-        """How the fleet hangs together: whether all reach all, who is cut off, and the link that limits the worst-off pair."""
+        """Record whether all drones reach each other, which are cut off, and the link that limits the worst pair."""
         whole = connectivity(self.air.link_mbps()[np.ix_(flying, flying)], LEAST_MBPS)
         i, j, mbps = whole.bottleneck or (None, None, NAN)
         ends = (-1, -1) if i is None or j is None else (flying[i], flying[j])

@@ -42,7 +42,7 @@ class Orders:
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
-    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus tells no rates."""
+    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus has no data rates."""
     return PlaneRules(
         period_s=scenario.frame_s,
         frames=round((end_s - begin_s) / scenario.frame_s),
@@ -56,8 +56,8 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
 
 
 def fly_one(orders: Orders, pipe: Connection) -> None:
-    """The process of one drone: ready, go, fly, report; ends with its flight, a word from the bench or its death."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the bench's, which tells everybody to stop
+    """The process of one drone: ready, go, fly, report. It ends with its flight, or when the bench says so or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the bench handles Ctrl-C and stops every process
     try:
         node = LiveNode(
             Bus(orders.domain), orders.drone, orders.scenario.fleet.drones, seed=orders.scenario.seed, loss=orders.loss
@@ -108,18 +108,18 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
         at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
 
-    def tell() -> None:
+    def send_report() -> None:
         pipe.send(_with_notices(node.report(clock.now), recorder))
 
-    told_s = orders.begin_s
+    reported_s = orders.begin_s
     while clock.now < orders.end_s and not pipe.poll():
         node.wait(min(clock.peek(), orders.end_s) - clock.now)
         node.take()
         clock.catch_up()
-        if clock.now - told_s >= 1.0:
-            told_s = clock.now
-            tell()
-    tell()
+        if clock.now - reported_s >= 1.0:
+            reported_s = clock.now
+            send_report()
+    send_report()
     pipe.send(Home(drone))
 
 
