@@ -15,6 +15,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@# torch first and alone: its pin picks the CPU build, and nothing later may widen it
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	@# an older clone's metadata would name entry points that are no more
+	@rm -rf *.egg-info
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	@touch $@
 

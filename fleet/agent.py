@@ -227,7 +227,7 @@ class Agent:
                 self._gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             changed = asked is not link.asked and asked != link.asked
-            if changed or age_s > fresh_s or link.state.asking_since_s is not None:
+            if changed or age_s > fresh_s or link.state.upgrade_since_s is not None:
                 self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 

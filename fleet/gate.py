@@ -13,6 +13,7 @@ from sortie.fleet import tiles
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
 from sortie.policies.contract import Directive, Disc, Representation
+from sortie.scenarios.representation import BOXES, NAME_OF
 
 HEADER_BYTES = 40
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
@@ -20,8 +21,7 @@ HEADER_BYTES = 40
 _EPSILON_S = 1e-6
 # members of an enumeration are slow to look up
 _NONE, _FEATURES, _RAW = Representation.NONE, Representation.FEATURES, Representation.RAW
-_NAMES = tuple(rung.name.lower() for rung in Representation)
-_RELIABLE = tuple(rung in (Representation.TRACKS, Representation.DETECTIONS) for rung in Representation)
+_RELIABLE = tuple(rung in BOXES for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
@@ -74,9 +74,9 @@ def make_payload(
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
     elif rung != _RAW:
-        boxes = budget.boxes_sent(_NAMES[rung], count_boxes(roi))
+        boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
-    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(_NAMES[rung], cells=cells, boxes=boxes)
+    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes)
     return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes)
 
 

@@ -11,7 +11,7 @@ from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
-from sortie.policies.damping import believed
+from sortie.policies.damping import apply_hysteresis
 
 
 class Received(NamedTuple):
@@ -62,7 +62,7 @@ class PeerMemory:
         known, sender = self._known, descriptor.agent_id
         self._claims[sender] = descriptor
         if sender in known:
-            known[sender] = believed(known[sender], descriptor, self._rules.hysteresis)
+            known[sender] = apply_hysteresis(known[sender], descriptor, self._rules.hysteresis)
         else:  # by ascending id, so that the order of arrival decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = now_s

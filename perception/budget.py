@@ -1,8 +1,8 @@
-"""The cell budget: which cells a peer may send, and what they weigh in bytes. Free of torch.
+"""The cell budget: which feature cells a drone sends, and the size of every payload in bytes. Free of torch.
 
-A sender fills its region of interest first: it ranks the cells whose centres lie in the disc, by its own
-confidence or by feature norm, and sends the best ⌊ρ · 4096⌋ of them. How *many* cells that is follows from
-pose and directive alone, so traffic is exact without running the detector.
+A sender ranks the cells whose centres lie in its region of interest, by its own confidence or by feature norm, and sends
+the best ⌊ρ · 4096⌋ of them. Pose and directive alone decide *how many* cells that is. So traffic is exact without
+running the detector. The evaluation (`evaluation/selection.py`) ranks cells by the same rule.
 """
 
 from __future__ import annotations
@@ -10,15 +10,19 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sortie.perception.geometry import CELLS as GRID
 from sortie.perception.geometry import CHANNELS, FULL
+from sortie.scenarios.disc import Disc
 
+Bools = NDArray[np.bool_]
 CELLS = GRID * GRID
 CELL_M = FULL.cell_m
-"""Sorties fly UAV3D's geometry; the smaller one is for the benchmark alone."""
+"""Side of a cell in UAV3D's geometry, which sorties fly; only the benchmark has a smaller one."""
 DETECTION_BYTES = 24
 """One detection: x, y, length, width, yaw, score as float32."""
 TRACK_BYTES = 20
@@ -68,79 +72,101 @@ def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0) -> int
     raise ValueError(f"representation is {representation!r}, must be features, detections, tracks or raw")
 
 
-_CENTRES_M = tuple((i + 0.5 - GRID / 2) * CELL_M for i in range(GRID))
-"""Along either axis of the sender's levelled frame: x forward (rows), y left (columns)."""
+@lru_cache(maxsize=4)
+def _centres_m(cell_m: float) -> tuple[float, ...]:
+    """Cell centres along either axis of the sender's level frame: x forward (rows), y left (columns)."""
+    return tuple((i + 0.5 - GRID / 2) * cell_m for i in range(GRID))
 
 
-def roi_mask(roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> np.ndarray:
-    """[64, 64] bool: cells of a sender at this estimated pose whose centres are in the disc (x, y, radius), ENU."""
+def roi_mask(roi: Disc | None, x_m: float, y_m: float, yaw_rad: float, cell_m: float = CELL_M) -> Bools:
+    """[64, 64] bool: the cells of a sender at this estimated pose whose centres are in the disc; all without one."""
     if roi is None:
         return np.ones((GRID, GRID), bool)
     mask = np.zeros((GRID, GRID), bool)
-    rows, columns, room, aside = _window(roi, x_m, y_m, yaw_rad)
-    mask[rows, columns] = np.array(aside) <= np.array(room)[:, None]
+    rows, columns, row_room, column_part = _window(roi, x_m, y_m, yaw_rad, cell_m)
+    mask[rows, columns] = np.array(column_part) <= np.array(row_room)[:, None]
     return mask
 
 
-def cells_sent(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> int:
-    """How many cells go: ⌊ρ·4096⌋, at most those in the ROI."""
-    budget = math.floor(rho * CELLS + 1e-9)
+def cells_in(rho: float, links: int = 1) -> int:
+    """The number of cells in a budget: ⌊ρ · links · 4096⌋."""
+    return math.floor(rho * links * CELLS + 1e-9)
+
+
+def cells_sent(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> int:
+    """How many cells a sender sends: ⌊ρ·4096⌋, at most those in the ROI."""
+    budget = cells_in(rho)
     if roi is None or budget == 0:
         return budget
-    _, _, room, aside = _window(roi, x_m, y_m, yaw_rad)
-    aside.sort()
-    return min(budget, sum([bisect_right(aside, left) for left in room]))
+    _, _, row_room, column_part = _window(roi, x_m, y_m, yaw_rad)
+    column_part.sort()
+    return min(budget, sum([bisect_right(column_part, room) for room in row_room]))
 
 
-def must_choose(rho: float, roi: tuple[float, float, float] | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
-    """Whether the budget is below the cells there are, so that they have to be ranked."""
-    candidates = CELLS if roi is None else cells_sent(1.0, roi, x_m, y_m, yaw_rad)
-    return math.floor(rho * CELLS + 1e-9) < candidates
+def must_choose(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> bool:
+    """Whether the budget is smaller than the number of cells allowed, so that cells have to be ranked."""
+    return cells_in(rho) < (CELLS if roi is None else cells_sent(1.0, roi, x_m, y_m, yaw_rad))
 
 
 def _window(
-    roi: tuple[float, float, float], x_m: float, y_m: float, yaw_rad: float
+    roi: Disc, x_m: float, y_m: float, yaw_rad: float, cell_m: float = CELL_M
 ) -> tuple[slice, slice, list[float], list[float]]:
-    """The rows and columns that a disc can touch; what each row leaves of the squared radius, and each column's squared
-    distance from the centre: a cell is inside where the second is at most the first. Lists: there are some twenty."""
+    """The rows and columns that a disc can touch, what each row leaves of the squared radius, and each column's squared distance.
+
+    A cell is inside where its column's value is at most its row's. Lists, because there are about twenty of each.
+    """
     dx, dy, radius_m = roi[0] - x_m, roi[1] - y_m, roi[2]
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     forward_m, left_m = c * dx + s * dy, -s * dx + c * dy
-    rows, columns = _span(forward_m, radius_m), _span(left_m, radius_m)
-    square = radius_m * radius_m
-    room = [square - (x - forward_m) * (x - forward_m) for x in _CENTRES_M[rows]]
-    return rows, columns, room, [(y - left_m) * (y - left_m) for y in _CENTRES_M[columns]]
+    rows, columns = _span(forward_m, radius_m, cell_m), _span(left_m, radius_m, cell_m)
+    square, centres_m = radius_m * radius_m, _centres_m(cell_m)
+    row_room = [square - (x - forward_m) * (x - forward_m) for x in centres_m[rows]]
+    return rows, columns, row_room, [(y - left_m) * (y - left_m) for y in centres_m[columns]]
 
 
-def _span(centre_m: float, radius_m: float) -> slice:
-    low = math.floor((centre_m - radius_m) / CELL_M) + GRID // 2
-    high = math.ceil((centre_m + radius_m) / CELL_M) + GRID // 2
+def _span(centre_m: float, radius_m: float, cell_m: float) -> slice:
+    low = math.floor((centre_m - radius_m) / cell_m) + GRID // 2
+    high = math.ceil((centre_m + radius_m) / cell_m) + GRID // 2
     if low >= 0 and high <= GRID:
         return slice(low, high)
     return slice(min(max(low, 0), GRID), min(max(high, 0), GRID))
 
 
+def ranking(rank: NDArray[np.floating], first: Bools | None = None) -> NDArray[np.intp]:
+    """[d, 4096]: each sender's cells as flat indices, in the order in which it sends them.
+
+    Args:
+        rank: [d, 64, 64], higher first; equal ones by the lower index.
+        first: [d, 64, 64] bool, cells that come before all others, each part ranked in itself.
+    """
+    d = len(rank)
+    order = np.argsort(-rank.reshape(d, CELLS).astype(np.float64), axis=1, kind="stable")
+    if first is not None:
+        late = np.take_along_axis(~first.reshape(d, CELLS), order, axis=1)
+        order = np.take_along_axis(order, np.argsort(late, axis=1, kind="stable"), axis=1)
+    return order
+
+
 def select(
-    rank: np.ndarray,
+    rank: NDArray[np.floating],
     rho: float,
-    roi: tuple[float, float, float] | None,
+    roi: Disc | None,
     x_m: float,
     y_m: float,
     yaw_rad: float,
     missing: Sequence[int] = (),
-) -> np.ndarray:
-    """[64, 64] bool: the cells that are sent, exactly `cells_sent` of them, less those that are missing.
+) -> Bools:
+    """[64, 64] bool: the cells that arrive: the `cells_sent` best ones, without those that went missing.
 
     Args:
-        rank: [64, 64] what ranks the cells (confidence or norm), higher first; ties go to the lower index.
+        rank: [64, 64] confidence or norm, as for `ranking`.
         rho, roi, x_m, y_m, yaw_rad: as for `cells_sent`.
-        missing: which of those sent, counted from the best, did not arrive.
+        missing: ranks among the cells sent (0 the best) that did not arrive.
     """
-    allowed = roi_mask(roi, x_m, y_m, yaw_rad).ravel()
     count = cells_sent(rho, roi, x_m, y_m, yaw_rad)
     out = np.zeros(CELLS, bool)
     if count:
-        order = np.argsort(np.where(allowed, -rank.ravel().astype(np.float64), np.inf), kind="stable")
+        order = ranking(rank[None], None if roi is None else roi_mask(roi, x_m, y_m, yaw_rad)[None])[0]
         out[order[:count]] = True
         out[order[list(missing)]] = False
     return out.reshape(GRID, GRID)

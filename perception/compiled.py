@@ -1,4 +1,4 @@
-"""Loops as machine code (numba): float32 and float64 rounded as written, no fast-math, no lock of Python's held."""
+"""Loops compiled to machine code by numba: rounded as written, no fast-math, without Python's global lock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detectors by name: what a sortie asks of one, and the table from which a scenario's `perception.detector` is made.
+"""The interface of a detector, and the table of detectors that `perception.detector` names.
 
 Free of torch: a constructor imports what it needs when it is called, so that sorties without the network never load it.
 """
@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 
 class Detector(Protocol):
-    """What a sortie asks of a detector."""
+    """Turns a drone's own images and the data it received into boxes."""
 
     def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
-        """Each ego's boxes from its own look and what it was sent, ENU, best first."""
+        """Each ego's boxes from its own capture and the shares it received, ENU, best first."""
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
-        """What there is to find in the ego's square at `t_s`, ENU."""
+        """The cars in the ego's square at `t_s`, ENU: what it should detect."""
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
-        """How many detections the drone would send for this capture, inside a disc (x, y, radius) if there is one."""
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        """The number of detections that the drone would send for this capture, inside the disc if there is one."""
 
     def camera_views(self, capture: Capture) -> NDArray[Any]:
         """The camera images [cameras, height, width, 3]; ValueError where there are none."""
@@ -35,21 +36,21 @@ class Detector(Protocol):
 
 @runtime_checkable
 class DetectsAhead(Protocol):
-    """A detector that works in the background: a sortie flies on to the next moment while it looks at this one.
+    """A detector that works in the background, so that a sortie flies on while this moment is computed.
 
-    One that has `begin` is asked by it alone: who overrides `detect` overrides `begin`.
+    A sortie calls `begin` instead of `detect` where there is one, so a subclass overrides both.
     """
 
     def begin(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> Callable[[], list[Boxes]]:
-        """Begin what `detect` does; what is returned waits for it."""
+        """Start `detect` in the background; calling the result waits for its boxes."""
 
 
 @runtime_checkable
 class DetectsMany(Protocol):
-    """A detector that need not be asked at once: a sortie gathers its moments and asks for many together."""
+    """A detector that computes many moments together, at the end of a sortie or of a batch."""
 
     calibration: str
-    """Which fit it is of, for outcomes."""
+    """The name of its calibration, for the outcome."""
 
     def detect_many(self, moments: Sequence[Sequence[tuple[Capture, Sequence[Share]]]]) -> Iterable[Boxes]:
         """As `detect`, moment after moment, job after job."""
@@ -73,7 +74,7 @@ class DetectorKind:
 
 
 def make_detector(scene: SceneModel, config: Perception, seed: int, replication: int = 0) -> Detector | None:
-    """The detector that the scenario names; None where it flies the traffic alone.
+    """The detector that the scenario names; None where only traffic is simulated.
 
     Raises:
         ValueError: weights or a recording that are missing or do not fit, naming the file.
@@ -107,11 +108,12 @@ DETECTORS: dict[str, DetectorKind] = {
         "the shipped network on rendered views: encoder, fusion by perception.fusion, centre head", _torch
     ),
     "recorded": DetectorKind(
-        "what another model saw, from perception.recording; its features may be fused by its own code", _recorded
+        "another model's recorded detections, from perception.recording; its features may be fused by its own code",
+        _recorded,
     ),
     "surrogate": DetectorKind(
         "a fast model fitted to the torch detector by `sortie calibrate`; nothing is rendered", _surrogate
     ),
     "none": DetectorKind("traffic alone; boxes are counted from the scene", None),
 }
-"""A new detector is one constructor and one line here, and one word in the schema."""
+"""A new detector needs a constructor, a line here, and its name in the schema."""

@@ -1,4 +1,4 @@
-"""What a user can mend, told in one line by the command line."""
+"""Errors that a user can put right; the command line prints them in one line."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from sortie.scenarios.errors import SortieError
 
 
 class InputError(SortieError):
-    """A file or setting that perception was given is not as it must be; the message names it, the value and the bound."""
+    """A wrong file or setting; the message names it, its value and what is allowed."""

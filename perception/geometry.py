@@ -1,4 +1,6 @@
-"""The bird's-eye grids: level, aligned with the drone's heading, the drone in the middle. Free of torch.
+"""The bird's-eye grids, the cameras' view angles, and the change between world and drone frames. Free of torch.
+
+A grid is level and aligned with the drone's heading, with the drone in the middle.
 
 x points forward along rows, y left along columns, row 0 the rearmost and column 0 the rightmost. Three
 resolutions cover the same square: the image that the encoder sees, the cells that are exchanged (UAV3D's
@@ -8,6 +10,7 @@ resolutions cover the same square: the image that the encoder sees, the cells th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +19,11 @@ IMAGE_PX = 256
 CELLS = 64
 CHANNELS = 80
 HEAD_PX = 128
+WIDTH_PX, HEIGHT_PX = 160, 90
+"""A camera image."""
+HALF_H = float(np.tan(np.radians(35.0)))
+"""Tangent of half the cameras' horizontal field of view."""
+HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +54,25 @@ SMALL = Geometry(51.2)
 """Half as far, twice as fine."""
 
 
+def to_local(x_m: Any, y_m: Any, pose: Any) -> tuple[Any, Any]:
+    """World coordinates in a drone's level frame, as (forward, left); `pose` is x, y, yaw: numbers or arrays that broadcast."""
+    dx, dy, c, s = x_m - pose[0], y_m - pose[1], np.cos(pose[2]), np.sin(pose[2])
+    return c * dx + s * dy, c * dy - s * dx
+
+
+def to_world(forward_m: Any, left_m: Any, pose: Any) -> tuple[Any, Any]:
+    """Points of a drone's level frame in world coordinates, as (x, y); the inverse of `to_local`."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return pose[0] + c * forward_m - s * left_m, pose[1] + s * forward_m + c * left_m
+
+
 def in_square(
     xy_m: NDArray[np.floating], poses: ArrayLike, half_extent_m: float = FULL.half_extent_m
 ) -> NDArray[np.bool_]:
-    """Which places [n, 2] (ENU) lie in the squares of which poses [m, 3] (x, y, yaw): [n, m]; poses [n, 1, 3]: one for
-    each place, [n, 1]."""
-    x, y, yaw = np.moveaxis(np.asarray(poses, np.float64), -1, 0)
-    dx, dy, c, s = xy_m[:, :1] - x, xy_m[:, 1:] - y, np.cos(yaw), np.sin(yaw)
-    inside: NDArray[np.bool_] = (np.abs(c * dx + s * dy) < half_extent_m) & (np.abs(c * dy - s * dx) < half_extent_m)
+    """[n, m] bool: which places [n, 2] (ENU) lie in the square of which pose [m, 3] (x, y, yaw).
+
+    With poses [n, 1, 3] each place has a pose of its own, and the answer is [n, 1].
+    """
+    forward, left = to_local(xy_m[:, :1], xy_m[:, 1:], np.moveaxis(np.asarray(poses, np.float64), -1, 0))
+    inside: NDArray[np.bool_] = (np.abs(forward) < half_extent_m) & (np.abs(left) < half_extent_m)
     return inside

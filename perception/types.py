@@ -1,4 +1,4 @@
-"""What passes between perception and the rest, free of torch: a capture, a peer's share of it, boxes."""
+"""The types that perception exchanges with the other rooms: a capture, a peer's share, boxes. Free of torch."""
 
 from __future__ import annotations
 
@@ -9,30 +9,39 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.geometry import to_world
+from sortie.scenarios.disc import Disc
+from sortie.scenarios.representation import MAP_NAMES
+
 
 class Capture(NamedTuple):
-    """One drone's sensing at one instant: a cheap handle, rendered only when somebody looks."""
+    """One drone's images at one instant: a cheap handle, rendered only when they are needed."""
 
     drone: int
     t_s: float
     """When it was sensed."""
     position_m: tuple[float, float, float]
-    """Where the drone was, ENU."""
+    """Its true position, ENU."""
     orientation_xyzw: tuple[float, float, float, float]
-    """How it was turned, FLU in ENU."""
+    """Its true orientation, FLU in ENU."""
     est_position_m: tuple[float, float, float]
-    """Where it believed it was, ENU."""
+    """Its estimated position, ENU."""
     est_yaw_rad: float
-    """The heading it believed, from east towards north."""
+    """Its estimated heading, from east towards north."""
 
     @property
     def est_pose(self) -> tuple[float, float, float]:
-        """x, y, yaw as believed: what places its features and boxes in the world."""
+        """Estimated x, y, yaw: places its features and boxes in the world."""
         return self.est_position_m[0], self.est_position_m[1], self.est_yaw_rad
 
     @property
+    def true_pose(self) -> tuple[float, float, float]:
+        """True x, y, yaw: the centre and the turn of the square in which it is scored."""
+        return self.position_m[0], self.position_m[1], self.true_yaw_rad
+
+    @property
     def true_yaw_rad(self) -> float:
-        """The heading it had."""
+        """Its true heading, from east towards north."""
         x, y, z, w = self.orientation_xyzw
         return float(np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)))
 
@@ -44,12 +53,17 @@ class Share(NamedTuple):
     representation: str
     """features, detections, tracks or raw."""
     rho: float
-    roi: tuple[float, float, float] | None
-    """x_m, y_m, radius_m, ENU."""
+    roi: Disc | None
+    """Its region of interest; None is everywhere."""
     weight: float
     """Fusion weight from the directive, 0 … 1."""
     missing: tuple[int, ...] = ()
     """Ranks (0 the best) of the cells that were sent and did not arrive."""
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it holds feature cells rather than boxes."""
+        return self.representation in MAP_NAMES
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +86,8 @@ class Boxes:
         """The boxes at the given indices, under the given mask or in the given slice, in that order."""
         return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which])
 
-    def inside(self, disc: tuple[float, float, float] | None) -> Boxes:
-        """The boxes whose centres are in the disc (x, y, radius); all of them for None."""
+    def inside(self, disc: Disc | None) -> Boxes:
+        """The boxes whose centres are in the disc; all of them for None."""
         if disc is None:
             return self
         dx, dy = self.xy_m[:, 0] - disc[0], self.xy_m[:, 1] - disc[1]
@@ -82,6 +96,10 @@ class Boxes:
     def table(self) -> NDArray[np.float64]:
         """[n, 5] float64: x, y, length, width, yaw."""
         return np.concatenate([self.xy_m, self.size_m, self.yaw_rad[:, None]], axis=1).astype(np.float64)
+
+    def single(self) -> Boxes:
+        """The same boxes in float32, as sorties record them."""
+        return Boxes(*(getattr(self, name).astype(np.float32) for name in self.__slots__))
 
     @classmethod
     def empty(cls) -> Boxes:
@@ -97,8 +115,6 @@ class Boxes:
 
     @classmethod
     def placed(cls, local: NDArray[Any], pose: tuple[float, float, float]) -> Boxes:
-        """Boxes [n, 6] of a drone's frame (x forward, y left, length, width, yaw, score), put into the world by its pose (x, y, yaw)."""
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        x, y = local[:, 0], local[:, 1]
-        xy = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=1)
-        return cls(*(a.astype(np.float32) for a in (xy, local[:, 2:4], local[:, 4] + pose[2], local[:, 5])))
+        """Boxes [n, 6] of a drone's frame (x forward, y left, length, width, yaw, score) in the world, by its pose (x, y, yaw)."""
+        xy = np.stack(to_world(local[:, 0], local[:, 1], pose), axis=1)
+        return cls(xy, local[:, 2:4], local[:, 4] + pose[2], local[:, 5]).single()

@@ -1,11 +1,11 @@
-"""Descriptors in, directives out: the types that every policy sees, and nothing else.
+"""The policy contract: the types that go into a policy and come out of it, and the check of its output.
 
-A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (ages are
-attached to the view), no I/O and no payloads. Frames: positions ENU, orientation quaternion x, y, z, w
-of FLU in ENU. One that also chooses where to look from has a second function, marked by `looks_from`.
+A policy is any callable `policy(view: FleetView) -> Sequence[Directive]`. It has no clock (the view has the ages), no
+input or output, and no payloads. Positions are ENU. An orientation is a quaternion x, y, z, w of FLU in ENU. A policy
+that also chooses where its drone looks from has a second function, marked by `looks_from`.
 
-The types are named tuples: frozen, and made in a third of a frozen dataclass's time, which a fleet feels that
-makes tens of thousands a minute. `d._replace(rate_hz=5.0)` is another one that differs.
+The types are named tuples. They are frozen, and creating one takes a third of the time of a frozen dataclass; a fleet
+creates tens of thousands a minute. `d._replace(rate_hz=5.0)` is a changed copy.
 """
 
 from __future__ import annotations
@@ -17,32 +17,38 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from sortie.scenarios.disc import Disc as Disc  # policies import it from here
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.representation import Representation as Representation
 
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
 COVERAGE_CELL_M = 12.8
 """Side of a coverage cell; cells lie on the world's lattice of this pitch."""
-
-
-class Representation(IntEnum):
-    """The fidelity ladder, lowest rung first."""
-
-    NONE = 0
-    TRACKS = 1
-    DETECTIONS = 2
-    FEATURES = 3
-    RAW = 4
+COVERAGE_BYTES = COVERAGE_CELLS**2 // 4
+AGENT_IDS = 256
+"""How many ids there are: an id is a byte. Rankings break ties by `(id - first) % AGENT_IDS`."""
+FEATURE_CELLS = 64 * 64
+"""The cells of a drone's feature map, of which ρ is a share."""
+FEATURE_CELL_BYTES = 80 * 2
+"""A feature cell: 80 channels of 2 bytes."""
+FEATURE_MAP_MEGABITS = 8 * FEATURE_CELLS * FEATURE_CELL_BYTES / 1e6
+"""A whole feature map."""
 
 
 class TaskPhase(IntEnum):
-    """What a drone is doing, as its descriptor says it."""
+    """What a drone is doing, as its descriptor states it."""
 
     TRANSIT = 0
     SEARCH = 1
     TRACK = 2
     RETURN = 3
     LANDING = 4
+
+
+PHASE_NAMES: dict[TaskPhase, str] = {phase: phase.name.lower() for phase in TaskPhase}
+"""The names in scenarios, tables and views on disk."""
+PHASE_OF: dict[str, TaskPhase] = {name: phase for phase, name in PHASE_NAMES.items()}
 
 
 class Coverage(IntEnum):
@@ -54,19 +60,11 @@ class Coverage(IntEnum):
     NOVEL = 3
 
 
-class Disc(NamedTuple):
-    """A disc on the ground, ENU, metres."""
-
-    x_m: float
-    y_m: float
-    radius_m: float
-
-
 class Descriptor(NamedTuple):
-    """One drone's context, as it stands in the paper's schema (180 B as CDR at N = 5)."""
+    """One drone's context, with the fields of the paper's schema (180 B as CDR with five drones)."""
 
     stamp_ns: int
-    """Publisher's clock, ns since the sortie's begin."""
+    """The publisher's clock, ns since the begin of the sortie."""
     agent_id: int
     position_m: tuple[float, float, float]
     orientation_xyzw: tuple[float, float, float, float]
@@ -87,7 +85,7 @@ class Descriptor(NamedTuple):
 
     @property
     def coverage_corner(self) -> tuple[int, int]:
-        """Row and column, in the world's lattice, of the grid's south-west cell: where the grid lies."""
+        """Row and column, in the world's lattice, of the coverage grid's south-west cell."""
         x_m, y_m, _ = self.position_m
         half = COVERAGE_CELLS // 2
         return math.floor(y_m / COVERAGE_CELL_M) - half, math.floor(x_m / COVERAGE_CELL_M) - half
@@ -100,9 +98,9 @@ class Descriptor(NamedTuple):
 
 
 class FleetView(NamedTuple):
-    """What a policy reads: the latest descriptor of every drone heard so far, however stale.
+    """A policy's input: the latest descriptor of every drone heard so far, of whatever age.
 
-    `descriptors` and `age_s` have the same keys; both hold the ego.
+    `descriptors` and `age_s` have the same keys. The ego is one of them.
     """
 
     ego: int
@@ -125,24 +123,24 @@ class FleetView(NamedTuple):
 class Directive(NamedTuple):
     """One policy decision for one outgoing link (36 B on the wire).
 
-    Directives are equal where all but their reasons are.
+    Two directives are equal if all fields but `reason` are equal.
     """
 
     source: int
     destination: int
     representation: Representation = Representation.NONE
     rho: float = 0.0
-    """Budget: at most this fraction of all feature cells, 0 … 1."""
+    """At most this share of the source's feature cells is sent on the link, 0 … 1."""
     roi: Disc | None = None
     """Only cells, boxes or tracks inside; None is everywhere."""
     rate_hz: float = 0.0
     deadline_s: float = 0.1
     fusion_weight: float = 1.0
-    """Trust × freshness that the receiver gives this link's payloads, 0 … 1."""
+    """The weight that the receiver gives this link's payloads (trust × freshness), 0 … 1."""
     duty_percent: int = 100
     """Share of frames in which the source runs perception at all, 0 … 100."""
     reason: str = ""
-    """Why, in words; for the record, not on the wire, no part of equality."""
+    """Why, as text for the record. It is not on the wire and no part of equality."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Directive) and self[:-1] == other[:-1]
@@ -156,7 +154,7 @@ class Directive(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def nothing(source: int, destination: int, reason: str) -> Directive:
-    """The directive to send nothing; one object for equal arguments, since policies say it most often."""
+    """The directive to send nothing. Equal arguments give one object, because it is the most frequent directive."""
     return Directive(source, destination, reason=reason)
 
 
@@ -167,21 +165,21 @@ class Policy(Protocol):
 
 
 class Reposition(NamedTuple):
-    """Where a drone asks to look from, instead of from its slot in the formation.
+    """A request of a drone to look from another place than its slot in the formation.
 
-    A wish, not a command: `fleet.viewpoints` grants as much of it as separation, fence, speed and acceleration allow.
-    It stands until the drone's next decision; a wish for where the drone already is moves nothing.
+    `fleet.viewpoints` grants as much of it as separation, fence, speed and acceleration allow. The request is valid
+    until the drone's next decision. A request for the place where the drone already is moves nothing.
     """
 
     x_m: float
-    """The place over ground where it would be now, ENU; the formation carries it on."""
+    """The place over ground where the drone would be now, ENU; it moves on with the formation."""
     y_m: float
     reason: str = ""
-    """Why, in words; for the record."""
+    """Why, as text for the record."""
 
 
 class Viewpoint(Protocol):
-    """The optional second half of a policy: asked with the view of every decision; None is the drone's slot."""
+    """The optional second part of a policy. It is called with the view of every decision; None means the drone's slot."""
 
     def __call__(self, view: FleetView, /) -> Reposition | None: ...
 
@@ -190,7 +188,7 @@ AnyPolicy = TypeVar("AnyPolicy", bound=Callable[..., Sequence[Directive]])
 
 
 def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPolicy], AnyPolicy]:
-    """Mark a policy as one that also chooses viewpoints; the keyword parameters that both name are given to both."""
+    """Mark a policy as one that also chooses viewpoints. Keyword parameters that both functions have are given to both."""
 
     def mark(policy: AnyPolicy) -> AnyPolicy:
         marked: Any = policy
@@ -204,34 +202,55 @@ class PolicyError(SortieError):
     """A policy broke its contract; the message names the directive, the field and the bound."""
 
 
-MAX_RATE_HZ = 30.0
-MAX_DEADLINE_S = 10.0
+class DirectiveBound(NamedTuple):
+    """The highest value of a directive's field, and what kind of value it is. The lowest value is 0 for every field."""
+
+    high: float
+    kind: str
+
+    def breaks(self, name: str, value: Any) -> str | None:
+        """What is wrong with a number (NaN is out of bounds), or None."""
+        return None if 0 <= value <= self.high else f"{name} is {value!r}, must be in [0, {self.high:g}]"
+
+
+DIRECTIVE_BOUNDS: dict[str, DirectiveBound] = {
+    "representation": DirectiveBound(int(max(Representation)), "a Representation"),
+    "rho": DirectiveBound(1.0, "a number"),
+    "rate_hz": DirectiveBound(30.0, "a number"),
+    "deadline_s": DirectiveBound(10.0, "a number"),
+    "fusion_weight": DirectiveBound(1.0, "a number"),
+    "duty_percent": DirectiveBound(100, "a whole number"),
+}
+"""The bounds of a directive's numbers: for policies, for the shield and for what comes in over the wire."""
+_MAX_RUNG, _MAX_RHO, _MAX_RATE_HZ, _MAX_DEADLINE_S, _MAX_WEIGHT, _MAX_DUTY = (b.high for b in DIRECTIVE_BOUNDS.values())
+_FAR_M = 3.4028234663852886e38
+"""The largest 32-bit float. The wire carries a disc in 32-bit floats."""
 MAX_REPOSITION_M = 200.0
-"""No drone may ask for a place farther from where it is."""
+"""A drone may not ask for a place farther away than this."""
 
 
 def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
-    """Hold a policy's output to the contract, once, where it enters the fleet.
+    """Check a policy's output against the contract, once, where it enters the fleet.
 
     Raises:
         PolicyError: naming the directive, the field and what it must be.
     """
-    if _plainly_sound(directives, view):
+    if _is_plainly_valid(directives, view):
         return
     seen = {view.ego}
     for d in directives:
-        fault = _fault(d, view, seen)
+        fault = _find_fault(d, view, seen)
         if fault is not None:
             raise PolicyError(fault)
         seen.add(d.destination)
 
 
-def _plainly_sound(directives: Sequence[Directive], view: FleetView) -> bool:
-    """Whether all is sound and of the plain types that nearly every policy uses: it runs thousands of times a sortie."""
+def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
+    """Whether all is valid and of the plain types that nearly every policy uses. Fast: it runs thousands of times a sortie."""
     ego, peers, seen, sound_roi = view.ego, view.descriptors, {view.ego}, None
     add = seen.add
     try:
-        links = len(directives)  # what has no length is not used up here
+        links = len(directives)  # a generator has no length, and is not consumed here
         for d in directives:
             source, destination, rung, rho, roi, rate_hz, deadline_s, weight, duty_percent, reason = d
             if not (
@@ -239,13 +258,13 @@ def _plainly_sound(directives: Sequence[Directive], view: FleetView) -> bool:
                 and source is ego  # ids are small ints, of which Python has one each
                 and destination.__class__ is int
                 and destination in peers
-                and (rung.__class__ is Representation or (rung.__class__ is int and 0 <= rung <= 4))
-                and 0.0 <= rho <= 1.0
-                and 0.0 <= rate_hz <= MAX_RATE_HZ
-                and 0.0 <= deadline_s <= MAX_DEADLINE_S
-                and 0.0 <= weight <= 1.0
+                and (rung.__class__ is Representation or (rung.__class__ is int and 0 <= rung <= _MAX_RUNG))
+                and 0.0 <= rho <= _MAX_RHO
+                and 0.0 <= rate_hz <= _MAX_RATE_HZ
+                and 0.0 <= deadline_s <= _MAX_DEADLINE_S
+                and 0.0 <= weight <= _MAX_WEIGHT
                 and duty_percent.__class__ is int
-                and 0 <= duty_percent <= 100
+                and 0 <= duty_percent <= _MAX_DUTY
                 and reason.__class__ is str
             ):
                 return False
@@ -265,44 +284,44 @@ def _plainly_sound(directives: Sequence[Directive], view: FleetView) -> bool:
     return len(seen) == links + 1  # no link twice, none to the ego itself
 
 
-def check_reposition(asked: object, view: FleetView) -> None:
-    """Hold what a viewpoint returned to the contract, once, where it enters the fleet.
+def check_reposition(request: object, view: FleetView) -> None:
+    """Check what a viewpoint returned against the contract, once, where it enters the fleet.
 
     Raises:
         PolicyError: naming the drone, the field and what it must be.
     """
-    if asked is None:
+    if request is None:
         return
-    if not isinstance(asked, Reposition):
-        raise PolicyError(f"a viewpoint returns Reposition or None, got {type(asked).__name__}")
+    if not isinstance(request, Reposition):
+        raise PolicyError(f"a viewpoint returns Reposition or None, got {type(request).__name__}")
     where, me = f"reposition of drone {view.ego}", view.me
     if me is None:
-        raise PolicyError(f"{where}: asked for in a view without it, must be None")
-    if not isinstance(asked.reason, str):
-        raise PolicyError(f"{where}: reason is {asked.reason!r}, must be text")
+        raise PolicyError(f"{where}: the view has no descriptor of it, must be None")
+    if not isinstance(request.reason, str):
+        raise PolicyError(f"{where}: reason is {request.reason!r}, must be text")
     away_m = []
-    for name, value, here_m in (("x_m", asked.x_m, me.position_m[0]), ("y_m", asked.y_m, me.position_m[1])):
+    for name, value, here_m in (("x_m", request.x_m, me.position_m[0]), ("y_m", request.y_m, me.position_m[1])):
         try:
             away_m.append(math.fabs(value - here_m))
         except Exception as error:  # only a number does this; the message names what came instead
             raise PolicyError(f"{where}: {name} is {value!r}, must be a number") from error
     far_m = math.hypot(*away_m)
     if not far_m <= MAX_REPOSITION_M:  # also catches NaN
-        raise PolicyError(f"{where}: {far_m:.1f} m from where it is, must be at most {MAX_REPOSITION_M:g} m")
+        raise PolicyError(f"{where}: {far_m:.1f} m from the drone, must be at most {MAX_REPOSITION_M:g} m")
 
 
-def kind_fault(d: object) -> str | None:
-    """What is no number, disc or text where a directive must have one, whatever the bounds; None where all are."""
+def find_wrong_type(d: object) -> str | None:
+    """The first field of a directive that is of a wrong type, as an error text; None if all types are right."""
     if not isinstance(d, Directive):
         return f"a policy returns Directive, got {type(d).__name__}"
     where = f"directive {d.source}→{d.destination}"
     for name in ("source", "destination"):
         if not _is_whole(getattr(d, name)):
             return f"{where}: {name} is {getattr(d, name)!r}, must be a drone's id, a whole number"
-    for name, low, high, kind in _BOUNDS:
+    for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
-        if not _compares(value, low, high) or (kind != "a number" and not _is_whole(value)):
-            return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}], {kind}"
+        if not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
+            return f"{where}: {name} is {value!r}, must be in [0, {high:g}], {kind}"
     if not (d.roi is None or isinstance(d.roi, Disc)):
         return f"{where}: roi is {d.roi!r}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
@@ -313,9 +332,9 @@ def kind_fault(d: object) -> str | None:
     return None
 
 
-def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
-    """What is wrong with a directive; None where it is sound and only made of rarer types, such as numpy's."""
-    wrong = kind_fault(d)
+def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
+    """What is wrong with a directive; None if it is valid and only has rarer types, such as numpy's."""
+    wrong = find_wrong_type(d)
     if wrong is not None:
         return wrong
     where = f"directive {d.source}→{d.destination}"
@@ -323,10 +342,10 @@ def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
         return f"{where}: source is {d.source}, must be the ego {view.ego}"
     if d.destination == view.ego or d.destination not in view.descriptors:
         return f"{where}: destination {d.destination} is not a peer in the view {list(view.peers)}"
-    for name, low, high, _ in _BOUNDS:
-        value = getattr(d, name)
-        if not low <= value <= high:  # also catches NaN
-            return f"{where}: {name} is {value!r}, must be in [{low:g}, {high:g}]"
+    for name, bound in DIRECTIVE_BOUNDS.items():
+        wrong = bound.breaks(name, getattr(d, name))
+        if wrong is not None:
+            return f"{where}: {wrong}"
     if d.roi is not None:
         if not d.roi.radius_m > 0:
             return f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0"
@@ -337,7 +356,7 @@ def _fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
 
 
 def _compares(value: Any, low: float, high: float) -> bool:
-    """Whether it is a number, of whatever type: one that can be held against its bounds."""
+    """Whether a value can be compared with its bounds: a number of any type."""
     try:
         bool(low <= value <= high)
     except Exception:  # whatever a foreign type raises
@@ -346,21 +365,9 @@ def _compares(value: Any, low: float, high: float) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether it is an int of whatever type, as the wire needs it: 2 and numpy's 2, not 2.0."""
+    """Whether a value is an integer of any type, as the wire needs it: 2 and numpy's 2, not 2.0."""
     try:
         operator.index(value)
     except TypeError:
         return False
     return True
-
-
-_FAR_M = 3.4028234663852886e38
-"""The largest float of 32 bits, as which a disc goes over the wire."""
-_BOUNDS = (
-    ("representation", 0, 4, "a Representation"),
-    ("rho", 0.0, 1.0, "a number"),
-    ("rate_hz", 0.0, MAX_RATE_HZ, "a number"),
-    ("deadline_s", 0.0, MAX_DEADLINE_S, "a number"),
-    ("fusion_weight", 0.0, 1.0, "a number"),
-    ("duty_percent", 0, 100, "a whole number"),
-)

@@ -1,9 +1,11 @@
-"""Damping about a policy: small changes of context are not read, passing ones do not switch the link.
+"""Damping around a policy: it does not read small changes of context, and short changes do not switch a link.
 
-Before the policy a hysteresis band (`believed`): of what can flicker, what a policy reads falls at once and rises only
-by more than the band, so that a threshold switches up that much higher than it switches down. After it a dwell time
-(`damp`): reductions at once, upgrades once they were asked for without a break for so long, repeats for free. The
-number of upgrades in t seconds is at most 1 + t / dwell (average dwell time, FACTS §5). Pure functions both.
+Before the policy there is a hysteresis band (`apply_hysteresis`). A value that a policy reads falls at once and rises
+only by more than the band. A threshold therefore switches up at a higher value than it switches down.
+
+After the policy there is a dwell time (`damp`). Reductions take effect at once. Upgrades take effect when they have
+been proposed without a break for the dwell time. Repeating a directive changes nothing. There are at most 1 + t / dwell
+upgrades in t seconds (average dwell time; Hespanha & Morse 1999). Both functions are pure.
 """
 
 from __future__ import annotations
@@ -15,46 +17,46 @@ from sortie.policies.contract import Descriptor, Directive, Disc, Representation
 
 _NONE = Representation.NONE
 SAME_DISC_M = 1.6
-"""A disc that moved less, half a feature cell, is the same disc: it would select almost the same cells."""
+"""A disc that moved by less than this (half a feature cell) is the same disc: it selects almost the same cells."""
 EPSILON_S = 1e-9
-"""Clocks step in frames: a dwell of 1 s is over at the tenth frame whatever the last bit says."""
+"""Tolerance of times: a dwell of 1 s is over at the tenth frame, whatever the rounding."""
 
 
-def believed(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
-    """What a policy reads of a drone: its goodput, charge and headrooms with a hysteresis band, all else as heard.
+def apply_hysteresis(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
+    """A descriptor as a policy reads it: goodput, charge and headrooms with a hysteresis band, all else as heard.
 
     The play operator (backlash) of width h in the logarithm: for a quantity u the value read is
     min(u, max(value read before, u / (1 + h))).
 
     Args:
-        before: what it read of that drone the last time.
+        before: the descriptor of that drone that it read the last time.
         heard: the drone's new descriptor.
         hysteresis: h, the share by which a quantity must rise before its rise is read, ≥ 0.
 
     Returns:
-        A descriptor that is nowhere better than `heard`; `heard` itself where they are equal.
+        A descriptor of which no value is better than in `heard`; `heard` itself if they are equal.
     """
     if not hysteresis:
         return heard
-    asked = _answered.get(heard.agent_id)  # all that heard one broadcast ask the same, each in its turn
-    if asked is not None and asked[0] is before and asked[1] is heard and asked[2] == hysteresis:
-        return asked[3]
-    answer = _banded(before, heard, hysteresis)
-    _answered[heard.agent_id] = before, heard, hysteresis, answer
-    return answer
+    last = _last_results.get(heard.agent_id)  # all receivers of one broadcast call this with the same arguments in turn
+    if last is not None and last[0] is before and last[1] is heard and last[2] == hysteresis:
+        return last[3]
+    result = _banded(before, heard, hysteresis)
+    _last_results[heard.agent_id] = before, heard, hysteresis, result
+    return result
 
 
-_answered: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
-"""By drone: what was asked of `believed` last, and its answer."""
+_last_results: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
+"""By drone: the last arguments of `apply_hysteresis`, and its result."""
 
 
 def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
     part = 1.0 / (1.0 + hysteresis)
-    # taken apart and built anew as a whole: every drone reads every other one in every frame
+    # unpacked and built again for speed: every drone reads every other one in every frame
     (
-        stamp, agent, at, turn, velocity, footprint, told_soc, told_cpu, told_gpu, told_links, grid, flags, phase, region, targets,
+        stamp, agent, at, turn, velocity, footprint, heard_soc, heard_cpu, heard_gpu, heard_links, grid, flags, phase, region, targets,
     ) = heard  # fmt: skip
-    soc, cpu, gpu, links, last = told_soc, told_cpu, told_gpu, told_links, before.peer_goodput_mbps
+    soc, cpu, gpu, links, last = heard_soc, heard_cpu, heard_gpu, heard_links, before.peer_goodput_mbps
     if links != last and len(links) == len(last):  # else the roster is another
         links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
     if soc > before.battery_soc:
@@ -63,7 +65,7 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
         cpu = max(before.cpu_headroom, cpu * part)
     if gpu > before.gpu_headroom:
         gpu = max(before.gpu_headroom, gpu * part)
-    if soc == told_soc and cpu == told_cpu and gpu == told_gpu and links == told_links:
+    if soc == heard_soc and cpu == heard_cpu and gpu == heard_gpu and links == heard_links:
         return heard
     return Descriptor(
         stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets
@@ -71,10 +73,10 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
 
 
 class LinkState(NamedTuple):
-    """What the gate enforces on a link, and since when more is being asked for (None: it is not)."""
+    """The directive in force on a link, and since when an upgrade has been proposed (None: none is)."""
 
     enforced: Directive
-    asking_since_s: float | None = None
+    upgrade_since_s: float | None = None
 
 
 def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) -> LinkState:
@@ -82,37 +84,37 @@ def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) ->
 
     Args:
         state: its present state.
-        proposed: what the policy, capped by the staleness rules, asks for now.
+        proposed: the policy's directive, after the staleness rules.
         now_s: the drone's clock.
-        dwell_s: how long an upgrade must be asked for.
+        dwell_s: how long an upgrade must be proposed.
 
     Returns:
-        `state` itself where nothing changes (a repeated directive restarts no timer), otherwise a new one whose
+        `state` itself if nothing changes (a repeated directive restarts no timer). Otherwise a new state: its
         directive is `proposed`, or the lower of both in every part while an upgrade waits.
     """
     current = state.enforced
-    if state.asking_since_s is not None:
+    if state.upgrade_since_s is not None:
         if proposed == current:
             return LinkState(current)
     elif proposed is current:
         return state
     elif _level(proposed) == _level(current):
         # A disc that follows its target, a deadline: no step on the ladder.
-        return state if _hardly_moved(proposed, current) else LinkState(proposed)
+        return state if _is_small_move(proposed, current) else LinkState(proposed)
     lower = _lower_of(current, proposed)
     if lower == proposed:
         return LinkState(proposed)
-    since_s = now_s if state.asking_since_s is None else state.asking_since_s
+    since_s = now_s if state.upgrade_since_s is None else state.upgrade_since_s
     if now_s - since_s >= dwell_s - EPSILON_S:
         return LinkState(proposed)
-    if lower == current and since_s == state.asking_since_s:
+    if lower == current and since_s == state.upgrade_since_s:
         return state
     # The reason in force stays while only an upgrade waits; a reduction brings its own.
     return LinkState(current if lower == current else lower, since_s)
 
 
 def _lower_of(current: Directive, proposed: Directive) -> Directive:
-    """The directive that is nowhere above either: what may be enforced at once."""
+    """The lower of two directives in every part: what may take effect at once."""
     if current.representation == _NONE:
         # Nothing flows, so the duty cycle alone can be lowered.
         duty = min(current.duty_percent, proposed.duty_percent)
@@ -131,12 +133,12 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
     )
     if reduced == current:
         return current
-    # A disc that moved while an upgrade waits is not that upgrade's doing: its reason would mislead.
+    # A disc that moved while an upgrade waits does not come from that upgrade, so its reason would mislead.
     return reduced._replace(reason=current.reason) if _level(reduced) == _level(current) else reduced
 
 
-def _hardly_moved(proposed: Directive, current: Directive) -> bool:
-    """Whether two directives of one level are equal, or differ by a small step of their disc alone."""
+def _is_small_move(proposed: Directive, current: Directive) -> bool:
+    """Whether two directives of one level are equal, or differ only by a small move of their disc."""
     a, b = proposed.roi, current.roi
     if proposed.deadline_s != current.deadline_s:
         return False

@@ -1,16 +1,13 @@
-"""Plane geometry that policies share: overlaps of footprints, from descriptor fields alone."""
+"""Overlap of footprints, from descriptor fields alone, for several policies."""
 
 from __future__ import annotations
 
 from math import acos, copysign, hypot, pi, sqrt
 
-from sortie.policies.contract import Descriptor, FleetView
+from sortie.policies.contract import AGENT_IDS, Descriptor, FleetView
 
 OVERLAP_STEP = 0.1
 """Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""
-
-
-_IDS = 256  # agent_id is a byte
 
 
 def circle_overlap(distance_m: float, radius_a_m: float, radius_b_m: float) -> float:
@@ -41,9 +38,9 @@ def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
 
 
 def peers_by_overlap(view: FleetView) -> list[int]:
-    """Peers by falling footprint overlap with the ego, in steps of `OVERLAP_STEP`.
+    """Peers in order of footprint overlap with the ego, largest first, in steps of `OVERLAP_STEP`.
 
-    Ties go round by id, beginning after the ego, so that drones in one place do not all choose the same peers.
+    Ties are broken by id, beginning after the ego, so that drones in one place do not all choose the same peers.
     """
     me = view.me
     if me is None:
@@ -54,6 +51,6 @@ def peers_by_overlap(view: FleetView) -> list[int]:
         if p != ego:
             px_m, py_m, _ = peer.position_m
             overlap = circle_overlap(hypot(x_m - px_m, y_m - py_m), radius_m, peer.footprint_radius_m)
-            ranked.append((-round(overlap / OVERLAP_STEP), (p - ego) % _IDS, p))
+            ranked.append((-round(overlap / OVERLAP_STEP), (p - ego) % AGENT_IDS, p))
     ranked.sort()
     return [p for _, _, p in ranked]

@@ -1,9 +1,8 @@
-"""The table of policies, and the way from a name in a scenario to a callable."""
+"""The registered policies, and `resolve`: from a policy's name in a scenario to its function."""
 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import inspect
 import math
 import numbers
@@ -18,6 +17,7 @@ from sortie.policies.catalogue.prior import METHODS
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
+from sortie.policies.user_code import imported_files, is_users, load
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worked": worked,
@@ -33,13 +33,13 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "vantage": vantage,
     **{name: method.policy for name, method in METHODS.items()},
 }
-"""One line a policy. Keyword-only arguments are its parameters."""
+"""One line for each policy. Its keyword-only arguments are its parameters."""
 
 
 class Bound(NamedTuple):
-    """What a parameter must be."""
+    """The allowed values of a parameter, and the text for its error message."""
 
-    words: str
+    text: str
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
@@ -58,12 +58,8 @@ BOUNDS: dict[str, Bound] = {
     "sharpness": Bound("a number in [0, 100]", 0, 100),  # e to the power of some 700 is no float any more
     "trusted_for_s": Bound("a number in [0.001, 3600]", 0.001, 3600),
 }
-"""Of the registered policies' parameters, by name; one that has none here is its function's to judge, as all are that a
-user's file declares."""
-
-
-_MODULE = "sortie_policy_"
-"""How modules of policies from files are called."""
+"""The bounds of the registered policies' parameters, by name. A policy checks all other parameters itself, and so does a
+user's file."""
 
 
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
@@ -83,32 +79,41 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
             raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
         bound = BOUNDS.get(key) if name in POLICIES else None
         if bound is not None and not bound.holds(value):
-            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.words}")
+            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.text}")
     return functools.partial(function, **params) if params else function
 
 
-def told(error: Exception) -> str:
-    """An exception out of a policy in words, with the last line that it came through of a file that was not registered."""
+def modules_of(reference: str) -> tuple[Path, ...]:
+    """The files that a policy's code is in: its own and those that it imports (`imported_files`); none if registered.
+
+    Raises:
+        PolicyError: the file is missing.
+    """
+    return imported_files(_file_of(reference)[0]) if ":" in reference else ()
+
+
+def describe_error(error: Exception) -> str:
+    """An exception that a policy raised, and the last line of the user's own files that it passed through."""
     frames = traceback.walk_tb(error.__traceback__)
-    lines = [(f.f_code.co_filename, n) for f, n in frames if str(f.f_globals.get("__name__")).startswith(_MODULE)]
+    lines = [(f.f_code.co_filename, n) for f, n in frames if is_users(f.f_globals.get("__name__"))]
     place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
     return f"{type(error).__name__}: {error}{place}"
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
-    """What a drone under this policy sends to each peer and frame before any payload; 0 where it asks for nothing."""
+    """Bytes that a drone under this policy sends to each peer in each frame before any payload; 0 without a handshake."""
     method = METHODS.get(name)
     return 0 if method is None else method.handshake_bytes(params or {})
 
 
 def own_fusion(name: str) -> str | None:
-    """The fusion that a prior method was published with, a value of `perception.fusion`; None where it has none."""
+    """The fusion with which a prior method was published (a value of `perception.fusion`), or None."""
     method = METHODS.get(name)
     return None if method is None else method.fusion
 
 
 def viewpoint_of(policy: Policy) -> Viewpoint | None:
-    """The function by which a policy chooses where to look from, its parameters bound; None where it has none."""
+    """The function by which a policy chooses where to look from, with its parameters bound; None if it has none."""
     bound = policy.keywords if isinstance(policy, functools.partial) else {}
     found = getattr(policy.func if isinstance(policy, functools.partial) else policy, "viewpoint", None)
     shared = {k: v for k, v in bound.items() if k in parameters(found)} if found is not None else {}
@@ -121,19 +126,24 @@ def parameters(function: Callable[..., object]) -> dict[str, object]:
     return {p.name: p.default for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
 
 
-def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
+def _file_of(reference: str) -> tuple[Path, str]:
+    """The file and the function that `path/to/file.py:function` names."""
     file, _, attribute = reference.rpartition(":")
     path = Path(file)
     if not path.is_file():
         raise PolicyError(f"policy file {file!r} not found")
-    spec = importlib.util.spec_from_file_location(f"{_MODULE}{path.stem}", path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py":
         raise PolicyError(f"policy file {file!r} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
+    return path, attribute
+
+
+def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
+    path, attribute = _file_of(reference)
+    file = str(path)
     try:
-        spec.loader.exec_module(module)
+        module = load(path)
     except Exception as error:
-        raise PolicyError(f"policy file {file!r} does not load: {told(error)}") from error
+        raise PolicyError(f"policy file {file!r} does not load: {describe_error(error)}") from error
     function = getattr(module, attribute, None)
     if not callable(function):
         raise PolicyError(f"policy file {file!r} has no function {attribute!r}")

@@ -2,6 +2,7 @@
 
 from sortie.radio.air import Air
 from sortie.radio.counters import Counters
+from sortie.radio.settings import AirSettings, BurstSettings
 from sortie.radio.transmission import Status, Transmission
 
-__all__ = ["Air", "Counters", "Status", "Transmission"]
+__all__ = ["Air", "AirSettings", "BurstSettings", "Counters", "Status", "Transmission"]

@@ -32,8 +32,8 @@ from sortie.radio.mac.medium import Medium
 from sortie.radio.overrides import Overrides
 from sortie.radio.relay import Routes
 from sortie.radio.sample import IntArray, Sample, Service
+from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
-from sortie.scenarios.schema import Radio
 from sortie.scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample asks some ten times
@@ -44,11 +44,11 @@ _WINDOW_S = 1e-3
 
 
 class Air:
-    """Bytes and positions in, fates out.
+    """The channel that a fleet shares: takes bytes and positions, returns what happened to each sample.
 
     Args:
         env: the clock.
-        config: the scenario's radio section.
+        settings: see `sortie.radio.settings.AirSettings`.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
@@ -58,12 +58,26 @@ class Air:
         up: [T, N, 3], ENU: the unit vector along each airframe's z axis, for the antennas; None is level flight.
 
     `advance` must be called before the first `broadcast` or `send`.
+
+    Example, two drones 20 m apart for ten frames:
+
+    >>> import numpy as np, simpy
+    >>> from sortie.radio import Air, AirSettings
+    >>> env = simpy.Environment()
+    >>> positions_m = np.broadcast_to([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]], (10, 2, 3))
+    >>> air = Air(env, AirSettings(bandwidth_mhz=20), positions_m, seed=1, frame_s=0.1)
+    >>> air.advance()
+    >>> rows = []
+    >>> number = air.send(0, 1, 13_120, kind="features", reliable=False, deadline_s=0.065, on_done=rows.append)
+    >>> env.run(until=0.1)
+    >>> rows[0].status.name
+    'DELIVERED'
     """
 
     def __init__(
         self,
         env: simpy.Environment,
-        config: Radio,
+        settings: AirSettings,
         positions_m: ArrayLike,
         *,
         seed: int,
@@ -75,28 +89,28 @@ class Air:
         if not 0.0 <= publish_spread <= 1.0:
             raise ValueError(f"publish_spread is {publish_spread!r}, must be in [0, 1]")
         self._env = env
-        self._config = config
-        self.channel = Channel(config, positions_m, seed, replication, frame_s, up)
+        self._settings = settings
+        self.channel = Channel(settings, positions_m, seed, replication, frame_s, up)
         self._n = n_drones = self.channel.n
         self.counters = Counters()
         self._gone: set[int] = set()
         self._overrides: Overrides | None = None
-        if Overrides.wanted(config):
-            trace = None if config.trace is None else read_links(config.trace, n_drones)
-            self._overrides = Overrides(config, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
+        if Overrides.wanted(settings):
+            trace = None if settings.trace is None else read_links(settings.trace, n_drones)
+            self._overrides = Overrides(settings, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
         self._broadcasts = Broadcasts(
-            config, self.channel, self.counters, self._gone, self._overrides,
+            settings, self.channel, self.counters, self._gone, self._overrides,
             seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
         )  # fmt: skip
         self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
-        self._service = Service(config, seed, replication)
+        self._service = Service(settings, seed, replication)
         self._luck = SampleLuck(seed, replication)
         self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, once asked for
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._in_flight: dict[int, Sample] = {}
         self._latest: dict[tuple[int, int, int, str], Sample] = {}
-        self._routes = Routes(config.relay_max_hops) if config.relay_max_hops > 1 else None
+        self._routes = Routes(settings.relay_max_hops) if settings.relay_max_hops > 1 else None
         self._seed = (seed, replication)
         self._numbers = 0
 
@@ -211,7 +225,7 @@ class Air:
         hop = receiver if self._routes is None else self._routes.next_hop(sender, receiver, self._routes.max_hops)
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            *sample_wire(payload_bytes, piece_bytes or self._config.fragment_bytes, piece_bytes is not None),
+            *sample_wire(payload_bytes, piece_bytes or self._settings.fragment_bytes, piece_bytes is not None),
             self._luck.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
             self._order,
         )  # fmt: skip
@@ -297,7 +311,7 @@ class Air:
         lost = s.lose()
         if lost and s.reliable:
             s.left = lost
-            wait_s = self._config.heartbeat_s + self._config.nack_delay_s
+            wait_s = self._settings.heartbeat_s + self._settings.nack_delay_s
             wait_s = max(0.0, min(wait_s, s.deadline_s - now_s))
             self._env.timeout(wait_s, s).callbacks.append(self._repair)
         elif s.receiver != s.target and (lost == 0 or any(map(len, s.arrived))):

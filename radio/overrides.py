@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sortie.radio.channel.bursts import PairNumbers, PairStates
 from sortie.radio.channel.traces import Given, LinkTrace
 from sortie.radio.rates import group_mcs, rate_table
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 FloatArray = NDArray[np.float64]
 _GOLDEN = 0.6180339887498949
@@ -38,7 +38,7 @@ class Overrides:
     """Traces and bursts, frame by frame.
 
     Args:
-        config: the scenario's radio section.
+        settings: see `sortie.radio.settings.AirSettings`.
         trace: None where there is none.
         n: number of drones.
         seed, replication: as in `sortie.scenarios.streams.stream`.
@@ -46,10 +46,10 @@ class Overrides:
     """
 
     def __init__(
-        self, config: Radio, trace: LinkTrace | None, n: int, *, seed: int, replication: int, frame_s: float
+        self, settings: AirSettings, trace: LinkTrace | None, n: int, *, seed: int, replication: int, frame_s: float
     ) -> None:
         self._n, self._frame_s, self._trace = n, frame_s, trace
-        bursts = config.bursts
+        bursts = settings.bursts
         self._states = None
         if bursts.good_to_bad > 0.0 or bursts.loss_good > 0.0:
             self._states = PairStates(bursts, n, seed, replication, frame_s)
@@ -60,16 +60,16 @@ class Overrides:
         self._burst_loss: FloatArray = np.zeros((n, n))
         self._luck: FloatArray = np.zeros((n, n))
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
-        self._group_gain_db = 10.0 * float(np.log10(config.bandwidth_mhz / 20.0))
-        self._group_mcs = group_mcs(config.group_rate_mbps)
-        self._k_db = config.rician_k_db
+        self._group_gain_db = 10.0 * float(np.log10(settings.bandwidth_mhz / 20.0))
+        self._group_mcs = group_mcs(settings.group_rate_mbps)
+        self._k_db = settings.rician_k_db
         self._snr_rows: list[list[float]] | None = None
         self._known_rows: list[list[float]] | None = None
 
     @classmethod
-    def wanted(cls, config: Radio) -> bool:
+    def wanted(cls, settings: AirSettings) -> bool:
         """Whether the scenario has any."""
-        return config.trace is not None or config.bursts.good_to_bad > 0.0 or config.bursts.loss_good > 0.0
+        return settings.trace is not None or settings.bursts.good_to_bad > 0.0 or settings.bursts.loss_good > 0.0
 
     def advance(self, extra_loss_db: ArrayLike | None, noise_rise_db: ArrayLike | None = None) -> None:
         """Move on by one frame.

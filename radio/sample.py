@@ -24,8 +24,8 @@ from sortie.radio.mac.jobs import AirJob
 from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
 from sortie.radio.rates import STANDARDS, rate_table, rescale
+from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission, losses
-from sortie.scenarios.schema import Radio
 
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
@@ -210,16 +210,16 @@ class Sample(AirJob):
 class Service:
     """What a link of a given quality asks of the medium for a sample: rate control, MAC retries, exchanges."""
 
-    def __init__(self, config: Radio, seed: int, replication: int) -> None:
-        self._config = config
-        self._frame_bytes = frame_bytes(config.fragment_bytes, fragmented=True)
-        self._standard = STANDARDS[config.standard]
-        self._table = rate_table(config.bandwidth_mhz, config.rician_k_db, self._frame_bytes, config.standard)
-        self._rates = self._standard.rates_mbps[config.bandwidth_mhz]
+    def __init__(self, settings: AirSettings, seed: int, replication: int) -> None:
+        self._settings = settings
+        self._frame_bytes = frame_bytes(settings.fragment_bytes, fragmented=True)
+        self._standard = STANDARDS[settings.standard]
+        self._table = rate_table(settings.bandwidth_mhz, settings.rician_k_db, self._frame_bytes, settings.standard)
+        self._rates = self._standard.rates_mbps[settings.bandwidth_mhz]
         self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
-        self._minstrel = Minstrel(self._rates, seed, replication) if config.rate_control == "minstrel" else None
+        self._minstrel = Minstrel(self._rates, seed, replication) if settings.rate_control == "minstrel" else None
         probe = frames_exchanges(1, self._frame_bytes, self._frame_bytes, self._rates[0], 1, ACK_S, self._standard)
-        self._probe = probe.scaled(config.retry_limit + 1.0)
+        self._probe = probe.scaled(settings.retry_limit + 1.0)
         self._mbps_at: FloatArray | None = None
         # both are the same again and again: links are looked up on a grid of SNR, payloads come in few sizes
         self._demands: dict[tuple[int, int, bool, int], Exchanges] = {}
@@ -312,14 +312,14 @@ class Service:
         """Mean tries, loss after all of them, and payload rate of full A-MPDUs, of frames that fail with `per`."""
         if len(self._qualities) > _MAX_DEMANDS:
             self._qualities.clear()
-        limit = self._config.retry_limit
+        limit = self._settings.retry_limit
         mean_tries, loss = tries(per, limit), residual_loss(per, limit)
         found = self._qualities[mcs, per] = (mean_tries, loss, self._full_mbps[mcs] / mean_tries * (1.0 - loss))
         return found
 
     def repair_payload(self, s: Sample) -> int:
         """Payload bytes of the fragments that are left."""
-        return min(s.payload_bytes, s.left * (s.piece_bytes or self._config.fragment_bytes))
+        return min(s.payload_bytes, s.left * (s.piece_bytes or self._settings.fragment_bytes))
 
     def wire_bytes(self, s: Sample) -> int:
         """Bytes of the frames of the fragments that are left."""
@@ -349,7 +349,7 @@ class Service:
         return mbps
 
     def _demand(self, payload_bytes: int, mcs: int, reliable: bool, piece_bytes: int) -> Exchanges:
-        c, rate = self._config, self._rates[mcs]
+        c, rate = self._settings, self._rates[mcs]
         demand = sample_exchanges(
             payload_bytes, piece_bytes or c.fragment_bytes, rate, c.max_ampdu_frames, self._standard, piece_bytes > 0
         )
@@ -360,7 +360,7 @@ class Service:
 
     def _full_goodput(self, rate_mbps: float) -> float:
         """Payload Mb/s of full A-MPDUs without loss, alone on the channel."""
-        c = self._config
+        c = self._settings
         m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames, self._standard)
         exchanges = frames_exchanges(
             m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames, standard=self._standard

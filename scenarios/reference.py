@@ -18,6 +18,7 @@ from pydantic_core import PydanticUndefined
 
 from sortie.scenarios.reading.explain import sections_of
 from sortie.scenarios.schema import Scenario, json_schema
+from sortie.scenarios.schema.base import PresetSection
 
 HERE = Path(__file__).parent
 BEGIN, END = "<!-- fields: made by python -m sortie.scenarios.reference -->", "<!-- end of fields -->"
@@ -83,7 +84,9 @@ def _type(annotation: Any) -> str:
         return _type(args[0]) + (f", {bounds}" if bounds else "")
     if origin is Literal:
         return ", ".join(f"`{arg}`" for arg in args)
-    if sections_of(annotation):
+    if sections := sections_of(annotation):
+        if issubclass(sections[0], PresetSection):
+            return f"{', '.join(f'`{name}`' for name in sections[0].presets)} or section"
         return "list of sections" if origin is tuple else "section"
     if origin is tuple:
         inner = "; ".join(dict.fromkeys(_type(arg) for arg in args if arg is not Ellipsis))

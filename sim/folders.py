@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
-from sortie.perception.evaluation.report import put_into
 from sortie.scenarios.errors import SortieError
 
 
@@ -101,10 +101,21 @@ def write_durably(path: Path, data: bytes) -> None:
     Raises:
         OSError: the disk refuses.
     """
+    with writing_durably(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def writing_durably(path: Path) -> Iterator[BinaryIO]:
+    """A file to write, as `write_durably` does, piece by piece; where the block fails, an older file stays.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     partial = partial_file(path)
     try:
         with partial.open("wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
@@ -136,9 +147,25 @@ def put_between(path: Path, section: str, begin: str, end: str) -> None:
     write_text(path, _put_between(path, section, begin, end))
 
 
+def replace_section(text: str, section: str, begin: str, end: str) -> str:
+    """A text with what stands between its markers replaced, the markers too.
+
+    Raises:
+        ValueError: the markers are missing, doubled or in the wrong order.
+
+    Example:
+        >>> replace_section("a <b> old </b> c", "<b> new </b>", "<b>", "</b>")
+        'a <b> new </b> c'
+    """
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"must hold {begin} and {end} once each, in this order")
+    before, _, rest = text.partition(begin)
+    return before + section + rest.partition(end)[2]
+
+
 def _put_between(path: Path, section: str, begin: str, end: str) -> str:
     try:
-        return put_into(path.read_text(encoding="utf-8"), section, begin, end)
+        return replace_section(path.read_text(encoding="utf-8"), section, begin, end)
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
@@ -156,14 +183,14 @@ def _ensure_place(path: Path) -> None:
 
 def _others(folder: Path, written: Collection[str], within: str = "") -> list[str]:
     """What a folder holds and `written` does not name, by its path in it; a folder of such things by its name alone."""
-    found = []
+    names = []
     for entry in sorted(folder.iterdir()):
         name = within + entry.name
         if entry.is_dir() and any(w.startswith(f"{name}/") for w in written):
-            found += _others(entry, written, f"{name}/")
+            names += _others(entry, written, f"{name}/")
         elif entry.is_dir() or (name not in written and entry.name != ".DS_Store"):  # a desktop that looked in
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def _replace(new: Path, path: Path) -> None:

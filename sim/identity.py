@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import re
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+
+from sortie.policies.user_code import imported_files
+from sortie.scenarios.reading.files import named_files
+from sortie.scenarios.schema import Scenario
 
 DISTRIBUTION = "sortie-sim"
 RELEASE = version(DISTRIBUTION)
@@ -45,6 +51,43 @@ def release_of(code: str) -> str:
         '0.1.0'
     """
     return code.partition("+")[0]
+
+
+def user_code(scenario: Scenario, policy: Callable[..., object] | None = None) -> dict[str, str]:
+    """The user's own code that a sortie runs: every Python file that the scenario names, and every module that such a
+    file imports from outside the standard library and installed packages.
+
+    Args:
+        scenario: whose policies and fusion may be in files.
+        policy: a callable that decides in place of the scenario's policy.
+
+    Returns:
+        16 hex digits of SHA-256 by path; a callable that is in no file stands under its name with the digest of its
+        source, or of nothing where Python has none.
+    """
+    named = [Path(name) for name in named_files(scenario.model_dump(mode="json")) if name.endswith(".py")]
+    found = {}
+    if policy is not None:
+        function = inspect.unwrap(policy.func if isinstance(policy, functools.partial) else policy)
+        function = function if inspect.isroutine(function) else type(function)
+        home = str(getattr(function, "__module__", "")).partition(".")[0]
+        try:
+            file = Path(inspect.getsourcefile(function) or "")
+            source = inspect.getsource(function)
+        except (OSError, TypeError):  # typed in, or written in C
+            file, source = Path(), ""
+        if file.is_file() and home != "sortie":
+            named.append(file)
+        elif home != "sortie":
+            found[function.__qualname__] = hashlib.sha256(source.encode()).hexdigest()[:16]
+    files = {file for path in named for file in imported_files(path)}
+    return found | {_shown(path): file_digest(path)[:16] for path in sorted(files)}
+
+
+def _shown(path: Path) -> str:
+    """A path from the working folder where it is below it."""
+    here = Path.cwd()
+    return (path.relative_to(here) if path.is_relative_to(here) else path).as_posix()
 
 
 def file_digest(path: Path) -> str:

@@ -122,7 +122,7 @@ class FleetBatteries:
         idle, active = config.compute_idle_w, config.compute_active_w - config.compute_idle_w
         listen, send = config.radio_idle_w, config.radio_tx_w - config.radio_idle_w
         landing_soc, cutoff_cell_v = config.landing_soc, config.cutoff_cell_v
-        thermal, polarises, warmth = config.ambient_c is not None, config.polarisation_mohm > 0, 1.0
+        thermal, polarises, warmth = config.ambient_c is not None, config.polarisation.resistance_mohm > 0, 1.0
         self._now_s += dt_s
         for i, down in enumerate(landed):
             if down:
@@ -219,8 +219,8 @@ class FleetBatteries:
         """One RC element a cell, exact for a constant current; its resistance ages with the rest, and `current_a` has
         the cold in it."""
         config = self._config
-        towards_v = current_a * config.polarisation_mohm / 1000.0 * self._worn[drone]
-        fades = math.exp(-dt_s / config.polarisation_time_s)
+        towards_v = current_a * config.polarisation.resistance_mohm / 1000.0 * self._worn[drone]
+        fades = math.exp(-dt_s / config.polarisation.time_s)
         self._polarised_v[drone] = towards_v + (self._polarised_v[drone] - towards_v) * fades
 
     def _warm(self, drone: int, lost_w: float, dt_s: float) -> None:

@@ -145,7 +145,8 @@ def terminal_voltage_v(time_s: Array, current_a: Array, pack: Battery, soc: floa
     full_c = pack.capacity_wh * 3600.0 * share / (pack.cells * MEAN_CELL_V)
     step_s = np.diff(time_s)
     drawn_c = np.concatenate([[0.0], np.cumsum(current_a[:-1] * step_s)])
-    fades, towards_v = np.exp(-step_s / pack.polarisation_time_s), current_a * pack.polarisation_mohm / 1000.0 * worse
+    slow = pack.polarisation
+    fades, towards_v = np.exp(-step_s / slow.time_s), current_a * slow.resistance_mohm / 1000.0 * worse
     lag_v = np.zeros(len(time_s))
     for k, fade in enumerate(fades.tolist()):
         lag_v[k + 1] = towards_v[k] + (lag_v[k] - towards_v[k]) * fade

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.formation import slots
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.flight.noise import LAGS, gauss_markov, smooth
 from sortie.fleet.flight.route import frame_path
 from sortie.scenarios import schema
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.formation import slots
 from sortie.scenarios.streams import stream
 
 Array = npt.NDArray[np.float64]

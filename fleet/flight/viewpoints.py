@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sortie.fleet.flight.formation import slots
 from sortie.fleet.flight.motion import MotionError
 from sortie.fleet.flight.route import FramePath, bend, frame_path, spread
 from sortie.scenarios import schema
+from sortie.scenarios.formation import slots
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from sortie.fleet.energy.cell import MEAN_CELL_V, terminal_voltage_v
 from sortie.fleet.logs.flightlog import FlightLog, LogError, Series
-from sortie.scenarios.schema import Battery
+from sortie.scenarios.schema import Battery, Polarisation
 
 Array = npt.NDArray[np.float64]
 
@@ -51,8 +51,8 @@ def identify_pack(log: FlightLog, pack: Battery, until_s: float, polarisation_ti
     time_s, (volts, current) = battery.time_s[first], battery.values[first].T
 
     def with_resistances(mohm: Array) -> Battery:
-        changes = dict(cell_resistance_mohm=mohm[0], polarisation_mohm=mohm[1], polarisation_time_s=polarisation_time_s)
-        return pack.model_copy(update={name: float(value) for name, value in changes.items()})
+        slow = Polarisation(resistance_mohm=float(mohm[1]), time_s=polarisation_time_s)
+        return pack.model_copy(update={"cell_resistance_mohm": float(mohm[0]), "polarisation": slow})
 
     found = least_squares(
         lambda mohm: terminal_voltage_v(time_s, current, with_resistances(mohm), soc) - volts,

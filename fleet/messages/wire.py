@@ -15,8 +15,8 @@ from math import isfinite
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
 from sortie.fleet.messages.compact import MARK, decode_compact
 from sortie.policies.contract import (
-    MAX_DEADLINE_S,
-    MAX_RATE_HZ,
+    COVERAGE_BYTES,
+    DIRECTIVE_BOUNDS,
     Descriptor,
     Directive,
     Disc,
@@ -26,7 +26,6 @@ from sortie.policies.contract import (
 from sortie.scenarios.errors import SortieError
 
 MAX_DESCRIPTOR_BYTES = 1024
-COVERAGE_BYTES = 64
 MAX_AGENT_ID = 254
 
 _MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"
@@ -43,7 +42,6 @@ _GOODPUT_COUNT_AT = layout(*_FRONT, ("I", 1))[1][-1]
 _TARGET_COUNT_AT = layout(*_FRONT, ("I", 1), *_BACK)[1][-1]  # without peers; each moves it by 4 B
 _DIRECTIVE = layout(("B", 4), ("f", 3), ("f", 4))[0]
 _PHASES = {int(phase): phase for phase in TaskPhase}
-_RUNGS = {int(rung): rung for rung in Representation}
 
 
 @lru_cache(maxsize=1024)
@@ -220,17 +218,11 @@ def decode_directive(data: bytes) -> Directive:
         raise MalformedDatagram("a float is not finite")
     if source > MAX_AGENT_ID or destination > MAX_AGENT_ID or source == destination:
         raise MalformedDatagram(f"link {source}→{destination} is none")
-    if rung not in _RUNGS:
-        raise MalformedDatagram(f"representation is {rung}, must be at most {len(_RUNGS) - 1}")
-    if duty > 100:
-        raise MalformedDatagram(f"duty_percent is {duty}, must be at most 100")
-    if not (0 <= rho <= 1 and 0 <= weight <= 1):
-        raise MalformedDatagram(f"rho, fusion_weight are {rho:g}, {weight:g}, must be in [0, 1]")
-    if not (0 <= rate <= MAX_RATE_HZ and 0 <= deadline <= MAX_DEADLINE_S):
-        raise MalformedDatagram(
-            f"rate, deadline are {rate:g}, {deadline:g}, must be in [0, {MAX_RATE_HZ:g}], [0, {MAX_DEADLINE_S:g}]"
-        )
+    for (name, bound), value in zip(DIRECTIVE_BOUNDS.items(), (rung, rho, rate, deadline, weight, duty), strict=True):
+        wrong = bound.breaks(name, value)
+        if wrong is not None:
+            raise MalformedDatagram(wrong)
     if radius < 0 or (radius == 0 and not x == y == 0):
         raise MalformedDatagram(f"roi is ({x:g}, {y:g}, {radius:g}), neither a disc nor none")
     roi = Disc(x, y, radius) if radius > 0 else None
-    return Directive(source, destination, _RUNGS[rung], rho, roi, rate, deadline, weight, duty)
+    return Directive(source, destination, Representation(rung), rho, roi, rate, deadline, weight, duty)

@@ -1,1 +1,1 @@
-"""The benchmark: seeded splits of procedural scenes that anyone can make again."""
+"""The benchmark: seeded splits of procedural scenes that anyone can reproduce."""

@@ -1,4 +1,4 @@
-"""A frame of the benchmark on one page: what five drones saw, what the lift makes of it, and what was there."""
+"""A frame of the benchmark on one page: five drones' views, their bird's-eye images, and the cars."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
-from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
+from sortie.perception.files import replacing
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import CAMERAS, Renderer
-from sortie.perception.scene.scene_model import SceneModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SEEN_COLOUR, PEER_COLOUR, HIDDEN_COLOUR = "#ffd23f", "#4cc9f0", "#ff3b5c"
 
 
-def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
+def draw(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
     """A row of views for each drone; below, a bird's-eye image for each with the cars in its square.
 
     Yellow: the drone sees it; blue: only another does; red: none. By straight lines (`visibility.py`), not by a network.
@@ -36,7 +36,7 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
     if index < 0 or frame < 0:
         raise ValueError(f"scene {index}, frame {frame}: must be 0 or above")
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
     views = Renderer(scene, scene_id(bench.seed, split, index)).render(captures)
     ground = lift(views, captures, bench.geometry).numpy()
@@ -54,16 +54,16 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
         ax = axes[DRONES, d]
         # row 0 is the rearmost, column 0 the rightmost: shown with forward up and left to the left
         ax.imshow(ground[d, :3].transpose(1, 2, 0)[::-1, ::-1], extent=(half, -half, -half, half))
-        asked = inside(capture, cars, half)
+        counted = inside(capture, cars, half)
         c, s = np.cos(capture.true_yaw_rad), np.sin(capture.true_yaw_rad)
-        for k in np.flatnonzero(asked):
+        for k in np.flatnonzero(counted):
             corners = _corners(cars.length_m[k], cars.width_m[k], cars.yaw_rad[k])
             corners += (cars.x_m[k] - capture.position_m[0], cars.y_m[k] - capture.position_m[1])
             local = corners @ np.array([[c, -s], [s, c]])  # forward, left
             colour = SEEN_COLOUR if seen[d, k] else PEER_COLOUR if seen[:, k].any() else HIDDEN_COLOUR
             ax.add_patch(Polygon(local[:, ::-1], closed=True, fill=False, edgecolor=colour, linewidth=0.9))
         others = seen.any(axis=0)
-        counts = f"drone {d}: {asked.sum()} cars: sees {(asked & seen[d]).sum()}, fleet {(asked & others).sum()}"
+        counts = f"drone {d}: {counted.sum()} cars: sees {(counted & seen[d]).sum()}, fleet {(counted & others).sum()}"
         ax.set_title(counts, fontsize=9)
         ax.set_xlim(half, -half)
         ax.set_ylim(-half, half)
@@ -81,10 +81,8 @@ def sheet(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """As a PNG, under a temporary name first."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.stem}.part.png")
-    figure.savefig(part, dpi=110)
-    part.replace(path)
+    with replacing(path) as part:
+        figure.savefig(part, format="png", dpi=110)
 
 
 def _corners(length: float, width: float, yaw: float) -> np.ndarray:

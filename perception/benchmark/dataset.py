@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.difficulty import Difficulty, Layout, Split
 from sortie.perception.benchmark.manifest import COLUMNS, BenchmarkError
-from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
+from sortie.perception.files import replacing
 from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import Renderer
-from sortie.perception.scene.scene_model import SceneModel
 
 FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
@@ -71,11 +71,11 @@ class Benchmark:
         if data["format"] != FORMAT:
             raise BenchmarkError(f"{path}: format is {data['format']}, must be {FORMAT}: make it anew")
         try:
-            told = data["benchmark"]
+            stored = data["benchmark"]
             known = {f.name for f in fields(Difficulty)}
-            if set(told["difficulty"]) != known:
-                raise ValueError(f"difficulty has {sorted(set(told['difficulty']) ^ known)} too many or too few")
-            bench = cls(told["seed"], _difficulty(told["difficulty"]), Geometry(**told["geometry"]))
+            if set(stored["difficulty"]) != known:
+                raise ValueError(f"difficulty has {sorted(set(stored['difficulty']) ^ known)} too many or too few")
+            bench = cls(stored["seed"], _difficulty(stored["difficulty"]), Geometry(**stored["geometry"]))
         except (KeyError, TypeError, ValueError) as error:
             raise BenchmarkError(f"{path}: cannot be understood: {error}") from error
         if bench.key() != data["key"]:
@@ -87,7 +87,7 @@ class Benchmark:
         return root / f"seed{self.seed}-{self.difficulty.density}-{self.geometry.half_extent_m:g}m-{self.key()}"
 
 
-def _difficulty(told: dict[str, Any]) -> Difficulty:
+def _difficulty(stored: dict[str, Any]) -> Difficulty:
     """From JSON, which knows lists but no tuples."""
 
     def plain(value: Any) -> Any:
@@ -95,7 +95,7 @@ def _difficulty(told: dict[str, Any]) -> Difficulty:
             return Layout(**{k: plain(v) for k, v in value.items()})
         return tuple(value) if isinstance(value, list) else value
 
-    return Difficulty(**{k: plain(v) for k, v in told.items()})
+    return Difficulty(**{k: plain(v) for k, v in stored.items()})
 
 
 def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, path: Path) -> Path:
@@ -104,7 +104,7 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
         return path
     name = scene_id(bench.seed, split, index)
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     renderer = Renderer(scene, name)
     images = np.empty((frames, DRONES, 4, IMAGE_PX, IMAGE_PX), np.uint8)
     true_pose, est_pose = np.empty((frames, DRONES, 3)), np.empty((frames, DRONES, 3))
@@ -112,17 +112,14 @@ def make_scene_file(bench: Benchmark, split: Split, index: int, frames: int, pat
     for f in range(frames):
         captures = draw_captures(bench.seed, split, index, f, bench.difficulty)
         images[f] = lift(renderer.render(captures), captures, bench.geometry).numpy()
-        true_pose[f] = [(*c.position_m[:2], c.true_yaw_rad) for c in captures]
+        true_pose[f] = [c.true_pose for c in captures]
         est_pose[f] = [c.est_pose for c in captures]
-        at = scene.cars_at(captures[0].t_s)
-        cars.append(np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1))
+        cars.append(scene.cars_at(captures[0].t_s).table())
     table = np.full((frames, max(len(c) for c in cars), 5), np.nan)
     for row, c in zip(table, cars, strict=True):
         row[: len(c)] = c
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-    np.savez(part, images=images, true_pose=true_pose, est_pose=est_pose, cars=table)
-    part.replace(path)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, images=images, true_pose=true_pose, est_pose=est_pose, cars=table)
     return path
 
 

@@ -1,4 +1,4 @@
-"""What a benchmark's files are: `manifest.json` beside the splits, with every parameter, every scene, and hashes of content.
+"""`manifest.json` of a benchmark: every parameter, every scene, and hashes of the files' content.
 
 Hashes are of arrays, not of files, so that another zip library does not make the same data look different. Free of torch.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.difficulty import Split
+from sortie.perception.files import replacing
 from sortie.scenarios.errors import SortieError
 
 MANIFEST = "manifest.json"
@@ -26,7 +26,7 @@ COLUMNS = ("images", "true_pose", "est_pose", "cars")
 
 
 class BenchmarkError(SortieError):
-    """A benchmark on disk is missing, broken, or not what it says; the message names the file."""
+    """A benchmark on disk is missing, broken or changed; the message names the file."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -95,13 +95,12 @@ def add(
         "made_with": {name: version(name) for name in ("sortie-sim", "numpy", "torch")},
         "splits": {s: splits[s] for s in known},
     }
-    part = folder / f".{MANIFEST}.{os.getpid()}.part"
-    part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
-    part.replace(folder / MANIFEST)
+    with replacing(folder / MANIFEST) as part:
+        part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
 
 
-def complaints(folder: Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """What is wrong with a benchmark's files, a line each that names the file; empty where all is as the manifest says.
+def problems(folder: Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
+    """The problems of a benchmark's files, one line each that names the file; empty where all agree with the manifest.
 
     Raises:
         BenchmarkError: no readable manifest.

@@ -1,4 +1,4 @@
-"""What is in scene k of a split, and where the fleet is in each of its frames: draws by name, nothing rendered."""
+"""Draw scene k of a split and the fleet's poses in each of its frames; nothing is rendered."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sortie.perception.benchmark.difficulty import DENSITIES, Difficulty, Range, Split
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
-from sortie.scenarios.schema import Scene
+from sortie.scenarios.formation import slots
+from sortie.scenarios.schema import Scene, Target
 from sortie.scenarios.streams import stream
 
 DRONES = 5
@@ -15,7 +17,6 @@ AREA_M = 60.0
 """The fleet's centre lies within ± this of the scene's origin."""
 SPLITS: dict[Split, int] = {"train": 1, "validation": 2, "tau": 3, "test": 4}
 """A number each, in the keys of the streams."""
-_CROSS = np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64)
 
 
 def scene_id(seed: int, split: Split, index: int) -> int:
@@ -49,6 +50,11 @@ def draw_scene(seed: int, split: Split, index: int, difficulty: Difficulty) -> S
     )
 
 
+def model_of(config: Scene, target: Target | None = None) -> SceneModel:
+    """The scene model of a drawn town, large enough for every fleet over it."""
+    return SceneModel(config, target, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+
+
 def draw_captures(seed: int, split: Split, index: int, frame: int, difficulty: Difficulty) -> list[Capture]:
     """Five drones in a jittered cross over the scene, any heading, with some attitude and pose error."""
     d = difficulty
@@ -57,9 +63,9 @@ def draw_captures(seed: int, split: Split, index: int, frame: int, difficulty: D
     centre = rng.uniform(-AREA_M, AREA_M, 2)
     heading, spacing, altitude = rng.uniform(-np.pi, np.pi), rng.uniform(*d.spacing_m), rng.uniform(*d.altitude_m)
     c, s = np.cos(heading), np.sin(heading)
-    slots = centre + spacing * _CROSS @ np.array([[c, s], [-s, c]])
+    places = centre + slots("cross", DRONES, spacing) @ np.array([[c, s], [-s, c]])
     out = []
-    for drone, slot in enumerate(slots):
+    for drone, slot in enumerate(places):
         x, y, z = np.array([*slot, altitude]) + d.slot_sigma_m * rng.normal(size=3)
         yaw = heading + np.radians(d.yaw_sigma_deg) * rng.normal()
         pitch, roll = np.radians(d.tilt_sigma_deg) * rng.normal(size=2)

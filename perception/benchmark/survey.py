@@ -1,4 +1,4 @@
-"""What a split's scenes are like, counted and not rendered: cars, what hides them, and how much of the ground is built on."""
+"""Counts of a split's scenes, without rendering: cars, how many are hidden, and how much ground is built on."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
-from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene
+from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, model_of
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
-from sortie.perception.scene.scene_model import SceneModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +19,11 @@ class Counts:
 
     style: str
     cars: float
-    """Cars in the ego's square: what AP asks for."""
+    """Cars in the ego's square: the ground truth of AP."""
     alone: float
     """Part of them that the ego sees."""
     fleet: float
-    """Part of them that some drone sees: what sharing could reach."""
+    """Part of them that some drone sees: the most that sharing could reach."""
     built: float
     """Part of the fleet's ground under roofs."""
     height_m: float
@@ -36,21 +35,21 @@ class Counts:
 def survey(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Counts:
     """Count one frame of a scene; about a fifth of a CPU second."""
     config = draw_scene(bench.seed, split, index, bench.difficulty)
-    scene = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(config)
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
     cars = scene.cars_at(captures[0].t_s)
-    asked = np.stack([inside(c, cars, bench.geometry.half_extent_m) for c in captures])
-    near = np.flatnonzero(asked.any(axis=0))
-    cars, asked = cars.where(near), asked[:, near]
+    counted = np.stack([inside(c, cars, bench.geometry.half_extent_m) for c in captures])
+    near = np.flatnonzero(counted.any(axis=0))
+    cars, counted = cars.where(near), counted[:, near]
     seen = np.stack([visible(scene, c, cars) >= SEEN for c in captures])
     blocks = scene.town.blocks(-AREA_M, -AREA_M, AREA_M, AREA_M)
     lots, buildings = np.concatenate([b.lots for b in blocks]), np.concatenate([b.buildings for b in blocks])
-    total = max(int(asked.sum()), 1)
+    total = max(int(counted.sum()), 1)
     return Counts(
         style=config.style,
-        cars=float(asked.sum(axis=1).mean()),
-        alone=float((seen & asked).sum() / total),
-        fleet=float((seen.any(axis=0) & asked).sum() / total),
+        cars=float(counted.sum(axis=1).mean()),
+        alone=float((seen & counted).sum() / total),
+        fleet=float((seen.any(axis=0) & counted).sum() / total),
         built=float(_area(buildings).sum() / (len(blocks) * config.block_m**2)),
         height_m=float(buildings[:, 4].mean()) if len(buildings) else 0.0,
         lot_m=float(np.sqrt(_area(lots)).mean()),

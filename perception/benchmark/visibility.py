@@ -1,7 +1,7 @@
 """Who can see which car, by geometry: straight lines from a drone to points on roofs, past houses and trees.
 
 Houses are boxes and crowns are domes, in closed form: nothing is rasterised, and no code is shared with the renderer
-but the cameras' axes. It says how hard a frame is before any network looks: a car that no drone sees is still asked for by AP.
+but the cameras' axes. It measures how hard a frame is without any network. A car that no drone sees still counts for AP.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.scene.render import AXES, HALF_H, HALF_V, rotation
+from sortie.perception.geometry import HALF_H, HALF_V, in_square
+from sortie.perception.scene.render import AXES, rotation
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import Cars
@@ -95,9 +96,5 @@ def in_a_camera(capture: Capture, points: Floats) -> NDArray[np.bool_]:
 
 
 def inside(capture: Capture, cars: Cars, half_extent_m: float) -> NDArray[np.bool_]:
-    """[n]: whether each car's centre is in the drone's true square, which is where AP asks for cars."""
-    dx, dy = cars.x_m - capture.position_m[0], cars.y_m - capture.position_m[1]
-    c, s = np.cos(capture.true_yaw_rad), np.sin(capture.true_yaw_rad)
-    ahead, left = c * dx + s * dy, c * dy - s * dx
-    near: NDArray[np.bool_] = (np.abs(ahead) <= half_extent_m) & (np.abs(left) <= half_extent_m)
-    return near
+    """[n]: whether each car's centre is in the drone's true square, the cars that AP counts."""
+    return in_square(cars.table()[:, :2], [capture.true_pose], half_extent_m)[:, 0]

@@ -1,1 +1,1 @@
-"""The paper's instrument: share less or with fewer at evaluation time, and see what it costs. Free of torch but for `instrument.py`."""
+"""The paper's evaluation: limit at test time what drones share, and measure the AP that it costs. Only `instrument.py` needs torch."""

@@ -1,4 +1,4 @@
-"""Every claim of the paper's Evaluation section, in its order, as data: what it says, what of ours answers it, by which rule.
+"""Every claim of the paper's Evaluation section as data: its text, how it is measured here, and the rule that judges it.
 
 AP differences are in points, absolute APs from 0 to 1, both as the paper prints them. Where a policy is "the best
 two-peer policy" it is the best of best-2, worst-2 and random-2 at that budget, as in the paper. Claims marked

@@ -1,4 +1,4 @@
-"""One way of sharing, as the harness measures it. Free of torch.
+"""One way of sharing, as the evaluation measures it. Free of torch.
 
 The paper's knobs, each defined in this folder's README: how much (ρ), from whom (peers), in which parts
 (allocation), which cells (rank, region of interest first), and what a cell that was not sent counts as.
@@ -19,7 +19,7 @@ _ALLOWED = {"allocation": get_args(Allocation), "cells_by": get_args(CellsBy), "
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """What every ego of every frame is given.
+    """What every ego of every frame receives.
 
     Raises:
         ValueError: naming the field, its value and what it must be.
@@ -30,11 +30,11 @@ class Sharing:
     peers: str = "all-4"
     """all-k, best-k, worst-k, random-k, or none: a drone alone. All of them share the same total of cells."""
     allocation: Allocation = "uniform"
-    """How the total is parted among the peers: alike, or in proportion to their overlap with the ego."""
+    """How the total is divided among the peers: equally, or in proportion to their overlap with the ego."""
     cells_by: CellsBy = "confidence"
     """What ranks a sender's cells."""
     unsent: Unsent = "zero"
-    """A cell that was not sent takes part in the fusion as zeros, or has no say (masked)."""
+    """A cell that was not sent takes part in the fusion as zeros, or is left out (masked)."""
     roi: bool = False
     """Whether cells in the mission's disc come before all others."""
 

@@ -1,4 +1,4 @@
-"""What the evaluator asks of frames and of a model, so that a recording of any other model can take our network's place. Free of torch."""
+"""The interfaces of frames and of a model that the evaluation needs; a recording of another model meets them too. Free of torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class FleetFrames(Protocol):
-    """n fleet-frames of d drones: where they were, what was there. `sortie.perception.benchmark.dataset.Frames` is one."""
+    """n fleet-frames of d drones: their poses and the cars. `sortie.perception.benchmark.dataset.Frames` is one."""
 
     @property
     def true_pose(self) -> Floats:
@@ -35,7 +35,7 @@ class FleetFrames(Protocol):
 
 
 class Exchange(NamedTuple):
-    """What one ego is given in one frame."""
+    """What one ego receives in one frame."""
 
     ego: int
     peers: tuple[int, ...]
@@ -54,7 +54,7 @@ class FrameView(Protocol):
     def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[Floats]:
         """Each ego's boxes [m, 6] with scores ≥ `floor`: x forward, y left of its estimated pose, length, width, yaw, score.
 
-        Before suppression. The same exchange gives the same boxes whatever else is asked for (to rounding).
+        Before suppression. The same exchange gives the same boxes whatever else is computed (to rounding).
         """
 
 
@@ -67,7 +67,7 @@ class Instrument(Protocol):
 
     @property
     def geometry(self) -> Geometry:
-        """Its grids; cars inside the ego's square of that size are what there is to find."""
+        """Its grids; the cars inside the ego's square of that size are the ground truth."""
 
     def look(self, frames: FleetFrames, frame: int) -> FrameView:
-        """What it makes of one fleet-frame; all that conditions share is computed once."""
+        """Look at one fleet-frame; whatever conditions share is computed once."""

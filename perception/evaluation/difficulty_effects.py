@@ -22,10 +22,11 @@ import torch
 
 from sortie.perception.benchmark.dataset import FORMAT, Frames, start_worker
 from sortie.perception.benchmark.difficulty import Difficulty
-from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.files import replacing
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.bev import lift
@@ -110,8 +111,8 @@ def measure(
         ValueError: weights that are missing or do not fit.
     """
     rows = moves()
-    told = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
-    mark = CarNetInstrument.load(weights).fingerprint + json.dumps(told, sort_keys=True)
+    setup = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
+    mark = CarNetInstrument.load(weights).fingerprint + json.dumps(setup, sort_keys=True)
     folder = store / hashlib.blake2b(mark.encode(), digest_size=6).hexdigest()
     paths = [folder / f"scene_{k}.npz" for k in range(scenes)]
     todo = [k for k, path in enumerate(paths) if not path.exists()]
@@ -146,25 +147,22 @@ def evaluate_scene(weights: Path, index: int, rows: Sequence[ParameterShift], pa
             config = draw_scene(SEED, "test", index, move.difficulty)
             key = config.model_dump_json()
             if key not in towns:
-                towns[key] = SceneModel(config, None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+                towns[key] = model_of(config)
                 renderers[key] = Renderer(towns[key], scene_id(SEED, "test", index))
             captures = draw_captures(SEED, "test", index, 0, move.difficulty)
-            at = towns[key].cars_at(captures[0].t_s)
             frames = Frames(
                 images=lift(renderers[key].render(captures), captures, instrument.geometry).numpy()[None],
-                true_pose=np.array([[(*c.position_m[:2], c.true_yaw_rad) for c in captures]]),
+                true_pose=np.array([[c.true_pose for c in captures]]),
                 est_pose=np.array([[c.est_pose for c in captures]]),
-                cars=np.stack([at.x_m, at.y_m, at.length_m, at.width_m, at.yaw_rad], axis=1)[None],
+                cars=towns[key].cars_at(captures[0].t_s).table()[None],
                 scene=np.array([index]),
             )
             result = evaluate(instrument, frames, CONDITIONS, regions=("full",))
             for c, condition in enumerate(CONDITIONS):
                 for e, unit in enumerate(result.matched(condition)):
                     arrays |= {f"{r}.{c}.{e}.{f}": getattr(unit, f) for f in Matched.__slots__}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-    np.savez(part, **arrays)
-    part.replace(path)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def _read(path: Path, rows: int) -> list[list[list[Matched]]]:
@@ -214,6 +212,5 @@ def write_table(readme: Path, text: str) -> None:
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise ValueError(f"{readme}: {BEGIN} and {END} are missing, the table goes between them")
-    part = readme.with_name(f".{readme.name}.part")
-    part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")
-    part.replace(readme)
+    with replacing(readme) as part:
+        part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")

@@ -1,7 +1,7 @@
-"""Conditions over frames: what each ego finds under each way of sharing, matched to what was there. Free of torch.
+"""Evaluate conditions over frames: each ego's boxes under each way of sharing, matched to ground truth. Free of torch.
 
 Scores are kept down to a low floor, and a threshold τ is applied afterwards (`Evaluation.at`): suppression and
-matching go best first, so what a box below τ does concerns boxes below τ alone.
+matching go best first, so a box below τ affects only boxes below τ.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.budget import cells_in
 from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, FrameView, Instrument
 from sortie.perception.evaluation.matched import (
     FLOOR,
-    NMS_IOU,
     Evaluation,
     FrameResult,
     MatchedStore,
@@ -28,13 +28,15 @@ from sortie.perception.evaluation.matched import (
     Settings,
     assemble,
 )
-from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.geometry import CELLS, Geometry, to_world
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, best_first, hits, suppressed
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.streams import stream
 
-__all__ = ["FLOOR", "NMS_IOU", "REGION_M", "Evaluation", "Region", "Settings", "evaluate", "mission_target", "truth"]
+__all__ = ["FLOOR", "REGION_M", "Evaluation", "Region", "Settings", "evaluate", "mission_target", "truth"]
 
 T = TypeVar("T")
 REGION_M = 32.0
@@ -164,14 +166,8 @@ def mission_target(frames: FleetFrames, f: int, key: tuple[int, int], seed: int 
 
 
 def truth(frames: FleetFrames, f: int, ego: int, geometry: Geometry) -> Boxes:
-    """The cars whose centres lie in the ego's true square, whether anyone can see them or not; scores are 1."""
-    cars = frames.cars[f][~np.isnan(frames.cars[f][:, 0])]
-    x, y, yaw = frames.true_pose[f, ego]
-    dx, dy, c, s = cars[:, 0] - x, cars[:, 1] - y, np.cos(yaw), np.sin(yaw)
-    reach = geometry.half_extent_m
-    inside = (np.abs(c * dx + s * dy) < reach) & (np.abs(c * dy - s * dx) < reach)
-    cars = cars[inside]
-    return Boxes(cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
+    """The cars in the ego's true square in frame `f`."""
+    return ground_truth(frames.cars[f], frames.true_pose[f, ego], geometry.half_extent_m)
 
 
 def exchanges(
@@ -188,11 +184,11 @@ def exchanges(
     est = frames.est_pose[f]
     drones = len(est)
     overlap = selection.footprint_overlap(est[:, :2], np.full(drones, selection.FOOTPRINT_M))
-    roi = None if target is None else selection.in_disc(est, (*target, REGION_M), geometry)
+    roi = None if target is None else selection.in_disc(est, Disc(*target, REGION_M), geometry)
     orders: dict[tuple[str, bool], NDArray[np.int16]] = {}
     out = []
     for c in conditions:
-        total = selection.total_cells(c.rho, drones - 1)
+        total = cells_in(c.rho, drones - 1)
         which = (c.cells_by, c.roi and roi is not None)
         if total and which not in orders:
             orders[which] = selection.sending_order(view.rank(c.cells_by), roi if which[1] else None)
@@ -258,10 +254,10 @@ def match_all(
     boxes = np.concatenate([np.zeros((0, 6)), *local])
     order = best_first(boxes[:, 5], image)
     boxes, image = boxes[order], image[order]
-    x0, y0, yaw = est_pose[ego_of[image]].T
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y = x0 + c * boxes[:, 0] - s * boxes[:, 1], y0 + s * boxes[:, 0] + c * boxes[:, 1]
-    world = np.stack([x, y, boxes[:, 2], boxes[:, 3], boxes[:, 4] + yaw], axis=1)
+    pose = est_pose[ego_of[image]].T
+    world = np.stack(
+        [*to_world(boxes[:, 0], boxes[:, 1], pose), boxes[:, 2], boxes[:, 3], boxes[:, 4] + pose[2]], axis=1
+    )
     left = suppressed(world, image, settings.nms_iou)
     world, image = world[left], image[left]
     score = boxes[left, 5].astype(np.float32).astype(np.float64)  # as it is stored

@@ -1,4 +1,4 @@
-"""The paper's data figure of one frame by matplotlib: camera views above, below them truth and detections, and the shared cells."""
+"""The paper's data figure of one frame by matplotlib: camera views, ground truth and detections, and the shared cells."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.perception.evaluation.contract import Floats
-from sortie.perception.evaluation.picture import Picture, to_world
-from sortie.perception.geometry import CELLS
+from sortie.perception.evaluation.picture import Picture
+from sortie.perception.geometry import CELLS, to_world
 from sortie.perception.metrics.overlap import corners
 from sortie.perception.types import Boxes
 

@@ -11,6 +11,7 @@ import numpy as np
 from sortie.perception.evaluation.claims import BUDGETS, CURVE
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, Point
 from sortie.perception.evaluation.verdict import ClaimVerdict
+from sortie.perception.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -134,12 +135,8 @@ def forest(rows: Iterable[ClaimRow]) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG under a temporary name, then rename it; without the date, so that equal figures are equal files."""
-    part = path.with_name(f".{path.name}.partial")
-    try:
+    with replacing(path) as part:
         figure.savefig(part, format="png", dpi=DPI, metadata={"Software": None})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def figure_of(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Sequence[Axes]]:

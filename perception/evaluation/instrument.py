@@ -1,4 +1,4 @@
-"""Our network as the harness's instrument: features of a fleet-frame once, then every exchange of it in batches."""
+"""Our network for the evaluation: it encodes a fleet-frame once, then detects for every exchange in batches."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def fingerprint(net: CarNet) -> str:
 class CarNetView:
     """The features of one fleet-frame, and what the network finds from them.
 
-    A fusion that works cell by cell (`PerCell`) is asked only about cells where something arrived; the others are the
-    ego's own, or, where silent peers count as zeros, what the ego makes of that many zeros, worked out once a view.
+    A fusion that works cell by cell (`PerCell`) computes only the cells where something arrived. The other cells are the
+    ego's own or, where silent peers count as zeros, the ego fused with that many zeros, computed once per view.
     """
 
     def __init__(self, net: CarNet, features: torch.Tensor, est: torch.Tensor) -> None:
@@ -88,7 +88,7 @@ class CarNetView:
 
     @torch.inference_mode()
     def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[Floats]:
-        """Each ego's boxes before suppression (see `contract.View`)."""
+        """Each ego's boxes before suppression (see `contract.FrameView`)."""
         out: list[Floats] = []
         for at in range(0, len(exchanges), BATCH):
             fused = torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]])  # [n, 4096, 80]

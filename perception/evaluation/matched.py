@@ -1,4 +1,4 @@
-"""What an evaluation found: matched detections per ego and frame under every condition; to and from Parquet. Free of torch."""
+"""The results of an evaluation: matched detections per ego and frame under every condition; Parquet. Free of torch."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.files import replacing
+from sortie.perception.joining import NMS_IOU
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, average_precision
 
 Region = Literal["full", "mission", "ego"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NMS_IOU, FLOOR = 0.15, 0.01
+FLOOR = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the numbers depend on beside the instrument, the frames and the condition."""
+    """Settings that the results depend on, beside instrument, frames and condition."""
 
     egos: int = 5
     """The first so many drones of a frame are egos."""
@@ -244,13 +246,11 @@ def _from_table(table: pa.Table) -> dict[str, FrameResult]:
         units = frame.units.setdefault((condition, region), [])
         units.append(Matched(score[here], hit[here], truths))
         cost = frame.cost.setdefault(condition, [])
-        if len(cost) == ego:  # said once for each region
+        if len(cost) == ego:  # repeated for each region
             cost.append((cells, payload, index))
     return out
 
 
 def _write(table: pa.Table, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    pq.write_table(table, part, compression="zstd")
-    part.replace(path)
+    with replacing(path) as part:
+        pq.write_table(table, part, compression="zstd")

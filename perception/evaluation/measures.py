@@ -1,4 +1,4 @@
-"""What is measured for a claim, as data, and how it is worked out from bootstrapped APs. Pure.
+"""The measures that claims refer to, and how they follow from bootstrapped APs. Pure.
 
 All of a table's figures come from one bootstrap: the same resampled frames for every condition, so that any
 difference is paired and any arithmetic of APs has its interval by doing it to every draw.
@@ -125,6 +125,18 @@ Policies = tuple[tuple[Sharing, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
+class OfPolicies:
+    """A measure of a whole table of policies."""
+
+    policies: Policies
+
+    def conditions(self) -> Iterator[Sharing]:
+        """What has to be evaluated."""
+        for row in self.policies:
+            yield from row
+
+
+@dataclass(frozen=True, slots=True)
 class WrongChoice:
     """What the policy that wins at one budget loses to the winner at another."""
 
@@ -149,7 +161,7 @@ class WrongChoice:
 
 
 @dataclass(frozen=True, slots=True)
-class Oracle:
+class Oracle(OfPolicies):
     """The best policy of each budget against the best single one, mean AP over the budgets, in points.
 
     The winners are chosen once on all frames and then held fixed, in every draw too, so that the interval can hold
@@ -157,13 +169,7 @@ class Oracle:
     many random splits; the interval resamples frames within the halves.
     """
 
-    policies: Policies
     held_out: bool = False
-
-    def conditions(self) -> Iterator[Sharing]:
-        """What has to be evaluated."""
-        for row in self.policies:
-            yield from row
 
     def measure(self, scores: Scores) -> MeasuredValue:
         """The gain."""
@@ -184,16 +190,10 @@ class Oracle:
 
 
 @dataclass(frozen=True, slots=True)
-class MeanLevel:
+class MeanLevel(OfPolicies):
     """Mean AP over the budgets, of the best policy of each or of the best single one."""
 
-    policies: Policies
     fixed: bool
-
-    def conditions(self) -> Iterator[Sharing]:
-        """What has to be evaluated."""
-        for row in self.policies:
-            yield from row
 
     def measure(self, scores: Scores) -> MeasuredValue:
         """AP, 0 … 1."""
@@ -267,15 +267,8 @@ class FleetFrameBytes:
 
 
 @dataclass(frozen=True, slots=True)
-class UnequalBytes:
+class UnequalBytes(OfPolicies):
     """By how much the bytes of matched policies differ at the same budget, at most, in per cent."""
-
-    policies: Policies
-
-    def conditions(self) -> Iterator[Sharing]:
-        """What has to be evaluated."""
-        for row in self.policies:
-            yield from row
 
     def measure(self, scores: Scores) -> MeasuredValue:
         """The largest relative spread in any frame of any budget."""
@@ -288,7 +281,7 @@ class UnequalBytes:
 
 @dataclass(frozen=True, slots=True)
 class Elsewhere:
-    """Measured outside this room, under this name."""
+    """A quantity measured outside this room, under this name."""
 
     name: str
 
@@ -303,7 +296,7 @@ Measure = Accuracy | Counted | Elsewhere
 
 
 def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence") -> Sharing:
-    """A claim's condition under another instrument; where every cell is sent, or none asked for, it is the same."""
+    """A claim's condition under another instrument; unchanged where every cell is sent, or none."""
     everything = condition.peers == "none" or (condition.rule == "all" and condition.rho >= 1.0)
     return condition if everything else replace(condition, unsent=unsent, cells_by=cells_by)
 

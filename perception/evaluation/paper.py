@@ -9,20 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
-from sortie.perception.benchmark.scenes import AREA_M, draw_captures, draw_scene, scene_id
+from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.evaluation.claims import conditions
 from sortie.perception.evaluation.contract import FleetFrames, Instrument
 from sortie.perception.evaluation.evaluate import Region, evaluate
 from sortie.perception.evaluation.measures import under
 from sortie.perception.evaluation.results import TableResults, TableSettings
 from sortie.perception.scene.render import Renderer
-from sortie.perception.scene.scene_model import SceneModel
 
 
 def measure(
     instrument: Instrument,
     frames: FleetFrames,
-    asked: TableSettings,
+    settings: TableSettings,
     *,
     store: Path | None = None,
     workers: int = 1,
@@ -36,10 +35,10 @@ def measure(
         workers: frames worked on side by side; the numbers do not depend on it.
         progress: called with frames done and frames in all.
     """
-    every = dict.fromkeys(under(c, unsent, asked.cells_by) for unsent in asked.unsent for c in conditions())
+    every = dict.fromkeys(under(c, unsent, settings.cells_by) for unsent in settings.unsent for c in conditions())
     regions: tuple[Region, ...] = ("full", "mission", "ego")
     found = evaluate(instrument, frames, tuple(every), regions=regions, store=store, workers=workers, progress=progress)
-    return TableResults(found, asked)
+    return TableResults(found, settings)
 
 
 def bench_frames(
@@ -60,7 +59,7 @@ def bench_frames(
 def camera_views(seed: int, frame: int) -> NDArray[np.uint8]:
     """[drone, camera, height, width, 3]: what the drones' cameras see in a frame of the test split, rendered anew."""
     bench, name = Benchmark(seed), scene_id(seed, "test", frame)
-    scene = SceneModel(draw_scene(seed, "test", frame, bench.difficulty), None, (-AREA_M, -AREA_M, AREA_M, AREA_M))
+    scene = model_of(draw_scene(seed, "test", frame, bench.difficulty))
     captures = draw_captures(seed, "test", frame, 0, bench.difficulty)
     views: NDArray[np.uint8] = Renderer(scene, name).render(captures)
     return views

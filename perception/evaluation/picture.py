@@ -1,4 +1,4 @@
-"""One frame as the paper's data figure shows it: what was there, what an ego found, which cells its peers shared at two budgets.
+"""The content of the paper's data figure for one frame: ground truth, detections, and the cells shared at two budgets.
 
 Free of torch; drawn by `figure_frame.draw` and, in Rerun, by the simulator's playback.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +14,17 @@ from numpy.typing import NDArray
 from sortie.perception.evaluation.condition import FULL_SHARING, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
 from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
-from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.geometry import CELLS, Geometry, to_local, to_world
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 PAPER_BUDGETS = (0.25, 0.02)
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What there is to draw of one frame and ego; world frame ENU, metres."""
+    """The data to draw for one frame and ego; world frame ENU, metres."""
 
     name: str
     ego: int
@@ -36,7 +36,7 @@ class Picture:
     truth: Boxes
     found: Boxes
     """Under full sharing, at τ."""
-    disc: tuple[float, float, float] | None
+    disc: Disc | None
     """The mission's."""
     shared: tuple[tuple[float, NDArray[np.int64]], ...]
     """For each budget how many peers share each cell of the ego's grid [64, 64]."""
@@ -68,8 +68,8 @@ def picture(
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)
     view, geometry = instrument.look(frames, f), instrument.geometry
-    asked = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
-    given = [e for e, _ in exchanges(view, frames, f, key, asked, settings, geometry, target) if e.ego == ego]
+    conditions = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
+    given = [e for e, _ in exchanges(view, frames, f, key, conditions, settings, geometry, target) if e.ego == ego]
     found = Boxes.placed(view.detect(given[:1], tau)[0], tuple(frames.est_pose[f, ego].tolist()))
     return Picture(
         name=f"scene {key[0]}, frame {f}",
@@ -79,7 +79,7 @@ def picture(
         est_pose=frames.est_pose[f],
         truth=truth(frames, f, ego, geometry),
         found=suppress(found, settings.nms_iou),
-        disc=None if target is None else (*target, REGION_M),
+        disc=None if target is None else Disc(*target, REGION_M),
         shared=tuple(
             (rho, sharers(e, frames.est_pose[f], geometry)) for rho, e in zip(budgets, given[1:], strict=True)
         ),
@@ -94,16 +94,7 @@ def sharers(exchange: Exchange, est_pose: Floats, geometry: Geometry) -> NDArray
     x, y = to_world(forward, left, est_pose[exchange.ego])
     count = np.zeros((CELLS, CELLS), np.int64)
     for peer, sent in zip(exchange.peers, exchange.sent, strict=True):
-        px, py, yaw = est_pose[peer]
-        c, s = np.cos(yaw), np.sin(yaw)
-        row = np.floor((c * (x - px) + s * (y - py)) / geometry.cell_m + CELLS / 2).astype(int)
-        column = np.floor((c * (y - py) - s * (x - px)) / geometry.cell_m + CELLS / 2).astype(int)
+        row, column = (np.floor(v / geometry.cell_m + CELLS / 2).astype(int) for v in to_local(x, y, est_pose[peer]))
         inside = (row >= 0) & (row < CELLS) & (column >= 0) & (column < CELLS)
         count[inside] += sent[row[inside], column[inside]]
     return count
-
-
-def to_world(forward: NDArray[Any], left: NDArray[Any], pose: Floats) -> tuple[Floats, Floats]:
-    """Points of a drone's level frame, put into the world by its pose (x, y, yaw)."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return pose[0] + c * forward - s * left, pose[1] + s * forward + c * left

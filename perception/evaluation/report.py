@@ -11,16 +11,10 @@ from typing import Any
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow
 from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.evaluation.verdict import ClaimVerdict
+from sortie.scenarios.report_text import fixed, interval, picture, signed, table
 
 BEGIN, END = "<!-- paper:begin -->", "<!-- paper:end -->"
-MINUS = "−"
 _DECIMALS = {"AP points": 1, "AP": 3, "MB": 1, "kB/s": 1, "MB/s": 1, "%": 1, "B": 0, "ms": 3, "s": 2, "×": 1, "of 3": 0}
-
-
-def signed(value: float, decimals: int = 1) -> str:
-    """A difference with its sign."""
-    text = f"{value:+.{decimals}f}"
-    return f"{0:.{decimals}f}" if float(text) == 0 else text.replace("-", MINUS)
 
 
 def figure(value: float | None, low: float | None, high: float | None, unit: str, decimals: int | None = None) -> str:
@@ -29,10 +23,8 @@ def figure(value: float | None, low: float | None, high: float | None, unit: str
         return "–" if low is None or high is None else f"{low:g}–{high:g}{_suffix(unit)}"
     places = _DECIMALS[unit] if decimals is None else decimals
     if unit == "AP points":
-        text = signed(value, places)
-        return text if low is None or high is None else f"{text} [{signed(low, places)}, {signed(high, places)}]"
-    text = _plain(value, places) + _suffix(unit)
-    return text if low is None or high is None else f"{text} [{_plain(low, places)}, {_plain(high, places)}]"
+        return interval(value, low, high, lambda v: signed(v, places))
+    return interval(value, low, high, lambda v: fixed(v, places), _suffix(unit))
 
 
 def papers(row: ClaimRow) -> str:
@@ -77,11 +69,11 @@ def report(
 ) -> str:
     """The whole report; `figures` are file names beside it and what they show, `varied` claims at other settings."""
     shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in rows)]
-    lines = ["# The paper's Evaluation, claim by claim", "", _made(facts), ""]
+    lines = ["# The paper's Evaluation, claim by claim", "", _provenance(facts), ""]
     lines += [f"- {INSTRUMENTS[i]}: {tally(r for r in rows if r.instrument == i)}." for i in shown]
     lines += [f"- measured on a flown sortie: {tally(r for r in rows if not r.instrument)}.", "", _RULE, ""]
     for name, caption in figures:
-        lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
+        lines += picture(name, caption)
     for section in dict.fromkeys(r.section for r in rows):
         lines += [f"## {section}", "", *_section([r for r in rows if r.section == section], shown), ""]
     if varied:
@@ -92,20 +84,20 @@ def report(
 def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
     """The README's section: the headline claims, between its markers."""
     chosen = [r for r in rows if r.headline]
-    head = [BEGIN, "", _made(facts), ""]
+    head = [BEGIN, "", _provenance(facts), ""]
     for i, name in INSTRUMENTS.items():
         if its := [r for r in rows if r.instrument == i]:
             head.append(f"- {name}: {tally(its)}.")
     head += [f"- measured on a flown sortie: {tally(r for r in rows if not r.instrument)}.", ""]
     shown = [i for i in INSTRUMENTS if any(r.instrument == i for r in chosen)]
-    table = ["| claim | paper | ours | verdict | masked |", "|---|---|---|---|---|"]
+    lines = []
     for several in _by_claim(chosen):
         first = several.get(shown[0] if shown else "", several.get(""))
         if first is None:
             continue
         other = several.get("masked") if "masked" in shown[1:] else None
         masked = "" if other is None else ours(other)
-        table.append(f"| {first.says} | {papers(first)} | {ours(first)} | {verdict(first)} | {masked} |")
+        lines.append((first.says, papers(first), ours(first), verdict(first), masked))
     tail = [
         "",
         "AP differences in points with 95 % intervals; *ours* is the paper's instrument (cells that were not sent count "
@@ -114,26 +106,14 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
         "",
         END,
     ]
-    return "\n".join([*head, *table, *tail])
-
-
-def put_into(text: str, section: str, begin: str = BEGIN, end: str = END) -> str:
-    """A README with its section between the markers replaced.
-
-    Raises:
-        ValueError: the markers are missing, doubled or in the wrong order.
-    """
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise ValueError(f"must hold {begin} and {end} once each, in this order")
-    before, _, rest = text.partition(begin)
-    return before + section + rest.partition(end)[2]
+    return "\n".join([*head, *table(("claim", "paper", "ours", "verdict", "masked"), lines), *tail])
 
 
 _RULE = """\
-**How verdicts are reached** (`perception/evaluation/verdict.py`, which tells what was fixed when). A difference is
+**How verdicts are reached** (`perception/evaluation/verdict.py`, which says what was fixed when). A difference is
 significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
 or in neither, or not in the paper and here wholly within half a point of zero; *opposite*: significant in both, with
-other signs; *not reproduced*: significant in one alone. The size is told apart: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
+other signs; *not reproduced*: significant in one alone. The size is reported separately: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
 That *most* of the gain is kept asks for an interval above one half. Absolute APs are not comparable between benchmarks, as the paper says itself. Counted bytes have to round to the
 paper's print; times and rates have to lie within half an order of magnitude, or beyond it on the side that makes the
 claim stronger. Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of
@@ -150,19 +130,17 @@ them, over both, from the same detections; a star marks another verdict than abo
 
 def _section(rows: Sequence[ClaimRow], shown: Sequence[str]) -> list[str]:
     if not any(r.instrument for r in rows):
-        lines = ["| claim | sentence | paper | ours | verdict | |", "|---|---|---|---|---|---|"]
-        return lines + [f"| {r.says} | {r.place} | {papers(r)} | {ours(r)} | {verdict(r)} | {r.note} |" for r in rows]
-    head = "".join(f" {INSTRUMENTS[i]} | q | verdict |" for i in shown)  # type: ignore[index]
-    lines = [f"| claim | sentence | paper |{head} |", "|---|---|---|" + "---|---|---|" * len(shown) + "---|"]
+        cells = ((r.says, r.place, papers(r), ours(r), verdict(r), r.note) for r in rows)
+        return table(("claim", "sentence", "paper", "ours", "verdict", ""), cells)
+    head = [cell for i in shown for cell in (INSTRUMENTS[i], "q", "verdict")]  # type: ignore[index]
+    lines = []
     for several in _by_claim(rows):
         first = next(iter(several.values()))
-        cells = "".join(
-            f" {ours(r)} | {'' if r.q is None else _level(r.q)} | {verdict(r)} |" if (r := several.get(i)) else " | | |"
-            for i in shown
-        )
+        its = [several.get(i) for i in shown]
+        measured = [cell for r in its for cell in (("", "", "") if r is None else (ours(r), _level(r.q), verdict(r)))]
         notes = list(dict.fromkeys(r.note for r in several.values() if r.note))
-        lines.append(f"| {first.says} | {first.place} | {papers(first)} |{cells} {'; masked: '.join(notes)} |")
-    return lines
+        lines.append((first.says, first.place, papers(first), *measured, "; masked: ".join(notes)))
+    return table(("claim", "sentence", "paper", *head, ""), lines)
 
 
 def _sensitivity(rows: Sequence[ClaimRow], varied: Sequence[Varied]) -> list[str]:
@@ -175,12 +153,7 @@ def _sensitivity(rows: Sequence[ClaimRow], varied: Sequence[Varied]) -> list[str
             if not its:
                 continue
             settings = list(dict.fromkeys(v.setting for v in its))
-            lines += [
-                f"**{title}**, {name}:",
-                "",
-                f"| claim | {' | '.join(settings)} |",
-                "|---|" + "---|" * len(settings),
-            ]
+            claims = []
             for claim in dict.fromkeys(v.id for v in its):
                 row = first[claim, i]
                 cells = {
@@ -189,8 +162,8 @@ def _sensitivity(rows: Sequence[ClaimRow], varied: Sequence[Varied]) -> list[str
                     for v in its
                     if v.id == claim
                 }
-                lines.append(f"| {row.says} | {' | '.join(cells[s] for s in settings)} |")
-            lines.append("")
+                claims.append((row.says, *(cells[s] for s in settings)))
+            lines += [f"**{title}**, {name}:", "", *table(("claim", *settings), claims), ""]
     return lines
 
 
@@ -202,7 +175,7 @@ def _by_claim(rows: Iterable[ClaimRow]) -> list[dict[str, ClaimRow]]:
     return list(claims.values())
 
 
-def _made(facts: Mapping[str, Any]) -> str:
+def _provenance(facts: Mapping[str, Any]) -> str:
     """One paragraph: on what, by what, how exactly."""
     return (
         f"Made by `{facts['command']}`: {facts['frames']} frames of {facts['scenes']} scenes of the benchmark's test split "
@@ -212,13 +185,11 @@ def _made(facts: Mapping[str, Any]) -> str:
     )
 
 
-def _plain(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}".replace("-", MINUS)
-
-
 def _suffix(unit: str) -> str:
     return {"AP": "", "AP points": "", "×": " ×", "of 3": " of 3"}.get(unit, f" {unit}")
 
 
-def _level(q: float) -> str:
+def _level(q: float | None) -> str:
+    if q is None:
+        return ""
     return "< 0.01" if q < 0.01 else f"{min(q, 1.0):.{2 if q >= 0.1 else 3}f}" if math.isfinite(q) else ""

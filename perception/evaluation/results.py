@@ -1,4 +1,4 @@
-"""What an evaluation for the paper found, to be asked under any instrument, threshold and disc. Free of torch."""
+"""The results of an evaluation for the paper, under any instrument, threshold and disc. Free of torch."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sortie.perception.evaluation.scores import Bootstrap, By
 from sortie.perception.metrics.bootstrap import DRAWS
 
 TAU = 0.1
-"""UAV3D's head cuts its scores there."""
-Disc = Literal["mission", "ego"]
-"""Around the mission's target, or around the ego."""
+"""Score threshold: UAV3D's head drops boxes below it, and so does a scenario unless it says otherwise."""
+DiscCentre = Literal["mission", "ego"]
+"""Where the mission's disc is centred: on the target or on the ego."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,24 +43,29 @@ class TableSettings:
 
 @dataclass(frozen=True, slots=True)
 class TableResults:
-    """An evaluation of the paper's conditions under every instrument that was asked for."""
+    """An evaluation of the paper's conditions under every instrument in the settings."""
 
     evaluation: Evaluation
-    asked: TableSettings
-    _made: dict[tuple[Unsent, float, Disc], Bootstrap] = field(default_factory=dict)
+    settings: TableSettings
+    _made: dict[tuple[Unsent, float, DiscCentre], Bootstrap] = field(default_factory=dict)
     _cut: dict[float, Evaluation] = field(default_factory=dict)
 
-    def scores(self, unsent: Unsent, *, tau: float | None = None, disc: Disc = "mission") -> Bootstrap:
-        """Bootstrapped APs of one instrument, at the threshold that was asked for or another."""
-        key = (unsent, self.asked.tau if tau is None else tau, disc)
+    def scores(self, unsent: Unsent, *, tau: float | None = None, disc: DiscCentre = "mission") -> Bootstrap:
+        """Bootstrapped APs of one instrument, at the threshold of the settings or another."""
+        key = (unsent, self.settings.tau if tau is None else tau, disc)
         if key not in self._made:
             if key[1] not in self._cut:
                 self._cut[key[1]] = self.evaluation.at(key[1])
             self._made[key] = Bootstrap(
-                self._cut[key[1]], unsent, self.asked.cells_by, disc=disc, by=self.asked.by, draws=self.asked.draws
+                self._cut[key[1]],
+                unsent,
+                self.settings.cells_by,
+                disc=disc,
+                by=self.settings.by,
+                draws=self.settings.draws,
             )
         return self._made[key]
 
     def all_scores(self) -> dict[Unsent, Bootstrap]:
-        """Those of every instrument, as asked."""
-        return {unsent: self.scores(unsent) for unsent in self.asked.unsent}
+        """Bootstrapped APs of every instrument in the settings."""
+        return {unsent: self.scores(unsent) for unsent in self.settings.unsent}

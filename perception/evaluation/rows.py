@@ -21,7 +21,7 @@ from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.perception.metrics.bootstrap import benjamini_hochberg
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
-"""What a cell that was not sent counts as, and the column that shows it."""
+"""How cells that were not sent count, and the heading of that column."""
 _NORMAL = ndtri([0.025, 0.975])
 _DRAWS = ndtri((np.arange(999) + 0.5) / 999)
 

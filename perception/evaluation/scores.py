@@ -18,7 +18,7 @@ By = Literal["frame", "scene"]
 
 
 class Bootstrap:
-    """Scores of an evaluation at its threshold, asked for by the paper's conditions and answered for one way to fuse.
+    """Bootstrapped APs of an evaluation at its threshold, for the paper's conditions under one way to fuse.
 
     Args:
         evaluation: it has to hold the conditions with `unsent` and `cells_by` put in.
@@ -48,7 +48,7 @@ class Bootstrap:
         self._disc, self._by = disc, by
         self._draws, self._seed = draws, seed
         self._ranked: dict[tuple[Sharing, Evaluated], Ranked] = {}
-        self._found: dict[tuple[Sharing, Evaluated], tuple[float, Floats]] = {}
+        self._scores: dict[tuple[Sharing, Evaluated], tuple[float, Floats]] = {}
         self._weights: dict[tuple[str, int], Floats] = {}
 
     def ap(self, condition: Sharing, region: Region) -> float:
@@ -75,25 +75,25 @@ class Bootstrap:
     def _under(self, condition: Sharing) -> Sharing:
         return under(condition, self._unsent, self._cells_by)
 
-    def _get(self, condition: Sharing, asked: Region) -> tuple[float, Floats]:
-        key = self._key(condition, asked)
-        if key not in self._found:
-            ranked = self._rank(condition, asked)
+    def _get(self, condition: Sharing, region: Region) -> tuple[float, Floats]:
+        key = self._key(condition, region)
+        if key not in self._scores:
+            ranked = self._rank(condition, region)
             weights = self._once("resamples", len(ranked.truths))
-            self._found[key] = (self._evaluation.ap(*key), ranked.ap(weights))
-        return self._found[key]
+            self._scores[key] = (self._evaluation.ap(*key), ranked.ap(weights))
+        return self._scores[key]
 
-    def _key(self, condition: Sharing, asked: Region) -> tuple[Sharing, Evaluated]:
-        return self._under(condition), self._disc if asked == "mission" else asked
+    def _key(self, condition: Sharing, region: Region) -> tuple[Sharing, Evaluated]:
+        return self._under(condition), self._disc if region == "mission" else region
 
-    def _rank(self, condition: Sharing, asked: Region) -> Ranked:
-        key = self._key(condition, asked)
+    def _rank(self, condition: Sharing, region: Region) -> Ranked:
+        key = self._key(condition, region)
         if key not in self._ranked:
             self._ranked[key] = rank(self._evaluation.matched(*key), self._evaluation.groups(key[1], self._by))
         return self._ranked[key]
 
     def _once(self, what: str, groups: int) -> Floats:
-        """Weights [draws, groups], made once and then the same for whoever asks."""
+        """Weights [draws, groups], made once and then reused."""
         if (what, groups) not in self._weights:
             if what == "resamples":
                 self._weights[what, groups] = resamples(groups, self._draws, self._seed)

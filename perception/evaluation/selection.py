@@ -1,4 +1,4 @@
-"""Who shares with an ego, how many cells each, and which: pure functions of estimated poses and rank maps. Free of torch."""
+"""Which peers share with an ego, and how a budget is divided among them and their cells. Pure; free of torch."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.budget import index_bytes, payload_bytes
+from sortie.perception.budget import CELLS, Bools, index_bytes, payload_bytes, ranking, roi_mask
 from sortie.perception.evaluation.condition import Allocation, Sharing
-from sortie.perception.geometry import CELLS as GRID
 from sortie.perception.geometry import FULL, Geometry
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.streams import stream
 
-CELLS = GRID * GRID
 FOOTPRINT_M = 60.0 * math.tan(math.radians(35.0))
 """The paper's 42 m: the radius that a 70° lens sees from 60 m."""
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Disc = tuple[float, float, float]
-"""x, y, radius in metres, ENU."""
 
 
 def footprint_overlap(xy_m: Floats, radius_m: Floats) -> Floats:
@@ -46,7 +42,7 @@ def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] =
     """The peers that share with `ego`, most overlapping first.
 
     Args:
-        condition: its `peers` is asked.
+        condition: gives the rule for `peers`.
         ego: the receiver.
         overlap: [d] of each drone's footprint with the ego's; equal ones go by the lower id.
         key: names the frame, so that random peers are its own whatever else is evaluated.
@@ -67,13 +63,8 @@ def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] =
     return tuple(ranked[: condition.k])
 
 
-def total_cells(rho: float, peers: int) -> int:
-    """⌊ρ · peers · 4096⌋, `peers` being all that the fleet has."""
-    return math.floor(rho * peers * CELLS + 1e-9)
-
-
 def allocate(total: int, overlap: Sequence[float], allocation: Allocation, most: int = CELLS) -> list[int]:
-    """Part `total` cells among the chosen peers: their sum is `total` unless every peer sends all it has.
+    """Divide `total` cells among the chosen peers: their sum is `total` unless every peer sends all it has.
 
     Quotas are equal or proportional to `overlap`; a peer whose quota passes `most` sends all and the rest is parted
     anew among the others (alike, where none of those overlaps). Quotas are rounded down, and the cells that are left
@@ -105,30 +96,17 @@ def allocate(total: int, overlap: Sequence[float], allocation: Allocation, most:
 
 def in_disc(pose: Floats, disc: Disc, geometry: Geometry = FULL) -> Bools:
     """[d, 64, 64]: the cells whose centres lie in the disc, on the grids of drones at `pose` [d, 3] (x, y, yaw)."""
-    along = (np.arange(GRID) + 0.5 - GRID / 2) * geometry.cell_m
-    dx, dy = disc[0] - pose[:, 0], disc[1] - pose[:, 1]
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    forward, left = c * dx + s * dy, c * dy - s * dx
-    row, column = (along - forward[:, None]) ** 2, (along - left[:, None]) ** 2
-    return np.asarray(row[:, :, None] + column[:, None, :] <= disc[2] ** 2)
+    return np.stack([roi_mask(disc, x, y, yaw, geometry.cell_m) for x, y, yaw in pose.tolist()])
 
 
 def sending_order(rank: NDArray[np.floating], first: Bools | None = None) -> NDArray[np.int16]:
-    """[d, 64, 64]: each cell's place in its sender's order, 0 sent first; what a budget of b cells sends is `order < b`.
+    """[d, 64, 64]: each cell's place in its sender's order, 0 sent first; a budget of b cells sends `order < b`.
 
-    Args:
-        rank: [d, 64, 64], higher first; equal ones by the lower index.
-        first: [d, 64, 64] bool, cells that come before all others, each part ranked in itself.
+    Unlike a sortie's region of interest, which sends nothing from outside it, `first` only comes before the rest.
     """
-    d = len(rank)
-    score = -rank.reshape(d, CELLS).astype(np.float64)
-    by = np.argsort(score, axis=1, kind="stable")
-    if first is not None:
-        late = np.take_along_axis(~first.reshape(d, CELLS), by, axis=1)
-        by = np.take_along_axis(by, np.argsort(late, axis=1, kind="stable"), axis=1)
-    place = np.empty((d, CELLS), np.int16)
-    np.put_along_axis(place, by, np.arange(CELLS, dtype=np.int16)[None], axis=1)
-    return place.reshape(d, GRID, GRID)
+    place = np.empty((len(rank), CELLS), np.int16)
+    np.put_along_axis(place, ranking(rank, first), np.arange(CELLS, dtype=np.int16)[None], axis=1)
+    return place.reshape(rank.shape)
 
 
 def link_bytes(cells: Sequence[int]) -> tuple[int, int]:

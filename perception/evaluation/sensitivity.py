@@ -1,4 +1,4 @@
-"""How much a verdict hangs on what the paper leaves open: the score threshold, and where the mission's disc is. Free of torch.
+"""How much verdicts depend on what the paper leaves open: the score threshold and the mission's disc. Free of torch.
 
 Nothing is evaluated anew: scores are kept down to the floor, so that any τ is applied afterwards, and boxes are
 matched in the disc around the mission's target and in the one around the ego alike.
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 from sortie.perception.evaluation.claims import CLAIMS, Claim
 from sortie.perception.evaluation.condition import Unsent
-from sortie.perception.evaluation.results import Disc, TableResults
+from sortie.perception.evaluation.results import DiscCentre, TableResults
 
 TAUS = (0.01, 0.1, 0.2, 0.3, 0.5)
-DISCS: dict[Disc, str] = {"mission": "around the target", "ego": "around the ego"}
+DISCS: dict[DiscCentre, str] = {"mission": "around the target", "ego": "around the ego"}
 BY_TAU = ("gain", "curve.0.1", "starved", "flip.0.02", "flip.0.05", "flip.0.1", "flip.0.25", "oracle.held-out")
 BY_DISC = ("mission.full", "mission.widest", "mission.tenth", "mission.peak", "compose.mission", "compose.spread")
-"""Claims that are looked at again."""
+"""Claims that are judged again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,29 +35,29 @@ class Varied:
     verdict: str
 
 
-def sensitivity(found: TableResults, claims: Sequence[Claim] = CLAIMS) -> list[Varied]:
+def sensitivity(results: TableResults, claims: Sequence[Claim] = CLAIMS) -> list[Varied]:
     """The claims above over all thresholds and discs, under every instrument that was evaluated."""
     by_id = {c.id: c for c in claims}
     out = []
-    for unsent in found.asked.unsent:
-        out += [_varied(found, by_id[i], unsent, "tau", f"{tau:g}", tau=tau) for i in BY_TAU for tau in TAUS]
+    for unsent in results.settings.unsent:
+        out += [_varied(results, by_id[i], unsent, "tau", f"{tau:g}", tau=tau) for i in BY_TAU for tau in TAUS]
         out += [
-            _varied(found, by_id[i], unsent, "disc", name, disc=disc) for i in BY_DISC for disc, name in DISCS.items()
+            _varied(results, by_id[i], unsent, "disc", name, disc=disc) for i in BY_DISC for disc, name in DISCS.items()
         ]
     return out
 
 
 def _varied(
-    found: TableResults,
+    results: TableResults,
     claim: Claim,
     unsent: Unsent,
     knob: str,
     setting: str,
     *,
     tau: float | None = None,
-    disc: Disc = "mission",
+    disc: DiscCentre = "mission",
 ) -> Varied:
-    measured = claim.measure.measure(found.scores(unsent, tau=tau, disc=disc))  # type: ignore[union-attr]
+    measured = claim.measure.measure(results.scores(unsent, tau=tau, disc=disc))  # type: ignore[union-attr]
     value = measured.value if measured.value == measured.value else None
     verdict = str(claim.rule(claim.paper, measured).verdict)
     return Varied(claim.id, unsent, knob, setting, value, measured.low, measured.high, verdict)

@@ -1,5 +1,7 @@
-"""The rule by which a figure of the paper and ours become a verdict; pure. Written before anything was measured, but for
-the half point, which was added when a second seed had shown that differences of 0.1 to 0.2 points come and go.
+"""The rules that turn a figure of the paper and ours into a verdict; pure.
+
+They were written before anything was measured, except the half point. That was added when a second seed had shown that
+differences of 0.1 to 0.2 points come and go.
 
 A *contrast* (a difference of APs) is judged as the paper judges its own: it is significant when its 95 % interval
 does not contain zero.
@@ -16,7 +18,7 @@ does not contain zero.
 
 A claim that *most* of the gain is kept asks for more than a sign: the interval has to lie above one half.
 
-Its size is told apart from the verdict: *same size* when the intervals overlap (where the paper prints none, when
+Its size is reported separately from the verdict: *same size* when the intervals overlap (where the paper prints none, when
 ours holds the paper's value), else *larger* or *smaller* by magnitude. Absolute APs are *not comparable*: the paper
 says so of its own split, and this is another benchmark.
 
@@ -35,8 +37,8 @@ HALF_AN_ORDER = math.sqrt(10.0)
 HALF = 50.0
 """Per cent."""
 NEGLIGIBLE = 0.5
-"""Points of AP. Where the paper finds no difference its intervals reach a point and more to either side, so that it could
-not have told half a point from nothing; and with frames enough any difference is significant."""
+"""Points of AP. Where the paper finds no difference its intervals reach a point and more to either side, so it could
+not tell half a point from zero; and with enough frames any difference is significant."""
 
 
 class ClaimVerdict(StrEnum):
@@ -55,7 +57,7 @@ class Size(StrEnum):
     SAME = "same size"
     LARGER = "larger"
     SMALLER = "smaller"
-    UNTOLD = ""
+    NOT_COMPARED = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class MeasuredValue:
     high: float | None = None
     p: float | None = None
     note: str = ""
-    """What a reader has to know of it: which policy was the best, on which machine."""
+    """Context for a reader: which policy was the best, on which machine."""
 
     @property
     def significant(self) -> bool:
@@ -99,7 +101,7 @@ class Judgement:
     """A verdict, and how the sizes compare."""
 
     verdict: ClaimVerdict
-    size: Size = Size.UNTOLD
+    size: Size = Size.NOT_COMPARED
 
 
 def contrast(paper: Paper, ours: MeasuredValue | None) -> Judgement:
@@ -170,7 +172,7 @@ def same_place(paper: Paper, ours: MeasuredValue | None) -> Judgement:
 
 def _size(paper: Paper, ours: MeasuredValue) -> Size:
     if paper.value is None or ours.low is None or ours.high is None:
-        return Size.UNTOLD
+        return Size.NOT_COMPARED
     low = paper.value if paper.low is None else paper.low
     high = paper.value if paper.high is None else paper.high
     if ours.low <= high and low <= ours.high:

@@ -1,1 +1,1 @@
-"""How good boxes are: average precision, overlap, and intervals by bootstrap."""
+"""Metrics of boxes: average precision, overlap, and intervals by bootstrap."""

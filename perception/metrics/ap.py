@@ -1,4 +1,4 @@
-"""How good boxes on the ground are: suppression, matching to what was there, average precision. Free of torch.
+"""Average precision of boxes on the ground: suppression, matching to ground truth, and the curve. Free of torch.
 
 AP here is AP@0.5 by rotated bird's-eye IoU: detections of all frames sorted by score together, each matched
 greedily to the best *remaining* ground truth of its frame, area under the all-point interpolated curve.
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
@@ -153,13 +154,13 @@ def suppress(boxes: Boxes, iou: float) -> Boxes:
 def match(
     found: Boxes,
     truth: Boxes,
-    disc: tuple[float, float, float] | None = None,
+    disc: Disc | None = None,
     iou: float = 0.5,
     convention: Convention = ROTATED,
 ) -> Matched:
     """Match one frame's detections to its ground truth, best score first, each to the best remaining truth.
 
-    With a `disc` (x, y, radius) only detections and truths centred in it count.
+    With a `disc` only detections and truths centred in it count.
     """
     found, truth = found.inside(disc), truth.inside(disc)
     found = found.take(np.argsort(-found.score, kind="stable"))
@@ -223,7 +224,7 @@ def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou:
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:
-    """AP over the frames; NaN when there was nothing to find. Of the convention `sort` and `points` are asked here."""
+    """AP over the frames; NaN without ground truth. Uses the convention's `sort` and `points`."""
     truths = sum(f.truths for f in frames)
     if truths == 0:
         return float("nan")

@@ -1,4 +1,4 @@
-"""How sure an AP is: a paired percentile bootstrap, its p-values, and Benjamini and Hochberg's correction. Free of torch.
+"""Uncertainty of an AP: a paired percentile bootstrap, its p-values, and Benjamini and Hochberg's correction. Free of torch.
 
 One set of resamples serves a whole table: the same frames are drawn for every condition, so that every difference is
 paired, and any arithmetic of APs has its interval by doing it to every draw.
@@ -31,7 +31,7 @@ class Ranked:
 
     hits: Floats
     """[groups, bins]"""
-    found: Floats
+    detections: Floats
     """[groups, bins]"""
     truths: Floats
     """[groups]"""
@@ -43,7 +43,7 @@ class Ranked:
         weights = np.asarray(weights, np.float64)
         truths = weights @ self.truths
         right = np.cumsum(weights @ self.hits, axis=1)
-        seen = np.cumsum(weights @ self.found, axis=1)
+        seen = np.cumsum(weights @ self.detections, axis=1)
         value = area(right, right / np.maximum(seen, 1e-12), np.maximum(truths, 1e-12))
         return np.where(truths > 0, value + self.offset, np.nan)
 

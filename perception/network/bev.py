@@ -1,7 +1,7 @@
 """The lift: five views to one bird's-eye image on the ground, by inverse perspective mapping.
 
-The grid is the image grid of `geometry.py`. The lift assumes that everything lies on the ground, which the lift is told to be `est_position_m[2]` below:
-what stands up leans outwards and hides what is behind it. That is what a second viewpoint resolves.
+The grid is the image grid of `geometry.py`. The lift assumes that everything lies on the ground, `est_position_m[2]` below the drone.
+So whatever stands up leans outwards and hides what is behind it; a second viewpoint resolves that.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from sortie.perception.compiled import compiled, fma
-from sortie.perception.geometry import FULL, IMAGE_PX, Geometry
-from sortie.perception.scene.render import CAMERAS, HALF_H, HALF_V, HEIGHT_PX, tilt
+from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, IMAGE_PX, Geometry
+from sortie.perception.scene.render import CAMERAS, tilt
 from sortie.perception.scene.town import Bytes, FloatMap
 from sortie.perception.types import Capture
 

@@ -12,20 +12,18 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from sortie.perception.errors import InputError
+from sortie.perception.files import replacing
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
 
 
 def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -> None:
     """Write every tensor of `net` and its configuration, under a temporary name first; `facts` is JSON about its making."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
     metadata = {"model": json.dumps(asdict(net.config)), "sortie": json.dumps(facts or {})}
-    save_file(
-        {k: v.contiguous() for k, v in net.state_dict().items() if v.dtype.is_floating_point}, part, metadata=metadata
-    )
-    part.chmod(0o644)  # the library makes it private
-    part.replace(path)
+    tensors = {k: v.contiguous() for k, v in net.state_dict().items() if v.dtype.is_floating_point}
+    with replacing(path) as part:
+        save_file(tensors, part, metadata=metadata)
+        part.chmod(0o644)  # the library makes it private
 
 
 def load_weights(path: Path) -> CarNet:

@@ -1,8 +1,8 @@
-"""The detector as a sortie uses it: render when asked, encode once, fuse what was delivered, find the cars.
+"""The torch detector of a sortie: it renders on demand, encodes once, fuses what was delivered, and detects the cars.
 
 A capture costs nothing until a job needs it. Features, confidences and single-drone boxes of a capture are
 kept for the latest 64 captures, so a frame that is shared to four peers is rendered and encoded once. Every
-network call has the same shapes whatever else is asked for, so the same capture gives the same numbers.
+network call has the same shapes whatever else is computed, so the same capture gives the same numbers.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.geometry import CELLS, FULL, in_square
-from sortie.perception.joining import NMS_IOU, Pose, Told, joined, sendable, told
+from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.ground_truth import ground_truth
+from sortie.perception.joining import NMS_IOU, Pose, SourceBoxes, joined, sendable, source_of
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
@@ -36,17 +37,16 @@ from sortie.perception.scene.render import VIEWS_SHAPE, Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
 KEPT_CAPTURES = 64
-MAPS, LATE = ("features", "raw"), ("detections", "tracks")
-Disc = tuple[float, float, float]
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
-__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "ground_truth", "shipped"]
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "shipped"]
 
 
 def shipped(fusion: str) -> Path:
@@ -54,33 +54,9 @@ def shipped(fusion: str) -> Path:
     return SHIPPED_WEIGHTS if FUSIONS[fusion].shares != "features" else WEIGHTS / f"{fusion}.safetensors"
 
 
-def ground_truth(
-    scene: SceneModel,
-    t_s: float,
-    centre_xy: tuple[float, float],
-    half_extent: float = FULL.half_extent_m,
-    yaw_rad: float = 0.0,
-) -> Boxes:
-    """The cars at `t_s` whose centres lie in the square about `centre_xy` (ENU, m) that is turned by `yaw_rad`.
-
-    Every such car counts, also one that no drone could see. Scores are 1.
-    """
-    cars = scene.cars_at(t_s)
-    xy = np.stack([cars.x_m, cars.y_m], axis=1)
-    inside = in_square(xy, [(*centre_xy, yaw_rad)], half_extent)[:, 0]
-    cars = cars.where(inside)
-    columns = (
-        xy[inside],
-        np.stack([cars.length_m, cars.width_m], 1),
-        cars.yaw_rad,
-        np.ones(len(cars)),
-    )
-    return Boxes(*(column.astype(np.float32) for column in columns))
-
-
 @dataclass(slots=True)
 class _Encoded:
-    """What is known of one capture, or under way: its features [80, 64, 64], and, when asked for, what it shows alone."""
+    """The results for one capture, computed or under way: its features [80, 64, 64], and on demand its boxes without peers."""
 
     features: Future[Tensor]
     out: Future[Tensor] | None = None
@@ -134,7 +110,7 @@ class TorchDetector:
         )
 
     def detect(self, jobs: Jobs) -> list[Boxes]:
-        """Each ego's boxes from its own features and what it was sent, ENU, best first.
+        """Each ego's boxes from its own features and the shares it received, ENU, best first.
 
         A late share's map lies where its sender was at the capture, both poses being known: what has moved since
         lags, what stands still fits. Without `motion_compensation` it lies where its sender is now, if that is among
@@ -143,12 +119,12 @@ class TorchDetector:
         return self.begin(jobs)()
 
     def begin(self, jobs: Jobs) -> Callable[[], list[Boxes]]:
-        """Render what the jobs need and have the rest worked out in the background; the boxes are there when called for."""
+        """Render what the jobs need and compute the rest in the background; calling the result waits for the boxes."""
         if self._fusion.shares == "nothing":
             jobs = [(ego, ()) for ego, _ in jobs]
         known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        look = {s.capture for s in shared if s.representation in LATE}
+        look = {s.capture for s in shared if not s.is_map}
         look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
@@ -157,20 +133,20 @@ class TorchDetector:
                 self._head_alone(capture)
         if self._fusion.shares == "boxes":
             for share in shared:
-                if share.representation in MAPS:
+                if share.is_map:
                     self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
-        # as things stand: what is asked for later stands behind these tasks, and none may wait for it
+        # a copy: later requests queue behind these tasks, and no task may wait for them
         known = {capture: replace(kept) for capture, kept in known.items()}
-        found = [self._task(self._find, ego, shares, now, known) for ego, shares in jobs]
-        return lambda: [f.result() for f in found]
+        detected = [self._task(self._detect_ego, ego, shares, now, known) for ego, shares in jobs]
+        return lambda: [f.result() for f in detected]
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
-        """The cars inside the ego's square at `t_s`: `ground_truth` about its true position and heading at capture."""
-        return ground_truth(self._scene, t_s, ego.position_m[:2], FULL.half_extent_m, ego.true_yaw_rad)
+        """The cars inside the ego's square at `t_s`, about its true position and heading at capture."""
+        return ground_truth(self._scene.cars_at(t_s).table(), ego.true_pose).single()
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
-        """How many detections the drone would send for this capture (it renders and encodes: tens of milliseconds)."""
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        """The number of detections that the drone would send (renders and encodes: tens of milliseconds)."""
         self._encode([capture])
         return len(self._sendable(self._look_alone(capture).result()).inside(roi))
 
@@ -180,7 +156,7 @@ class TorchDetector:
         return views
 
     def _task(self, do: Callable[..., R], *what: Any) -> Future[R]:
-        """Have it done by one thread."""
+        """Run it in one thread of the pool."""
 
         def task() -> R:
             with torch.inference_mode():
@@ -198,7 +174,7 @@ class TorchDetector:
         def encode(i: int, seen: Future[None]) -> Tensor:
             seen.result()
             image = lift(views[i : i + 1], missing[i : i + 1])
-            with self._reckoning():
+            with self._autocast():
                 features: Tensor = self._net.encoder(image)[0]
             return features
 
@@ -220,22 +196,22 @@ class TorchDetector:
         return {capture: self._kept[capture] for capture in wanted}
 
     def _must_rank(self, share: Share) -> bool:
-        """Whether the sender's own head is needed to say which cells it sent."""
+        """Whether the sender's own head is needed to choose the cells it sent."""
         if share.representation != "features" or self._config.cells_by != "confidence":
             return False
         return _is_ranked(share)
 
-    def _reckoning(self) -> torch.autocast:
+    def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self._config.precision == "bfloat16")
 
     def _head(self, features: Tensor) -> Tensor:
         """[1, 80, 64, 64] → [7, 128, 128]."""
-        with self._reckoning():
+        with self._autocast():
             out: Tensor = self._net.head(features)[0]
         return out.float()
 
     def _head_alone(self, capture: Capture) -> Future[Tensor]:
-        """The head's output without peers, worked out once."""
+        """The head's output without peers, computed once."""
         kept = self._kept[capture]
         if kept.out is None:
             features = kept.features
@@ -243,7 +219,7 @@ class TorchDetector:
         return kept.out
 
     def _look_alone(self, capture: Capture) -> Future[Boxes]:
-        """What the capture shows without peers, worked out once."""
+        """The capture's boxes without peers, computed once."""
         kept = self._kept[capture]
         if kept.boxes is None:
             out = self._head_alone(capture)
@@ -270,9 +246,9 @@ class TorchDetector:
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
-        return self._fusion.shares == "features" and share.representation in MAPS
+        return self._fusion.shares == "features" and share.is_map
 
-    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
+    def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
         out = self._fuse(ego, maps, now, known) if maps else None
@@ -282,14 +258,14 @@ class TorchDetector:
             own = alone.result()
         else:
             own = self._place(self._head(known[ego].features.result()[None]), ego.est_pose)
-        late = [self._told(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+        late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         return joined(ego.est_pose, own, out is not None, late, self._config.join)
 
     def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Tensor | None:
-        """The head's output after fusion; None where no peer has a say in any cell."""
+        """The head's output after fusion; None where no peer takes part in any cell."""
         # relative to the ego, so that float32 keeps millimetres kilometres from the origin
         x, y, yaw = ego.est_pose
-        poses = [self._lies(s, now) for s in maps]
+        poses = [self._map_pose(s, now) for s in maps]
         there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
         under = support(torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
         weights, arrived = arriving(under, torch.stack([self._sent(s, known).flatten() for s in maps]))
@@ -306,30 +282,30 @@ class TorchDetector:
         fused = self._net.fusion.fuse(known[ego].features.result(), said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         return self._head(fused)
 
-    def _lies(self, share: Share, now: Mapping[int, Capture]) -> Pose:
+    def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
         return capture.est_pose
 
-    def _told(self, share: Share, now: Mapping[int, Capture], known: Known) -> Told:
-        """What a share adds as boxes: those that were sent, or, in late fusion, those that show in the cells that were."""
-        if share.representation in MAPS:
-            lies, part = self._lies(share, now), _part(share)
+    def _source(self, share: Share, now: Mapping[int, Capture], known: Known) -> SourceBoxes:
+        """The boxes that a share adds: those that were sent or, in late fusion, those detected in the cells that were sent."""
+        if share.is_map:
+            lies, part = self._map_pose(share, now), _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)
-            said = Told(self._place(out, lies), share.weight, lies, part[1], cut)
+            said = SourceBoxes(self._place(out, lies), share.weight, lies, part[1], cut)
         else:
             alone = known[share.capture].boxes
-            assert alone is not None  # noqa: S101 (asked for with the job)
-            said = told(share, alone.result())
+            assert alone is not None  # noqa: S101 (requested with the job)
+            said = source_of(share, alone.result())
         return replace(said, boxes=self._sendable(said.boxes))
 
     def _sendable(self, boxes: Boxes) -> Boxes:
-        """What of a drone's boxes it sends: in late fusion those that are sure."""
+        """Those of a drone's boxes that it sends: in late fusion only confident ones."""
         return sendable(boxes) if self._fusion.shares == "boxes" else boxes
 
     def _head_in_part(self, share: Share, known: Known) -> None:
-        """The head's output from what was sent of a map, worked out once for a capture and a budget."""
+        """The head's output from the cells that were sent, computed once per capture and budget."""
         kept = known[share.capture]
         if _part(share) in kept.in_part:
             return
@@ -350,5 +326,5 @@ def _part(share: Share) -> tuple[float, Disc | None, tuple[int, ...]]:
 
 
 def _is_ranked(share: Share) -> bool:
-    """Whether cells stand in an order: some did not fit the budget, or some did not arrive (the best are sent first)."""
+    """Whether cells have to be ranked: some did not fit the budget or did not arrive (the best are sent first)."""
     return bool(share.missing) or budget.must_choose(share.rho, share.roi, *share.capture.est_pose)

@@ -1,4 +1,4 @@
-"""The network as it is flown: the same answers to rounding, in less than half the time on a CPU.
+"""The network prepared for inference: the same results to rounding, in less than half the time on a CPU.
 
 Batch norms go into the layers before them, 3 × 3 convolutions are done by Winograd's filtering (`winograd.py`), and what
 the first layer makes of where a pixel lies is worked out once.

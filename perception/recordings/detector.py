@@ -1,4 +1,4 @@
-"""A recording as a sortie's detector: what was recorded nearest to the capture is what the drone saw. Free of torch."""
+"""A recording as a sortie's detector: a drone sees the record nearest to its capture. Free of torch."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.geometry import CELLS, CHANNELS, FULL, in_square
-from sortie.perception.joining import NMS_IOU, Told, joined, sendable, told
+from sortie.perception.geometry import CELLS, CHANNELS, FULL
+from sortie.perception.ground_truth import ground_truth
+from sortie.perception.joining import NMS_IOU, SourceBoxes, joined, sendable, source_of
 from sortie.perception.metrics.ap import suppress
-from sortie.perception.recordings.exchange import Sent, fused, load_fusion, reaching
+from sortie.perception.recordings.exchange import Sent, fused, load_fusion, received_boxes
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
-MAPS = ("features", "raw")
 NEAR_M = 5.0
 """The drone of the sortie has to be this near to where the recorded one was."""
 
@@ -54,19 +55,16 @@ class RecordedDetector:
         self._step_s = float(np.median(np.diff(rec.t_s))) if len(rec) > 1 else 0.1
 
     def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
-        """Each ego's boxes from its own record and what it was sent, ENU, best first."""
+        """Each ego's boxes from its own record and the shares it received, ENU, best first."""
         now = {ego.drone: ego for ego, _ in jobs}
-        return [self._find(ego, shares if self._config.fusion != "none" else (), now) for ego, shares in jobs]
+        return [self._detect_ego(ego, shares if self._config.fusion != "none" else (), now) for ego, shares in jobs]
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The recorded cars of the frame nearest to `t_s`, in the square about where the ego was recorded."""
         pose = self._recording.pose[self._frame(ego), ego.drone]
-        cars = self._recording.truth(self._nearest(t_s, "truth"))
-        cars = cars[in_square(cars[:, :2], [pose])[:, 0]]
-        columns = (cars[:, :2], cars[:, 2:4], cars[:, 4], np.ones(len(cars)))
-        return Boxes(*(column.astype(np.float32) for column in columns))
+        return ground_truth(self._recording.truth(self._nearest(t_s, "truth")), pose).single()
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """How many recorded detections the drone would send."""
         return len(self._sendable(self._alone(capture, self._pose(capture))).inside(roi))
 
@@ -80,19 +78,19 @@ class RecordedDetector:
 
     # --- one ego ---------------------------------------------------------------------------------
 
-    def _find(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
+    def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
         config, pose = self._config, self._pose(ego)
         at = (self._frame(ego), ego.drone)
-        heard = [s for s in shares if s.weight > 0.0]
-        maps = [self._sent(s, now) for s in heard if s.representation in MAPS]
+        weighted = [s for s in shares if s.weight > 0.0]
+        maps = [self._sent(s, now) for s in weighted if s.is_map]
         if self._fuse is not None and maps:
             local = fused(self._fuse, self._recording, at, pose, maps, config.unsent_cells)
         else:
-            local = reaching(self._recording, at, pose, maps)
-        found = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
-        found = suppress(found, NMS_IOU)
-        late = [self._told(s) for s in heard if s.representation not in MAPS]
-        return joined(pose, found, bool(maps), late, config.join)
+            local = received_boxes(self._recording, at, pose, maps)
+        own = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
+        own = suppress(own, NMS_IOU)
+        late = [self._source(s) for s in weighted if not s.is_map]
+        return joined(pose, own, bool(maps), late, config.join)
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:
         capture, config = share.capture, self._config
@@ -107,12 +105,12 @@ class RecordedDetector:
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight)
 
-    def _told(self, share: Share) -> Told:
-        said = told(share, self._alone(share.capture, self._pose(share.capture)))
+    def _source(self, share: Share) -> SourceBoxes:
+        said = source_of(share, self._alone(share.capture, self._pose(share.capture)))
         return replace(said, boxes=self._sendable(said.boxes))
 
     def _sendable(self, boxes: Boxes) -> Boxes:
-        """What of a drone's boxes it sends: in late fusion those that are sure."""
+        """Those of a drone's boxes that it sends: in late fusion only confident ones."""
         return sendable(boxes) if self._config.fusion == "late" else boxes
 
     def _alone(self, capture: Capture, pose: tuple[float, float, float]) -> Boxes:
@@ -129,7 +127,7 @@ class RecordedDetector:
         """
         rec = self._recording
         if capture.drone >= rec.drones:
-            raise RecordingError(f"{rec.path}: drone {capture.drone} is asked for, must be one of 0 … {rec.drones - 1}")
+            raise RecordingError(f"{rec.path}: drone {capture.drone} is not in it, must be one of 0 … {rec.drones - 1}")
         frame = self._nearest(capture.t_s, f"drone {capture.drone}")
         x, y = rec.pose[frame, capture.drone, :2]
         off = float(np.hypot(x - capture.position_m[0], y - capture.position_m[1]))
@@ -147,7 +145,7 @@ class RecordedDetector:
         off = abs(float(times[frame]) - t_s)
         if off > self._step_s * (1 + 1e-9):
             bound = f"within {self._step_s:g} s of a frame ({times[0]:g} … {times[-1]:g} s)"
-            raise RecordingError(f"{self._recording.path}: {who} is asked for at {t_s:g} s, must be {bound}")
+            raise RecordingError(f"{self._recording.path}: {who} is needed at {t_s:g} s, must be {bound}")
         return frame
 
     def _pose(self, capture: Capture) -> tuple[float, float, float]:

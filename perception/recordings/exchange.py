@@ -1,4 +1,4 @@
-"""What reaches an ego of a recording: boxes by the cells that were sent, or features through the user's own fusion.
+"""What an ego of a recording receives: boxes by the cells that were sent, or features through the user's own fusion.
 
 Without a fusion an object-level stand-in is modelled: a peer's recorded box reaches the ego if the cell that holds
 its centre was sent. It cannot find a car that neither drone found alone, and silent peers cost it nothing.
@@ -23,7 +23,7 @@ Fuse = Callable[[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]], A
 """`fuse(agents, takes_part, weight)` → boxes [m, 6] in the ego's frame.
 
 - agents [1 + k, C, 64, 64] float32 on the ego's grid, the ego's own first, zero where nothing arrived;
-- takes_part [1 + k, 64, 64] bool: who has a say where (with unsent cells as zeros: all that a peer's grid covers);
+- takes_part [1 + k, 64, 64] bool: who counts in which cell (with unsent cells as zeros: all that a peer's grid covers);
 - weight [1 + k]: each link's fusion weight, the ego's 1.
 """
 
@@ -71,7 +71,7 @@ def fusion_hash(reference: str | None) -> str:
     return hashlib.blake2b(source + reference.rpartition(":")[2].encode(), digest_size=16).hexdigest()
 
 
-def reaching(
+def received_boxes(
     recording: Recording, ego: tuple[int, int], pose: tuple[float, float, float], sent: Sequence[Sent]
 ) -> Floats:
     """[m, 6]: the ego's own boxes and those of its peers whose cells were sent, in the ego's frame, before suppression.

@@ -1,4 +1,4 @@
-"""A recording as the harness's instrument and frames: every condition of the paper on a model of the user's. Free of torch."""
+"""A recording as instrument and frames of the evaluation: every condition of the paper on another model. Free of torch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames
 from sortie.perception.evaluation.evaluate import FLOOR, evaluate
 from sortie.perception.evaluation.matched import Evaluation
-from sortie.perception.recordings.exchange import Fuse, Sent, fused, fusion_hash, load_fusion, reaching
+from sortie.perception.recordings.exchange import Fuse, Sent, fused, fusion_hash, load_fusion, received_boxes
 from sortie.perception.recordings.recording import Floats, Ints, Recording, RecordingError, open_recording
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrames:
-    """Frames of a recording as the harness reads them (`contract.FleetFrames`)."""
+    """Frames of a recording as the evaluation reads them (`contract.FleetFrames`)."""
 
     true_pose: Floats
     est_pose: Floats
@@ -76,7 +76,7 @@ class RecordedInstrument:
 
 @dataclass(frozen=True, slots=True)
 class RecordedView:
-    """One recorded frame (`contract.View`)."""
+    """One recorded frame (`contract.FrameView`)."""
 
     recording: Recording
     fuse: Fuse | None
@@ -94,7 +94,7 @@ class RecordedView:
     def _boxes(self, e: Exchange) -> Floats:
         sent = [Sent(self.frame, p, cells, self._pose(p)) for p, cells in zip(e.peers, e.sent, strict=True)]
         if self.fuse is None or not sent:
-            return reaching(self.recording, (self.frame, e.ego), self._pose(e.ego), sent)
+            return received_boxes(self.recording, (self.frame, e.ego), self._pose(e.ego), sent)
         return fused(self.fuse, self.recording, (self.frame, e.ego), self._pose(e.ego), sent, e.unsent)
 
     def _pose(self, drone: int) -> tuple[float, float, float]:

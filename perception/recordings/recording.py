@@ -1,4 +1,4 @@
-"""A recording: what a model of the user's saw, frame by frame and drone by drone, on disk as npz or Zarr.
+"""A recording: the detections of another model, frame by frame and drone by drone, on disk as npz or Zarr.
 
 The layout is the table in this folder's README. Everything is checked when a recording is opened, but for features
 and confidences, which may be larger than memory and are checked frame by frame as they are read.
@@ -28,7 +28,7 @@ Ints = NDArray[np.int64]
 
 
 class RecordingError(InputError):
-    """A recording that is missing, broken, or asked for what it does not hold; the message names file, array, value and bound."""
+    """A recording that is missing, broken, or lacks what is needed; the message names file, array, value and bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ def cells_of(boxes: Floats, geometry: Geometry) -> tuple[Ints, Ints, NDArray[np.
 
 
 def open_recording(path: Path | str) -> Recording:
-    """A recording on disk: a folder is Zarr (read as it is asked for), a file npz (in memory).
+    """A recording on disk: a folder is Zarr (read as it is needed), a file npz (in memory).
 
     Raises:
         RecordingError: naming the file, the array, its value and the bound; also where Zarr is not installed.
@@ -202,46 +202,46 @@ def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, A
         raise RecordingError(
             f"{path}: {name} is unknown, beside what it must hold a recording may hold {', '.join(OPTIONAL)}"
         )
-    look = _Look(path, small)
-    version = int(look.numbers("format", ()))
+    checks = _Checks(path, small)
+    version = int(checks.numbers("format", ()))
     if version != FORMAT:
         raise RecordingError(f"{path}: format is {version}, must be {FORMAT}")
-    cell_m = float(look.numbers("cell_m", ()))
-    look.hold("cell_m", cell_m > 0, f"is {cell_m:g}", "above 0")
-    t_s = look.numbers("t_s", (None,))
+    cell_m = float(checks.numbers("cell_m", ()))
+    checks.require("cell_m", cell_m > 0, f"is {cell_m:g}", "above 0")
+    t_s = checks.numbers("t_s", (None,))
     n = len(t_s)
-    look.hold("t_s", n > 0, "is empty", "at least one frame")
-    scene = look.whole("scene", (n,)) if "scene" in small else np.zeros(n, np.int64)
+    checks.require("t_s", n > 0, "is empty", "at least one frame")
+    scene = checks.whole("scene", (n,)) if "scene" in small else np.zeros(n, np.int64)
     begins = np.flatnonzero(np.append(True, scene[1:] != scene[:-1]))
-    look.hold(
+    checks.require(
         "scene", len(begins) == len(set(scene.tolist())), "comes back to a scene it left", "one run of frames a scene"
     )
     back = np.flatnonzero((np.diff(t_s) <= 0) & (scene[1:] == scene[:-1]))
     if len(back):
         at = int(back[0]) + 1
-        look.hold("t_s", False, f"is {t_s[at]:g} in frame {at}", f"above {t_s[at - 1]:g}, the frame before")
-    pose = look.numbers("pose", (n, None, 3))
+        checks.require("t_s", False, f"is {t_s[at]:g} in frame {at}", f"above {t_s[at - 1]:g}, the frame before")
+    pose = checks.numbers("pose", (n, None, 3))
     d = pose.shape[1]
-    look.hold("pose", d > 0, "has no drones", "at least one")
-    est_pose = look.numbers("est_pose", (n, d, 3)) if "est_pose" in small else pose
+    checks.require("pose", d > 0, "has no drones", "at least one")
+    est_pose = checks.numbers("est_pose", (n, d, 3)) if "est_pose" in small else pose
     parts = []
     for name, width, count in (("boxes", 6, n * d), ("truth", 5, n)):
-        table = look.numbers(name, (None, width))
-        offset = look.whole(f"{name}_offset", (count + 1,))
+        table = checks.numbers(name, (None, width))
+        offset = checks.whole(f"{name}_offset", (count + 1,))
         ends = (int(offset[0]), int(offset[-1]))
-        look.hold(
+        checks.require(
             f"{name}_offset",
             ends == (0, len(table)),
             f"runs from {ends[0]} to {ends[1]}",
             f"0 to {len(table)}, the rows of {name}",
         )
-        look.hold(f"{name}_offset", bool((np.diff(offset) >= 0).all()), "falls", "ascending")
+        checks.require(f"{name}_offset", bool((np.diff(offset) >= 0).all()), "falls", "ascending")
         flat = np.flatnonzero((table[:, 2:4] <= 0).any(axis=1))
-        look.hold(name, not len(flat), f"row {flat[0] if len(flat) else 0} has a length or width ≤ 0", "above 0 m")
+        checks.require(name, not len(flat), f"row {flat[0] if len(flat) else 0} has a length or width ≤ 0", "above 0 m")
         parts += [table, offset]
     wrong = np.flatnonzero((parts[0][:, 5] < 0) | (parts[0][:, 5] > 1))
     if len(wrong):
-        look.hold("boxes", False, f"row {wrong[0]} has the score {parts[0][wrong[0], 5]:g}", "0 to 1")
+        checks.require("boxes", False, f"row {wrong[0]} has the score {parts[0][wrong[0], 5]:g}", "0 to 1")
     _check_large(path, large, n, d)
     return Recording(path, t_s, scene, pose, est_pose, cell_m, dict(large), *parts)
 
@@ -265,32 +265,32 @@ def _check_large(path: Path, large: Mapping[str, Any], n: int, d: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
-    """Asks arrays of a file for what they must be."""
+class _Checks:
+    """Checks arrays of a file."""
 
     path: Path
     arrays: Mapping[str, NDArray[Any]]
 
-    def hold(self, name: str, good: bool, what: str, bound: str) -> None:
+    def require(self, name: str, good: bool, what: str, bound: str) -> None:
         if not good:
             raise RecordingError(f"{self.path}: {name} {what}, must be {bound}")
 
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Any:
         """As float64 of a shape; None is any length."""
         array = np.asarray(self.arrays[name])
-        self.hold(name, array.dtype.kind in "iuf", f"is {array.dtype}", "numbers")
+        self.require(name, array.dtype.kind in "iuf", f"is {array.dtype}", "numbers")
         fits = array.ndim == len(shape) and all(w is None or h == w for h, w in zip(array.shape, shape, strict=True))
-        told = ", ".join("any" if w is None else str(w) for w in shape)
-        self.hold(name, fits, f"has shape {list(array.shape)}", f"[{told}]")
+        expected = ", ".join("any" if w is None else str(w) for w in shape)
+        self.require(name, fits, f"has shape {list(array.shape)}", f"[{expected}]")
         good = np.isfinite(array)
         if not good.all():
             at = [int(i[0]) for i in np.nonzero(~good)]
-            self.hold(name, False, f"{at} is {array[tuple(at)]}", "finite")
+            self.require(name, False, f"{at} is {array[tuple(at)]}", "finite")
         return array.astype(np.float64)
 
     def whole(self, name: str, shape: tuple[int | None, ...]) -> Any:
         """As int64 of a shape."""
-        self.hold(
+        self.require(
             name, np.asarray(self.arrays[name]).dtype.kind in "iu", f"is {self.arrays[name].dtype}", "whole numbers"
         )
         return self.numbers(name, shape).astype(np.int64)

@@ -108,7 +108,7 @@ def _info(r: _Record) -> Uav3dSample:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What the JSON tables say beyond the pickles: each sample's scene, and every annotation."""
+    """What the JSON tables hold beyond the pickles: each sample's scene, and every annotation."""
 
     scene_of: Mapping[str, str]
     """Scene name by sample token."""
@@ -251,7 +251,7 @@ def read_image(root: Path | str, camera: Camera) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """A dict of a file, asked for its fields."""
+    """A dict of a file, with checked access to its fields."""
 
     where: str
     data: Any
@@ -289,8 +289,8 @@ class _Record:
         if value.size == 0 and shape[0] is None:
             value = value.reshape(0, *(w or 0 for w in shape[1:]))
         if value.ndim != len(shape) or any(w is not None and h != w for h, w in zip(value.shape, shape, strict=True)):
-            told = ", ".join("any" if w is None else str(w) for w in shape)
-            raise Uav3dError(f"{self.where}.{name} has shape {list(value.shape)}, must be [{told}]")
+            expected = ", ".join("any" if w is None else str(w) for w in shape)
+            raise Uav3dError(f"{self.where}.{name} has shape {list(value.shape)}, must be [{expected}]")
         if not np.isfinite(value).all():
             raise Uav3dError(f"{self.where}.{name} is not finite, must be finite everywhere")
         return value

@@ -39,8 +39,8 @@ def load_data(path: Path | str) -> Any:
     try:
         return loads_data(Path(path).read_bytes())
     except (UnpickleError, OSError) as error:
-        told = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-        raise UnpickleError(f"{path}: {told}") from None
+        reason = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+        raise UnpickleError(f"{path}: {reason}") from None
 
 
 def loads_data(data: bytes) -> Any:
@@ -86,7 +86,7 @@ class _StandIn:
 
 
 class _Dtype:
-    """A dtype as a pickle tells it: its code, then its byte order."""
+    """A dtype as a pickle gives it: its code, then its byte order."""
 
     __slots__ = ("_code", "_order")
 
@@ -112,8 +112,8 @@ class _Array(np.ndarray[Any, Any]):
             raise UnpickleError("an array's state is refused, must be version, shape, dtype, order and bytes")
         _, shape, dtype, fortran, raw = state
         values = _values(raw, dtype, shape, "F" if fortran is True else "C")
-        told: Any = (1, values.shape, values.dtype, bool(fortran), values.tobytes("F" if fortran else "C"))
-        super().__setstate__(told)
+        checked: Any = (1, values.shape, values.dtype, bool(fortran), values.tobytes("F" if fortran else "C"))
+        super().__setstate__(checked)
 
 
 def _values(raw: Any, dtype: Any, shape: Any, order: str) -> np.ndarray[Any, Any]:
@@ -148,7 +148,7 @@ def _scalar(dtype: Any, raw: Any = None) -> Any:
 
 
 def _encode(text: Any, codec: Any) -> bytes:
-    """How protocols 0 to 2 tell bytes."""
+    """How protocols 0 to 2 write bytes."""
     if not isinstance(text, str) or codec != "latin1":
         raise UnpickleError(f"_codecs.encode to {codec!r} is refused, must be bytes as latin1 text")
     return text.encode("latin1")
@@ -161,7 +161,7 @@ def _no_bytes(*args: Any) -> bytes:
 
 
 def _ndarray(*args: Any) -> Any:
-    raise UnpickleError("a call of numpy.ndarray is refused, arrays are told by their bytes")
+    raise UnpickleError("a call of numpy.ndarray is refused, arrays are given by their bytes")
 
 
 def _listed(make: Callable[..., Any]) -> _StandIn:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sortie.perception.files import replacing
 from sortie.perception.recordings.recording import FORMAT, Floats, RecordingError, checked, from_zarr
 
 
@@ -57,9 +58,8 @@ def write_recording(
             halves = [_halves(path, f"features of frame {f}", frame) for f, frame in enumerate(features)]
             large["features"] = np.stack(halves)
         checked(path, small, large)
-        part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
-        np.savez_compressed(part, **small, **large)  # type: ignore[arg-type]
-        part.replace(path)
+        with replacing(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **small, **large)  # type: ignore[arg-type]
         return path
     _to_zarr(path, small, large, features)
     return path

@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.geometry import HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
 from sortie.perception.scene.rays import COARSE, FAR, FAR_REACH, REACH, see
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.stamping import raised, restore, saved, stamp
@@ -24,11 +25,7 @@ from sortie.perception.types import Capture
 from sortie.scenarios.streams import stream
 
 CAMERAS = ("front", "left", "right", "back", "nadir")
-WIDTH_PX, HEIGHT_PX = 160, 90
 VIEWS_SHAPE = (len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3)
-HALF_H = float(np.tan(np.radians(35.0)))
-"""Tangent of half the horizontal field of view."""
-HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
 MAX_REACH_M = 170.0
 RES = np.float32(RES_M)
 FloatOrArray = TypeVar("FloatOrArray", float, Floats)
@@ -102,7 +99,7 @@ class Window:
         self._stamp(scene.parked_cars)
         self.coarse = _grown(_blocks(self.height, COARSE), 1)
         self.far = _grown(_blocks(self.coarse, FAR // COARSE), FAR_REACH)
-        """Of scenery alone: it is asked above all cars."""
+        """For scenery alone, as rays are followed above all cars."""
         self.top_m = float(self.height.max())
 
     def pixel(self, x_m: FloatOrArray, y_m: FloatOrArray) -> tuple[FloatOrArray, FloatOrArray]:

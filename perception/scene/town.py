@@ -3,7 +3,7 @@
 The world is ENU. Roads run along x = i·block_m and y = j·block_m; block (i, j) is the square between
 them and owns its buildings, trees and the kerb spots on its own sides of the four roads. Across a road,
 from its centre line: a lane to 3.2 m, kerb parking to 5.6 m, pavement to 8.1 m, then the lots.
-`Town.tile` rasterises any 102.4 m square of it; nothing is rasterised before it is asked for.
+`Town.tile` rasterises any 102.4 m square of it; nothing is rasterised before it is needed.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class Tile:
 
 
 class Town:
-    """Blocks and tiles of one scene, made when first asked for and kept (tiles: the latest 64)."""
+    """Blocks and tiles of one scene, made when first needed and kept (tiles: the latest 64)."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene

@@ -2,7 +2,7 @@
 
 Every lane of every road carries a stream of cars that all drive at the lane's own speed, so that none
 overtakes; the stream repeats every 1,280 m. Position along a lane is closed-form in t: nothing is
-stepped, and any moment may be asked for in any order. Cars drive straight over crossings without
+stepped, and moments may be computed in any order. Cars drive straight over crossings without
 giving way, so two crossing cars may touch there for a moment (about one crossing in fifty at 10 cars/km).
 """
 
@@ -40,6 +40,10 @@ class Cars:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def table(self) -> Floats:
+        """[n, 5]: x, y, length, width, yaw."""
+        return np.stack([self.x_m, self.y_m, self.length_m, self.width_m, self.yaw_rad], axis=1)
 
     def where(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Cars:
         """The cars that a mask [n] marks, or those at the given indices, in that order."""

@@ -1,1 +1,1 @@
-"""Why the flip exists: variants that were named before they were trained, all of them reported."""
+"""The study of why the flip exists: variants named before they were trained, all of them reported."""

@@ -1,4 +1,4 @@
-"""What the study asks of an evaluation: the fall below a single drone, the flip, the oracle's gain. Free of torch."""
+"""What the study measures: the fall below a single drone, the flip, the oracle's gain. Free of torch."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.matched import Evaluation
 from sortie.perception.evaluation.measures import POINTS, ApOf, Contrast, Oracle
+from sortie.perception.evaluation.results import TAU
 from sortie.perception.evaluation.scores import Bootstrap
 from sortie.perception.evaluation.verdict import MeasuredValue as Measurement
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import interval
 from sortie.perception.study.plan import MeasuredGrid, Tau, Variant
-
-MODEL_TAU = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +122,7 @@ def _between(a: Bootstrap, b: Bootstrap, condition: Sharing) -> Figures:
 def threshold(name: Tau, tau_f1: F1) -> float:
     """The score threshold that a name of the plan stands for."""
     if name == "model":
-        return MODEL_TAU
+        return TAU
     return tau_f1.tau if name == "f1" else float(name)
 
 

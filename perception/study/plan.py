@@ -1,4 +1,4 @@
-"""The study's plan: `variants.toml` read and held to its form. Free of torch."""
+"""The study's plan: reads and checks `variants.toml`. Free of torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Variant:
     """One way to train the network."""
 
     name: str
-    why: str
+    reason: str
     seeds: tuple[int, ...]
     begins_from: str = ""
     """Name of the variant whose weights of the same seed it goes on from; empty for none."""
@@ -102,7 +102,7 @@ def read_plan(path: Path = PLAN) -> StudyPlan:
     for tau in measured.taus:
         if tau not in ("model", "f1") and not (isinstance(tau, float) and 0 < tau < 1):
             raise ValueError(f"{path}: evaluation.taus has {tau!r}, must be model, f1 or above 0 and below 1")
-    list(measured.conditions())  # says itself what is wrong
+    list(measured.conditions())  # raises with its own message
     known: dict[str, Variant] = {}
     for v in variants:
         if v.name in known:

@@ -1,4 +1,4 @@
-"""The study told by rule: what each network shows of the flip, as Markdown, and the README's sentences. Pure text."""
+"""The study's report, written by rule from its rows: Markdown, and the README's sentences. Pure text."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sortie.perception.benchmark.dataset import SIZES
-from sortie.perception.study.measure import MODEL_TAU, StudyRow
+from sortie.perception.evaluation.results import TAU
+from sortie.perception.study.measure import StudyRow
 from sortie.perception.study.plan import StudyPlan
+from sortie.scenarios.report_text import NONE, interval, listed, picture, signed, table
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
-MINUS = "−"
 UNSENT: Mapping[str, str] = {"zero": "Zero fill, as in the paper", "masked": "Masked fusion"}
 
 
@@ -28,7 +29,7 @@ class FixedSettings:
 
 
 class StudyRows:
-    """Rows of the study, asked for one at a time."""
+    """Rows of the study, looked up one at a time."""
 
     def __init__(self, rows: Iterable[StudyRow]) -> None:
         self.rows = tuple(rows)
@@ -67,7 +68,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
     lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
     lines += ["## The answer", "", *answers(plan, found), f"- {on_frames(rows)}", ""]
     for name, caption in figures:
-        lines += [f"![{caption}]({name})", "", f"*{caption}.*", ""]
+        lines += picture(name, caption)
     first, seed = plan.variants[0], plan.variants[0].seeds[0]
     lines += ["## Every network", "", networks(plan, found)]
     lines += [f"## The score threshold ({first.job(seed)})", "", thresholds(plan, found)]
@@ -75,7 +76,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
         if table := _table(plan, found, "network", others):
             lines += [f"## {title}", "", *table, ""]
     lines += ["## The variants", ""]
-    lines += [f"- `{v.name}` (seeds {', '.join(map(str, v.seeds))}): {v.why}" for v in plan.variants]
+    lines += [f"- `{v.name}` (seeds {', '.join(map(str, v.seeds))}): {v.reason}" for v in plan.variants]
     if missing:
         lines += [
             "",
@@ -89,7 +90,7 @@ def networks(plan: StudyPlan, found: StudyRows) -> str:
     lines = [_LEGEND, ""]
     for unsent in plan.measured.unsent:
         views = {v.job(s): FixedSettings(v.name, s, unsent) for v in plan.variants for s in v.seeds}
-        lines += [f"**{UNSENT[unsent]}**, τ = {MODEL_TAU:g}, cells by confidence:", ""]
+        lines += [f"**{UNSENT[unsent]}**, τ = {TAU:g}, cells by confidence:", ""]
         lines += [*_table(plan, found, "network", views), ""]
     return "\n".join(lines)
 
@@ -120,11 +121,11 @@ def on_frames(rows: Sequence[StudyRow]) -> str:
     scenes, per_scene = SIZES["test"]
     of = scenes * per_scene
     measured = [f"all {of}" if n >= of else f"the first {n} of the {of}" for n in sorted({row.frames for row in rows})]
-    return f"Measured on {_and(measured)} frames of the test split."
+    return f"Measured on {listed(measured)} frames of the test split."
 
 
 def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
-    """What the rows say of the paper's observation and of each part of the hypothesis."""
+    """What the rows show about the paper's observation and about each part of the hypothesis."""
     m, networks = plan.measured, found.networks()
     first = plan.variants[0].name
     seeds = [s for v, s in networks if v == first]
@@ -150,8 +151,8 @@ def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
     fall = "none falls" if not fallen else f"{', '.join(dict.fromkeys(fallen))} fall"
     dropped = [v for v in plan.variants if v.recipe.get("cell_dropout")]
     lines = [
-        f"- {flip} at the model's own threshold among {len(networks)} networks under {_and(m.unsent)} filling, and {fall} "
-        f"below a single drone at ρ = {m.starved:g}: with {first} (seeds {_and(seeds)}) two peers minus four at ρ = {little:g} "
+        f"- {flip} at the model's own threshold among {len(networks)} networks under {listed(m.unsent)} filling, and {fall} "
+        f"below a single drone at ρ = {m.starved:g}: with {first} (seeds {listed(seeds)}) two peers minus four at ρ = {little:g} "
         f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
         f"- Zero fill costs {_several(fill)} against masked fusion at ρ = {m.starved:g}, significantly in "
         + " and ".join(
@@ -184,7 +185,7 @@ def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
     if gains:
         top = max(gains, key=lambda r: r.value)
         lines.append(
-            f"- Choosing the best of {_and(m.policies)} at each budget gains at most {_signed(top.value)} AP points over "
+            f"- Choosing the best of {listed(m.policies)} at each budget gains at most {signed(top.value)} AP points over "
             f"the best single one ({top.variant}-{top.seed}, {top.unsent})."
         )
     return lines
@@ -218,12 +219,8 @@ def _table(plan: StudyPlan, found: StudyRows, head: str, views: Mapping[str, Fix
     shown = {name: view for name, view in views.items() if found.get(view, "gain") is not None}
     if not shown:
         return []
-    lines = [
-        f"| {head} | alone | all | starved, ρ = {m.starved:g} | fill |"
-        + "".join(f" two − four, ρ = {rho:g} |" for rho in m.budgets)
-        + " oracle |",
-        "|---|" + "---|" * (5 + len(m.budgets)),
-    ]
+    contrasts = [f"two − four, ρ = {rho:g}" for rho in m.budgets]
+    lines = []
     for name, view in shown.items():
         alone, full = found.get(view, "level", 0.0), found.get(view, "level", 1.0)
         cells = [_plain(alone), _plain(full), _difference(found.get(view, "starved", m.starved))]
@@ -232,8 +229,8 @@ def _table(plan: StudyPlan, found: StudyRows, head: str, views: Mapping[str, Fix
             row = found.get(view, "contrast", rho)
             cells.append(f"{'·▲▼'[sign(row)]} {_difference(row)}")
         cells.append(_difference(found.get(view, "oracle")))
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return lines
+        lines.append((name, *cells))
+    return table((head, "alone", "all", f"starved, ρ = {m.starved:g}", "fill", *contrasts, "oracle"), lines)
 
 
 def _tau(found: StudyRows, variant: str, seed: int, name: str) -> str:
@@ -246,30 +243,16 @@ def _tau(found: StudyRows, variant: str, seed: int, name: str) -> str:
 
 
 def _plain(row: StudyRow | None) -> str:
-    return "–" if row is None else f"{row.value:.1f}"
+    return NONE if row is None else f"{row.value:.1f}"
 
 
 def _difference(row: StudyRow | None) -> str:
-    if row is None:
-        return "–"
-    if math.isnan(row.low):
-        return _signed(row.value)
-    return f"{_signed(row.value)} [{_signed(row.low)}, {_signed(row.high)}]"
+    return NONE if row is None else interval(row.value, row.low, row.high, signed)
 
 
 def _several(rows: Sequence[StudyRow | None]) -> str:
     there = [r for r in rows if r is not None]
-    return _and([_difference(r) for r in there]) if there else "not measured"
-
-
-def _signed(value: float) -> str:
-    text = f"{value:+.1f}"
-    return "0.0" if float(text) == 0 else text.replace("-", MINUS)
-
-
-def _and(items: Sequence[object]) -> str:
-    words = [str(i) for i in items]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return listed([_difference(r) for r in there]) if there else "not measured"
 
 
 def _quoted(text: str) -> list[str]:

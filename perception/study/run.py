@@ -61,7 +61,7 @@ def train_job(
     warm_start = weights_of(begins, *folders) if begins else None
     if begins and warm_start is None:
         raise ValueError(f"{job} begins from {begins}, which has no weights in {folder}")
-    log.info("training %s: %s", job, variant.why)
+    log.info("training %s: %s", job, variant.reason)
     return train(
         folder / f"{job}.safetensors",
         variant.recipe_for(seed),

@@ -1,4 +1,4 @@
-"""From the torch detector's runs to a calibration and its card; a calibration that was cut off goes on where it was."""
+"""Make a calibration and its card from runs of the torch detector; an interrupted calibration resumes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.geometry import FULL
+from sortie.perception.files import replacing
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
-from sortie.perception.network.detector import SHIPPED_WEIGHTS, ground_truth
+from sortie.perception.network.detector import SHIPPED_WEIGHTS
 from sortie.perception.surrogate.collect import FLOOR, DetectorRuns, collect, read
-from sortie.perception.surrogate.correlation import hang_together, seen_by_several
+from sortie.perception.surrogate.correlation import fit_correlation, fit_shared_false_positives
 from sortie.perception.surrogate.fit import fit
 from sortie.perception.surrogate.judge import WITHIN, CalibrationVerdict, judge
 from sortie.perception.surrogate.levels import level
@@ -44,7 +45,7 @@ def calibrate(
 
     Args:
         out: the calibration (safetensors); its card lies beside it (Markdown).
-        work: keeps the detector's answers, by weights; scenes that are there are not run again.
+        work: keeps the detector's runs, by weights; scenes that are there are not run again.
         weights: the detector's; None takes the shipped ones.
 
     Raises:
@@ -54,21 +55,21 @@ def calibrate(
         raise ValueError(f"out is {out}, must not end in .md, as its card does")
     if scenes < 2 or held_out < 2:
         raise ValueError(f"{scenes} scenes and {held_out} held out, must be at least 2 each")
-    tell = progress or (lambda stage, done, of: None)
+    report = progress or (lambda stage, done, of: None)
     path = SHIPPED_WEIGHTS if weights is None else weights
     config = read_config(path)
     key = hashlib.blake2b(path.read_bytes(), digest_size=5).hexdigest()
-    fitted = _asked("fit", scenes, work, seed, weights, key, tell)
-    judged = _asked("held-out", held_out, work, seed, weights, key, tell)
+    fitted = _detector_runs("fit", scenes, work, seed, weights, key, report)
+    judged = _detector_runs("held-out", held_out, work, seed, weights, key, report)
     floor = _floor(fitted, seed)
-    tell("rows", 0, len(fitted))
+    report("rows", 0, len(fitted))
     rows = []
-    for k, asked in enumerate(fitted):
-        rows.append(rows_of(asked, floor, seed))
-        tell("rows", k + 1, len(fitted))
+    for k, recorded in enumerate(fitted):
+        rows.append(rows_of(recorded, floor, seed))
+        report("rows", k + 1, len(fitted))
     parts = iter(range(1, 6))  # those of `fit`
     parameters = fit(
-        FitRows.join(rows), _boxes(fitted, seed), floor, seed, progress=lambda _: tell("fit", next(parts), 5)
+        FitRows.join(rows), _boxes(fitted, seed), floor, seed, progress=lambda _: report("fit", next(parts), 5)
     )
     facts: dict[str, Any] = {
         "fusion": config.fusion,
@@ -77,12 +78,14 @@ def calibrate(
         "scenes": scenes,
         "held_out": held_out,
     }
-    parameters = replace(parameters, mirages=seen_by_several(fitted, floor, seed), card={**facts, "id": ""})
-    parameters = hang_together(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("together", done, of))
-    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: tell("levels", done, of))
+    parameters = replace(
+        parameters, shared_false_positives=fit_shared_false_positives(fitted, floor, seed), card={**facts, "id": ""}
+    )
+    parameters = fit_correlation(parameters, fitted, seed, THRESHOLD, lambda done, of: report("together", done, of))
+    parameters = level(parameters, fitted, seed, THRESHOLD, lambda done, of: report("levels", done, of))
     arrays = [
         parameters.alike,
-        parameters.mirages,
+        parameters.shared_false_positives,
         parameters.residuals,
         *(w for n in parameters.nets.values() for w in n.weight),
     ]
@@ -92,49 +95,46 @@ def calibrate(
     verdict = judge(parameters, judged, seed)
     parameters = replace(parameters, card={**facts, **verdict.facts()})
     save(out, parameters)
-    part = out.with_suffix(".md.part")
-    part.write_text(card(parameters, verdict))
-    part.replace(out.with_suffix(".md"))
+    with replacing(out.with_suffix(".md")) as part:
+        part.write_text(card(parameters, verdict))
     return parameters, verdict
 
 
-def _asked(
-    split: Split, count: int, work: Path, seed: int, weights: Path | None, key: str, tell: Progress
+def _detector_runs(
+    split: Split, count: int, work: Path, seed: int, weights: Path | None, key: str, report: Progress
 ) -> list[DetectorRuns]:
     out = []
     for k in range(count):
-        tell(f"the detector, {split} scenes", k, count)
+        report(f"the detector, {split} scenes", k, count)
         out += [read(collect(work, seed, split, k, m, weights, key), split) for m in range(len(MANNERS))]
-    tell(f"the detector, {split} scenes", count, count)
+    report(f"the detector, {split} scenes", count, count)
     return out
 
 
-def _floor(asked: Sequence[DetectorRuns], seed: int) -> float:
+def _floor(recorded: Sequence[DetectorRuns], seed: int) -> float:
     """The highest score below which boxes hardly count, alone and with plenty shared."""
     for floor in FLOORS:
-        if all(full - left <= LOST for full, left in (_ap(asked, seed, shared, floor) for shared in (False, True))):
+        if all(full - left <= LOST for full, left in (_ap(recorded, seed, shared, floor) for shared in (False, True))):
             return floor
     return FLOORS[-1]
 
 
-def _ap(asked: Sequence[DetectorRuns], seed: int, shared: bool, floor: float) -> tuple[float, float]:
+def _ap(recorded: Sequence[DetectorRuns], seed: int, shared: bool, floor: float) -> tuple[float, float]:
     """AP of the detector's boxes, and of those above `floor`."""
     matched = []
-    for a in asked:
+    for a in recorded:
         scene = scene_model(seed, a.split, a.scene)
         for job, boxes in zip(a.jobs, a.boxes, strict=True):
             if bool(job.shares) == shared:
-                truth = ground_truth(
-                    scene, job.ego.t_s, job.ego.position_m[:2], FULL.half_extent_m, job.ego.true_yaw_rad
-                )
+                truth = ground_truth(scene.cars_at(job.ego.t_s).table(), job.ego.true_pose).single()
                 matched.append(match(boxes.take(boxes.score >= THRESHOLD), truth))
     return average_precision(matched), average_precision([m.at(floor) for m in matched])
 
 
-def _boxes(asked: Sequence[DetectorRuns], seed: int) -> NDArray[np.float64]:
-    """[3, s]: score thresholds; of a drone alone, the part of the cars that have a box above each, and boxes of nothing."""
+def _boxes(recorded: Sequence[DetectorRuns], seed: int) -> NDArray[np.float64]:
+    """[3, s]: score thresholds; of a drone alone, the share of the cars with a box above each, and the number of false positives."""
     rows = FitRows.join(
-        [rows_of(replace(a, jobs=jobs, boxes=boxes), FLOOR, seed) for a in asked for jobs, boxes in [_alone(a)]]
+        [rows_of(replace(a, jobs=jobs, boxes=boxes), FLOOR, seed) for a in recorded for jobs, boxes in [_alone(a)]]
     )
     thresholds = np.array([FLOOR, 0.05, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
     found = [(rows.score >= t).mean() for t in thresholds]
@@ -142,8 +142,8 @@ def _boxes(asked: Sequence[DetectorRuns], seed: int) -> NDArray[np.float64]:
     return np.array([thresholds, found, alarms])
 
 
-def _alone(asked: DetectorRuns) -> tuple[list[Any], list[Any]]:
-    pairs = [(j, b) for j, b in zip(asked.jobs, asked.boxes, strict=True) if not j.shares]
+def _alone(recorded: DetectorRuns) -> tuple[list[Any], list[Any]]:
+    pairs = [(j, b) for j, b in zip(recorded.jobs, recorded.boxes, strict=True) if not j.shares]
     return [j for j, _ in pairs], [b for _, b in pairs]
 
 

@@ -1,9 +1,8 @@
-"""The torch detector's own runs: what it found for every job of a moment, one npz file each, kept where it exists."""
+"""The torch detector's runs for a calibration: its boxes for every job of a moment, one npz file each, kept for reuse."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.files import replacing
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.plan import (
     THRESHOLD,
-    Question,
+    DetectorJob,
     Split,
     draw_scene,
     draw_target,
@@ -29,17 +29,17 @@ from sortie.perception.types import Boxes, Capture
 from sortie.scenarios.schema import Perception
 
 FLOOR = 0.02
-"""Boxes are kept down to this score: what the surrogate knows of weaker ones is that they are."""
+"""The lowest score of a box that is kept."""
 
 
 class Probe(TorchDetector):
-    """The detector, asked job by job under that job's rules, and for the ranks of its cells."""
+    """The torch detector, run job by job under that job's settings; it also gives the ranks of its cells."""
 
     def __init__(self, scene: SceneModel, seed: int, weights: Path | None) -> None:
         super().__init__(scene, Perception(score_threshold=FLOOR), seed, weights)
 
-    def ask(self, job: Question) -> Boxes:
-        """Its boxes, best first. Where boxes are averaged, weak ones would move those that count: they stay away."""
+    def detect_job(self, job: DetectorJob) -> Boxes:
+        """Its boxes, best first; without weak ones where boxes are averaged, as they would move those that count."""
         least = FLOOR if job.join == "nms" else THRESHOLD
         if least != self._config.score_threshold:
             for known in self._kept.values():
@@ -66,53 +66,51 @@ class DetectorRuns:
     split: Split
     scene: int
     """Its index in the split."""
-    jobs: list[Question]
+    jobs: list[DetectorJob]
     boxes: list[Boxes]
     ranks: dict[Capture, NDArray[np.float32]]
 
 
-def captures_of(jobs: Sequence[Question]) -> list[Capture]:
+def captures_of(jobs: Sequence[DetectorJob]) -> list[Capture]:
     """Every capture in the jobs, once, in order."""
     return list(dict.fromkeys(c for job in jobs for c in (job.ego, *(s.capture for s in job.shares))))
 
 
 def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weights: Path | None, key: str) -> Path:
-    """Ask about moment `index` of a scene and keep the answers, unless they are there already.
+    """Run the detector for moment `index` of a scene and keep the results, unless they are there already.
 
     Args:
-        key: names the weights; answers of other weights, and to other questions, have other files.
+        key: names the weights; other weights and other jobs have other files.
     """
     jobs = moment(seed, split, scene, index)
-    asked = repr((jobs, draw_scene(seed, split, scene), draw_target(seed, split, scene)))
-    digest = hashlib.blake2b(asked.encode(), digest_size=4).hexdigest()
+    setup = repr((jobs, draw_scene(seed, split, scene), draw_target(seed, split, scene)))
+    digest = hashlib.blake2b(setup.encode(), digest_size=4).hexdigest()
     path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{index}-{digest}.npz"
     if path.exists():
         return path
     probe = Probe(scene_model(seed, split, scene), scene_seed(seed, split, scene), weights)
-    boxes = [probe.ask(job) for job in jobs]
-    folder.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")
+    boxes = [probe.detect_job(job) for job in jobs]
     joined = Boxes.join(boxes)
-    np.savez(
-        part,
-        of=np.array([seed, scene, index]),
-        count=np.array([len(b) for b in boxes]),
-        boxes=np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
-        ranks=np.stack([probe.ranks(c) for c in captures_of(jobs)]),
-    )
-    part.replace(path)
+    arrays = {
+        "of": np.array([seed, scene, index]),
+        "count": np.array([len(b) for b in boxes]),
+        "boxes": np.concatenate([joined.table().astype(np.float32), joined.score[:, None]], axis=1),
+        "ranks": np.stack([probe.ranks(c) for c in captures_of(jobs)]),
+    }
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
     return path
 
 
 def read(path: Path, split: Split) -> DetectorRuns:
-    """The answers in a file, with the jobs drawn again."""
+    """The runs in a file, with the jobs drawn again."""
     with np.load(path, allow_pickle=False) as file:
         seed, scene, index = (int(v) for v in file["of"])
         count, table, ranks = file["count"], file["boxes"], file["ranks"]
     jobs = moment(seed, split, scene, index)
     captures = captures_of(jobs)
     if len(jobs) != len(count) or len(captures) != len(ranks):
-        raise ValueError(f"{path}: holds {len(count)} answers, the plan has {len(jobs)} jobs; remove it")
+        raise ValueError(f"{path}: holds {len(count)} results, the plan has {len(jobs)} jobs; remove it")
     parts = np.split(table, np.cumsum(count)[:-1])
     boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
     return DetectorRuns(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))

@@ -1,4 +1,4 @@
-"""The surrogate as a sortie uses it: the torch detector's interface, nothing rendered, many moments at once. Free of torch."""
+"""The surrogate as a sortie's detector: nothing is rendered, and many moments are computed at once. Free of torch."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from scipy.special import ndtri
 from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import FULL
-from sortie.perception.joining import Heard, joined_many, told
+from sortie.perception.joining import EgoSources, joined_many, source_of
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
-from sortie.perception.surrogate.draws import Drawn, Luck
+from sortie.perception.surrogate.draws import Drawn, DrawSource
 from sortie.perception.surrogate.exchange import FeatureShares, alarm_covariates, covariates, mean_shift, pair
 from sortie.perception.surrogate.features import CaptureColumns, Eyes, Ints, Looks, axes, off_axes, square, turned
 from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
-from sortie.perception.surrogate.shared_false_positives import Mirages
+from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 Job = tuple[Capture, Sequence[Share]]
-LATE = ("detections", "tracks")
 BATCH = 400
 """Jobs worked out together; memory grows with it."""
 
@@ -49,8 +49,8 @@ class SurrogateDetector:
     Args:
         scene: what there is to see.
         config: the scenario's `perception` section.
-        seed, replication: key its draws. A car's luck at a drone and a moment does not depend on what was sent, so
-            that policies flown on one seed meet the same luck.
+        seed, replication: key its draws. The draws for a drone, a moment and a car do not depend on what was sent, so
+            policies flown on one seed get the same draws.
         weights: a calibration's file; None takes the shipped one.
 
     Raises:
@@ -93,15 +93,15 @@ class SurrogateDetector:
         self.parameters, self.calibration = parameters, parameters.id
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)
-        self._luck = Luck(seed, replication, town, self._eyes.traffic.count, parameters.alike)
-        self._mirages = Mirages(town)
-        threshold, found, alarms = parameters.boxes
+        self._draw_source = DrawSource(seed, replication, town, self._eyes.traffic.count, parameters.alike)
+        self._shared = SharedFalsePositives(town)
+        threshold, found, false_positives = parameters.boxes
         at = max(config.score_threshold, float(threshold[0]))
-        self._found, self._alarms_alone = (float(np.interp(at, threshold, y)) for y in (found, alarms))
-        """Of a drone alone: the part of the cars that it finds, and how many boxes of nothing."""
+        self._found_alone, self._alarms_alone = (float(np.interp(at, threshold, y)) for y in (found, false_positives))
+        """Of a drone alone: the share of the cars that it finds, and its number of false positives."""
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
-        """Each ego's boxes from its own look and what it was sent, ENU, best first."""
+        """Each ego's boxes from its own look and the shares it received, ENU, best first."""
         return list(self.detect_many([jobs]))
 
     def detect_many(self, moments: Sequence[Sequence[Job]]) -> BoxColumns:
@@ -124,12 +124,13 @@ class SurrogateDetector:
         return _joined(parts)
 
     def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> BoxColumns:
+        """As `ground_truth`, but in float32: at the square's edge, within a hundredth of a millimetre, the two may differ."""
         looks = self._eyes.look(replace(CaptureColumns.of(egos), t_s=np.asarray(t_s, float)), bare=True)
-        columns = (looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
-        return BoxColumns(looks.first, Boxes(*(c.astype(np.float32) for c in columns)))
+        boxes = Boxes(looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
+        return BoxColumns(looks.first, boxes.single())
 
-    def count_boxes(self, capture: Capture, roi: tuple[float, float, float] | None) -> int:
-        """How many detections the drone would send, as many as the detector has there on average."""
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        """The number of detections that the drone would send: the torch detector's average there."""
         half = FULL.half_extent_m
         x, y, radius = (*capture.position_m[:2], 2 * half / np.sqrt(np.pi)) if roi is None else roi
         if roi is not None and np.hypot(x - capture.position_m[0], y - capture.position_m[1]) + radius > half:
@@ -140,7 +141,7 @@ class SurrogateDetector:
         else:
             cars = self._scene.cars_near(capture.t_s, x, y, radius)
             part = np.pi * radius**2 / (2 * half) ** 2
-        return round(cars * self._found + part * self._alarms_alone)
+        return round(cars * self._found_alone + part * self._alarms_alone)
 
     def camera_views(self, capture: Capture) -> NDArray[np.uint8]:
         """There are none.
@@ -153,58 +154,63 @@ class SurrogateDetector:
     # --- one batch ---------------------------------------------------------------------------------
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
-        asked = [(ego, shares) for ego, shares, _ in jobs]
-        late = {s.capture: None for _, shares in asked for s in shares if s.representation in LATE and s.weight > 0.0}
-        captures = list(dict.fromkeys(c for ego, shares in asked for c in (ego, *(s.capture for s in shares))))
+        queries = [(ego, shares) for ego, shares, _ in jobs]
+        late = {s.capture: None for _, shares in queries for s in shares if not s.is_map and s.weight > 0.0}
+        captures = list(dict.fromkeys(c for ego, shares in queries for c in (ego, *(s.capture for s in shares))))
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
         looks = self._eyes.look(fleet)
-        luck = self._luck.of(captures, looks)
+        draws = self._draw_source.of(captures, looks)
         p = self.parameters
-        confidence = p.confidence(looks.covariates, luck.look)
-        asked += [(c, ()) for c in late]
+        confidence = p.confidence(looks.covariates, draws.look)
+        queries += [(c, ()) for c in late]
         lies = None
         if not self._config.motion_compensation:
             lies = [[now.get(s.capture.drone, s.capture).est_pose for s in shares] for _, shares, now in jobs]
             lies += [[] for _ in late]
-        exchange = FeatureShares.of(asked, column, lies)
-        found = self._fuse(exchange, looks, fleet, confidence, luck)
+        exchange = FeatureShares.of(queries, column, lies)
+        fused = self._fuse(exchange, looks, fleet, confidence, draws)
         if not late:
-            return found
-        boxes = list(found)
+            return fused
+        boxes = list(fused)
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
-        fused = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
-        heard = []
-        for own, (ego, shares, _), f in zip(boxes, jobs, fused, strict=False):
-            others = [told(s, alone[s.capture]) for s in shares if s.representation in LATE and s.weight > 0.0]
-            heard.append(Heard(ego.est_pose, own, f, others))
-        out = joined_many(heard, self._config.join)
+        with_maps = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
+        sources = []
+        for own, (ego, shares, _), f in zip(boxes, jobs, with_maps, strict=False):
+            others = [source_of(s, alone[s.capture]) for s in shares if not s.is_map and s.weight > 0.0]
+            sources.append(EgoSources(ego.est_pose, own, f, others))
+        out = joined_many(sources, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(
-        self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, confidence: NDArray[np.float32], luck: Drawn
+        self,
+        exchange: FeatureShares,
+        looks: Looks,
+        fleet: CaptureColumns,
+        confidence: NDArray[np.float32],
+        draws: Drawn,
     ) -> BoxColumns:
         p, config = self.parameters, self._config
         pairs = pair(exchange, looks, fleet)
         zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
         cars = np.diff(looks.first)[looks.capture]
-        rank = p.rank(rank_covariates(looks.covariates, confidence, cars), luck.rank, config.cells_by)[pairs.peer]
+        rank = p.rank(rank_covariates(looks.covariates, confidence, cars), draws.rank, config.cells_by)[pairs.peer]
         everything = exchange.cells >= exchange.allowed
         sent = pairs.aimed & (
             (rank < (exchange.cells / np.maximum(exchange.allowed, 1.0))[pairs.row]) | everything[pairs.row]
         )
         exchange.drop_missing(sent, rank, pairs.row)
         x = covariates(pairs, exchange, looks, confidence, sent, rank, zeros[pairs.row])
-        score = p.find(x, luck.find[pairs.look])
+        score = p.find(x, draws.find[pairs.look])
         here = np.flatnonzero(score >= max(p.floor, config.score_threshold))
         look, row, x, score = pairs.look[here], pairs.row[here], x[here], score[here]
         at, own = looks.xy_m[look], exchange.ego[row]
         heading = looks.yaw_rad[look] - fleet.yaw_rad[own]
         angle, hand = axes(heading, at)
-        thrown = luck.thrown[look].copy()
+        offset_draw = draws.offset_draw[look].copy()
         along = np.where(angle == heading, 1.0, -1.0)  # what lies to one side of a car does so for all who look
-        thrown[:, 1:] *= np.stack([along, along * hand, hand], axis=1)
-        off, follow = p.place(np.concatenate([x, score[:, None]], axis=1), luck.residual[look], thrown)
+        offset_draw[:, 1:] *= np.stack([along, along * hand, hand], axis=1)
+        off, follow = p.place(np.concatenate([x, score[:, None]], axis=1), draws.residual[look], offset_draw)
         at = (
             at
             + off_axes(off[:, :2].astype(np.float64), angle, hand)
@@ -212,7 +218,7 @@ class SurrogateDetector:
         )
         size = self._eyes.traffic.size_m[looks.car[look]] * np.exp(off[:, 3:5])
         yaw = heading + hand * off[:, 2]
-        also = self._alarms(exchange, looks, fleet, zeros, luck)
+        also = self._alarms(exchange, looks, fleet, zeros, draws)
         row, score = np.concatenate([row, also.job]), np.concatenate([score, also.drawn[:, 5]])
         at, size = np.concatenate([at, also.drawn[:, :2]]), np.concatenate([size, also.drawn[:, 2:4]])
         yaw = np.concatenate([yaw, also.drawn[:, 4]])
@@ -221,32 +227,35 @@ class SurrogateDetector:
         x_m, y_m, turn = fleet.est[exchange.ego[row]].T
         xy = turned(at, turn) + np.stack([x_m, y_m], axis=1)
         first = np.searchsorted(row, np.arange(len(exchange.ego) + 1))
-        return BoxColumns(first, Boxes(*(v.astype(np.float32) for v in (xy, size, yaw + turn, score))))
+        return BoxColumns(first, Boxes(xy, size, yaw + turn, score).single())
 
     def _alarms(
-        self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], luck: Drawn
+        self, exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], draws: Drawn
     ) -> _Alarms:
-        """False alarms: a drone's own, and those of things that others may see as well. One that comes at a rate also comes at
-        a higher one."""
+        """False positives: a drone's own, and those that others may share. One drawn at a rate is also drawn at a higher one."""
         p, ego = self.parameters, exchange.ego
         rate = p.alarm_rates(alarm_covariates(exchange, looks, fleet, zeros, self._scene.config))
-        job, band, k = np.nonzero(luck.alarm_at[ego, : rate.shape[1]] < ((1.0 - p.mirages[0]) * rate)[:, :, None])
-        own = _Alarms(job, self._pooled(fleet.yaw_rad[ego[job]], band, luck.alarm_which[ego[job], band, k]))
-        seen = self._seen(rate, ego, fleet, luck)
+        job, band, k = np.nonzero(
+            draws.alarm_at[ego, : rate.shape[1]] < ((1.0 - p.shared_false_positives[0]) * rate)[:, :, None]
+        )
+        own = _Alarms(job, self._pooled(fleet.yaw_rad[ego[job]], band, draws.alarm_which[ego[job], band, k]))
+        seen = self._seen(rate, ego, fleet, draws)
         job, drawn = np.concatenate([own.job, seen.job]), np.concatenate([own.drawn, seen.drawn])
         loud = drawn[:, 5] >= self._config.score_threshold
         return _Alarms(job[loud], drawn[loud])
 
-    def _seen(self, rate: NDArray[np.float32], ego: Ints, fleet: CaptureColumns, luck: Drawn) -> _Alarms:
-        """Alarms of things in the town, at `rate` [m, bands] of all alarms. They are there for everybody; whether a drone takes
-        one for a car, how surely and where exactly, is its own affair."""
-        part, chance, spread_m, spread_rad = self.parameters.mirages.astype(np.float64)
+    def _seen(self, rate: NDArray[np.float32], ego: Ints, fleet: CaptureColumns, draws: Drawn) -> _Alarms:
+        """Shared false positives, at `rate` [m, bands] of all.
+
+        Their things stand in the town for every drone. Each drone draws for itself whether it has one, its score and its place.
+        """
+        part, chance, spread_m, spread_rad = self.parameters.shared_false_positives.astype(np.float64)
         expected = rate.sum(axis=1, dtype=np.float64) * part / chance
-        things = self._mirages.about(fleet, float(expected.max(initial=0.0)))
-        luck_of = mixed(luck.moment[:, None] ^ things.word)
-        seen = things.there & (uniform(luck_of, 0) < chance)
+        things = self._shared.about(fleet, float(expected.max(initial=0.0)))
+        thing_draws = mixed(draws.moment[:, None] ^ things.key)
+        seen = things.there & (uniform(thing_draws, 0) < chance)
         job, thing = np.nonzero(seen[ego] & (things.rarity < expected[:, None]))
-        capture, own = ego[job], luck_of[ego[job], thing]
+        capture, own = ego[job], thing_draws[ego[job], thing]
         over = np.cumsum(rate[job], axis=1) > (uniform(own, 1) * rate[job].sum(axis=1))[:, None]
         band = np.where(over.any(axis=1), over.argmax(axis=1), rate.shape[1] - 1)
         drawn = self._pooled(fleet.yaw_rad[capture], band, uniform(own, 2))
@@ -256,11 +265,13 @@ class SurrogateDetector:
         drawn[:, 4] = things.yaw_rad[thing] - fleet.yaw_rad[capture] + spread_rad * off[:, 2]
         return _Alarms(job, drawn)
 
-    def _pooled(self, yaw_rad: Floats, band: NDArray[np.intp], luck: NDArray[np.floating]) -> Floats:
-        """Alarms [a, 6] that the detector had, of the given bands, by drones that flew along a street or askew, as these do;
-        `luck` [a] uniform."""
+    def _pooled(self, yaw_rad: Floats, band: NDArray[np.intp], draws: NDArray[np.floating]) -> Floats:
+        """False positives [a, 6] that the torch detector had in the given bands, by drones turned to the streets as these are.
+
+        `draws` [a] uniform.
+        """
         pool = self.parameters.alarm_pool
-        which = np.minimum((luck * pool.shape[2]).astype(np.intp), pool.shape[2] - 1)
+        which = np.minimum((draws * pool.shape[2]).astype(np.intp), pool.shape[2] - 1)
         out: Floats = pool[(square(yaw_rad) > SQUARE).astype(np.intp), band, which].astype(np.float64)
         return out
 

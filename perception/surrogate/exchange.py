@@ -1,4 +1,4 @@
-"""What an exchange brings to each car of an ego: who sent the cell that holds it, how sure they were, how far off it lies. Free of torch."""
+"""What an exchange brings for each car of an ego: who sent its cell, with which confidence, and how misplaced. Free of torch."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
 from sortie.perception.types import Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Scene
 
-MAPS = ("features", "raw")
 _ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
@@ -87,7 +87,7 @@ class FeatureShares:
         for m, (_, shares) in enumerate(jobs):
             slot = 0
             for i, s in enumerate(shares):
-                if s.representation in MAPS and s.weight > 0.0:
+                if s.is_map and s.weight > 0.0:
                     x, y, yaw = s.capture.est_pose
                     rho, disc = (1.0, None) if s.representation == "raw" else (s.rho, s.roi)
                     pose = (x, y, yaw) if lies is None else lies[m][i]
@@ -122,7 +122,7 @@ def _allowed(roi: Floats, pose: Floats) -> Floats:
     off = np.hypot(roi[:, 0] - pose[:, 0], roi[:, 1] - pose[:, 1]) + radius
     for i in np.flatnonzero(np.isfinite(radius) & (off > FULL.half_extent_m)).tolist():
         x, y, yaw = pose[i].tolist()
-        out[i] = budget.cells_sent(1.0, tuple(roi[i].tolist()), x, y, yaw)
+        out[i] = budget.cells_sent(1.0, Disc(*roi[i].tolist()), x, y, yaw)
     return np.asarray(out)
 
 
@@ -250,8 +250,8 @@ def alarm_covariates(
     exchange: FeatureShares, looks: Looks, fleet: CaptureColumns, zeros: NDArray[np.bool_], scene: Scene
 ) -> NDArray[np.float32]:
     """What the number of false alarms depends on, [m, 18] float32 as `ALARM_COVARIATES`: cars in the square, the town and its
-    light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was asked
-    for, how many cars move, how old the maps are, and both multiplied: a moving car has a second box where an older map shows
+    light, how much of how many maps was sent, whether the drone flies square to the streets, what part of the maps was requested,
+     how many cars move, how old the maps are, and both multiplied: a moving car has a second box where an older map shows
     it."""
     m = len(exchange.ego)
     cars = np.diff(looks.first)[exchange.ego]

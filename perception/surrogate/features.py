@@ -1,4 +1,4 @@
-"""What bears on whether a car is found: who looks at it from where, over what, and what of that was sent. Free of torch.
+"""Covariates of detection: who looks at a car, from where, and what is in between. Free of torch.
 
 A *look* is one capture and one car in its ±102.4 m square. Everything here follows from geometry and the scene's
 description; nothing is rendered. Looks of many captures are worked out at once.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.perception.geometry import FULL
+from sortie.perception.geometry import FULL, HALF_H, HALF_V
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
@@ -20,9 +20,6 @@ from sortie.perception.surrogate.line_of_sight import HeightField, Kerbs, next_o
 from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]
-HALF_H = float(np.tan(np.radians(35.0)))
-HALF_V = HALF_H * 90 / 160
-"""The cameras' half angles, as in `render.py`, which needs torch."""
 LOOK_COVARIATES = (
     "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
     "crowd", "altitude", "strange", "square", "next", "next_along", "next_across",
@@ -169,7 +166,7 @@ class Eyes:
         parked = np.flatnonzero(((traffic.parked_xy > low) & (traffic.parked_xy < high)).all(axis=1))
         times, which = np.unique(fleet.t_s, return_inverse=True)
         xy, yaw, there = traffic.at(times, parked)
-        # differences in double precision: where a car lies must not hang on what else is asked
+        # differences in double precision: a car's place must not depend on what else is computed
         x, y = ((xy[which, :, k] - where[:, k, None]).astype(np.float32) for k in (0, 1))
         c, s = np.cos(fleet.yaw_rad).astype(np.float32)[:, None], np.sin(fleet.yaw_rad).astype(np.float32)[:, None]
         near = np.abs(c * x + s * y) < half

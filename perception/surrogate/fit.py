@@ -1,4 +1,4 @@
-"""Fitting: the detector's answers to the surrogate's parameters. Small networks, a few minutes."""
+"""Fit the surrogate's parameters to runs of the torch detector: small networks, a few minutes."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ STEPS = {"look": 5000, "rank": 5000, "rank_norm": 5000, "find": 10_000, "place":
 START = {"look": [0.0, 1.0, -1.0, 0.0, 0.0], "find": [0.0, 0.0, 1.0, -1.0, 0.0, 0.0]}
 """First outputs, so that a mixture's components part."""
 CAR_M = (4.5, 1.9)
-"""A car, about the towns' mean: to tell which boxes would count."""
+"""A car, about the towns' mean: decides which boxes would count."""
 RESIDUALS, POOL, REACH = 2048, 512, 10.0
 FEWEST = 20
 """Alarms of one band that are a pool of their own."""
 GROUPS, FACTORS = 4, (0.7, 1.4)
 """Of bands of residuals, each made longer or shorter by a factor within these bounds."""
-NO_MIRAGES = (0.0, 1.0, 0.0, 0.0)
+NONE_SHARED = (0.0, 1.0, 0.0, 0.0)
 BANDS = np.array([0.0, 0.35, 0.6, 0.77, 0.88, 0.95, 0.98, 0.995])
 """Quantiles of the alarms' scores between which they are counted."""
 
@@ -58,23 +58,23 @@ def fit(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Parameters:
-    """All parameters, without a card, and without what several drones have in common (`together`).
+    """All parameters, without a card, and without what several drones have in common (`correlation`).
 
     Args:
         rows: of the fitted scenes, made with the same `floor`.
         boxes: as `Parameters.boxes`.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     nets: dict[str, Net] = {}
-    tell("look")
+    report("look")
     nets["look"], out = _train("look", rows.look, {"c": rows.confidence}, _look_loss, seed)
     car, alone = rows.look_object[rows.fused_look], rows.job[rows.fused_job, ALARM_COVARIATES.index("sharing")] == 0
     alike = [_alike(rows, out, rows.fused_look[alone])]
-    tell("rank")
+    report("rank")
     covariates = rank_covariates(rows.look, rows.confidence, rows.look_cars)
     for name, above in (("rank", rows.above), ("rank_norm", rows.above_norm)):
         nets[name], _ = _train(name, covariates, {"y": np.log(above + 0.5 / 4096)}, _normal_loss, seed)
-    tell("find")
+    report("find")
     found = rows.score > 0
     q = np.where(found, logit(np.clip(rows.score, 1e-6, 1 - 1e-6)), 0.0)
     at = torch.tensor(float(logit(floor)))
@@ -82,7 +82,7 @@ def fit(
     nets["find"], out = _train("find", rows.fused, {"hit": found, "q": q}, loss, seed)
     chance = expit(out[:, 0]) * (1.0 - _below(np.full(len(out), float(at)), out[:, 1:]))
     alike.append(_in_common(found[alone], chance[alone], car[alone]))
-    tell("place")
+    report("place")
     covariates = np.concatenate([rows.fused, rows.score[:, None]], axis=1)[found]
     angle, hand = axes(rows.heading[found], rows.xy_m[found])
     off = np.concatenate([on_axes(rows.offset[found, :2], angle, hand), rows.offset[found, 2:]], axis=1)
@@ -104,13 +104,13 @@ def fit(
         pools.append(_as_good(pool, centre[of], spread[of], unsure[of], good, rows.score[found][of], rng))
     only = alone[found]
     alike.append(_in_common(fits[only] >= 0.5, _chance(fits[only] >= 0.5, unsure[only]), car[found][only]))
-    tell("alarms")
+    report("alarms")
     edges, counts, alarms = _alarms(rows, floor, rng)
-    ask = np.isfinite(rows.job).all(axis=1)
-    start = np.log(counts[ask].mean(axis=0) + 1e-3).tolist()
-    nets["alarms"], _ = _train("alarms", rows.job[ask], {"count": counts[ask]}, _count_loss, seed, start=start)
-    ends = np.stack([rows.job[ask].min(axis=0), rows.job[ask].max(axis=0)])
-    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, ends, alarms, NO_MIRAGES, boxes)
+    usable = np.isfinite(rows.job).all(axis=1)
+    start = np.log(counts[usable].mean(axis=0) + 1e-3).tolist()
+    nets["alarms"], _ = _train("alarms", rows.job[usable], {"count": counts[usable]}, _count_loss, seed, start=start)
+    ends = np.stack([rows.job[usable].min(axis=0), rows.job[usable].max(axis=0)])
+    singles = (np.array([*alike, 0.0]), np.stack(pools), edges, ends, alarms, NONE_SHARED, boxes)
     a, r, e, x, p, m, n = (np.asarray(v, np.float32) for v in singles)
     return Parameters(nets, a, r, e, x, p, m, n, card={})
 
@@ -131,13 +131,13 @@ def _as_good(
     many count, by score, as did. Networks that are fitted twice place by a percent better or worse; AP would follow."""
     band = np.maximum(np.searchsorted(pool[::BAND, 5], unsure, side="right") - 1, 0)
     group = band * GROUPS // (len(pool) // BAND)
-    luck = (rng.random(len(band)) * BAND).astype(np.intp)
+    draw = (rng.random(len(band)) * BAND).astype(np.intp)
     out = pool.copy()
     for g in range(GROUPS):
         mine = np.flatnonzero(group == g)
         if not len(mine):
             continue
-        drawn, weight = spread[mine] * pool[band[mine] * BAND + luck[mine], :5], score[mine] / score[mine].sum()
+        drawn, weight = spread[mine] * pool[band[mine] * BAND + draw[mine], :5], score[mine] / score[mine].sum()
         wanted = weight @ good[mine]
         low, high = FACTORS
         for _ in range(12):
@@ -252,7 +252,7 @@ def _place_loss(out: Tensor, y: dict[str, Tensor]) -> Tensor:
 
 
 def _alike(rows: FitRows, out: Array, looks: Array) -> float:
-    """What part of a look's luck is the car's own: correlation, over pairs of such `looks` at one car, of where in its
+    """The share of a look's random draw that is the car's own: correlation, over pairs of such `looks` at one car, of where in its
     predicted distribution each fell."""
     z = ndtri(np.clip(_below(rows.confidence[looks], out[looks]), 1e-4, 1 - 1e-4))
     a, b = _pairs(rows.look_object[looks])
@@ -260,7 +260,7 @@ def _alike(rows: FitRows, out: Array, looks: Array) -> float:
 
 
 def _in_common(happened: Array, chance: Array, car: Array) -> float:
-    """What part of the luck of events is the car's own: the covariance over pairs at one car, over what it would be if all
+    """The share of the random draw of events that is the car's own: the covariance over pairs at one car, over what it would be if all
     of it were, where the less likely of two happens only with the other."""
     a, b = _pairs(car)
     off = happened - chance

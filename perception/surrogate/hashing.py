@@ -1,4 +1,4 @@
-"""Numbers by hashing: a draw that hangs on whose it is and on nothing else, many at once. Free of torch.
+"""Random numbers by hashing keys, many at once: equal keys give equal draws. Free of torch.
 
 splitmix64 (Steele, Lea and Flood, *Fast Splittable Pseudorandom Number Generators*, 2014).
 """
@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Words = NDArray[np.uint64]
+Hashes = NDArray[np.uint64]
 GAMMA = 0x9E3779B97F4A7C15
 
 
-def mixed(x: Words) -> Words:
-    """Each word scrambled, one to one: splitmix64's finaliser."""
+def mixed(x: Hashes) -> Hashes:
+    """Each number scrambled, one to one: splitmix64's finaliser."""
     x = x + np.uint64(GAMMA)
     x ^= x >> np.uint64(30)
     x *= np.uint64(0xBF58476D1CE4E5B9)
@@ -23,8 +23,8 @@ def mixed(x: Words) -> Words:
     return x
 
 
-def uniform(x: Words, purpose: int) -> NDArray[np.float64]:
-    """Numbers in (0, 1), others for every purpose."""
+def uniform(x: Hashes, purpose: int) -> NDArray[np.float64]:
+    """Numbers in (0, 1); each purpose gives different ones."""
     return np.asarray(
         ((mixed(x + np.uint64((purpose + 1) * 0xD1B54A32D192ED03 % 2**64)) >> np.uint64(12)) + 0.5) * 2.0**-52,
         np.float64,

@@ -1,4 +1,4 @@
-"""How far the surrogate is from the torch detector on scenes that it was not fitted to."""
+"""The surrogate's error against the torch detector, on scenes that it was not fitted to."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from sortie.perception.metrics.bootstrap import compare, interval, rank, resampl
 from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.plan import THRESHOLD, Disc, Question, scene_model
+from sortie.perception.surrogate.plan import THRESHOLD, DetectorJob, scene_model
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
 WITHIN = 0.02
@@ -64,7 +65,7 @@ class OrderKept:
 
     @property
     def kept(self) -> bool:
-        """Whether the surrogate says the same, where the detector says something."""
+        """Whether the surrogate has the same sign, where the torch detector's contrast is significant."""
         return not self.significant or self.torch * self.surrogate > 0
 
 
@@ -82,31 +83,32 @@ class CalibrationVerdict:
 
 
 def judge(parameters: Parameters, held_out: Sequence[DetectorRuns], seed: int = 0) -> CalibrationVerdict:
-    """Both detectors' AP under every condition of the held-out scenes; the surrogate's with several draws of its luck,
-    other ones in every scene."""
+    """Both detectors' AP under every condition of the held-out scenes; the surrogate's over several replications."""
     theirs: dict[str, list[Matched]] = {}
     ours: dict[str, list[Matched]] = {}
     scenes: dict[str, list[int]] = {}
     drawn: dict[str, list[int]] = {}
-    for asked in held_out:
-        scene = scene_model(seed, asked.split, asked.scene)
+    for recorded in held_out:
+        scene = scene_model(seed, recorded.split, recorded.scene)
         truths = None
-        for rules in dict.fromkeys((j.unsent, j.cells_by, j.join) for j in asked.jobs):
+        for rules in dict.fromkeys((j.unsent, j.cells_by, j.join) for j in recorded.jobs):
             config = Perception(unsent_cells=rules[0], cells_by=rules[1], join=rules[2], score_threshold=THRESHOLD)
-            mine = [i for i, j in enumerate(asked.jobs) if (j.unsent, j.cells_by, j.join) == rules]
+            mine = [i for i, j in enumerate(recorded.jobs) if (j.unsent, j.cells_by, j.join) == rules]
             for repeat in range(REPEATS):
                 detector = SurrogateDetector.of(scene, config, parameters, repeat)
                 if truths is None:
-                    truths = list(detector.truth_many([j.ego.t_s for j in asked.jobs], [j.ego for j in asked.jobs]))
-                jobs = [[(asked.jobs[i].ego, asked.jobs[i].shares)] for i in mine]
+                    truths = list(
+                        detector.truth_many([j.ego.t_s for j in recorded.jobs], [j.ego for j in recorded.jobs])
+                    )
+                jobs = [[(recorded.jobs[i].ego, recorded.jobs[i].shares)] for i in mine]
                 for i, boxes in zip(mine, detector.detect_many(jobs), strict=True):
-                    for name, disc in _regions(asked.jobs[i]):
+                    for name, disc in _regions(recorded.jobs[i]):
                         ours.setdefault(name, []).append(match(boxes, truths[i], disc))
-                        drawn.setdefault(name, []).append(asked.scene)
+                        drawn.setdefault(name, []).append(recorded.scene)
                         if repeat == 0:
-                            found = asked.boxes[i].take(asked.boxes[i].score >= THRESHOLD)
+                            found = recorded.boxes[i].take(recorded.boxes[i].score >= THRESHOLD)
                             theirs.setdefault(name, []).append(match(found, truths[i], disc))
-                            scenes.setdefault(name, []).append(asked.scene)
+                            scenes.setdefault(name, []).append(recorded.scene)
     levels = [_level(name, theirs[name], ours[name], scenes[name], drawn[name]) for name in theirs]
     ap = {v.condition: v.surrogate for v in levels}
     orders = []
@@ -126,7 +128,7 @@ def _level(
     return LevelError(name, a, b, b - a, low, high, len(theirs))
 
 
-def _regions(job: Question) -> list[tuple[str, Disc | None]]:
+def _regions(job: DetectorJob) -> list[tuple[str, Disc | None]]:
     """Where the job's condition is judged, and under which name."""
     everywhere: list[tuple[str, Disc | None]] = [(job.condition, None)]
     return everywhere if job.disc is None else [*everywhere, (job.condition + IN_DISC, job.disc)]

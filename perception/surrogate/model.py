@@ -1,12 +1,12 @@
-"""The surrogate's parameters: small networks and tables, read from safetensors, asked in numpy. Free of torch.
+"""The surrogate's parameters: small networks and tables, read from safetensors, evaluated in numpy. Free of torch.
 
 Five parts, each fitted to what the torch detector did:
 
-- **look**: how sure a drone is of a car on its own, the logit of its heat map there. A mixture of two normals.
-- **rank**: what part of the drone's cells rank above the car's cell, given how sure it is: whether a budget sends it.
-- **find**: what fusion makes of it: a box or none, and its score.
-- **place**: how far that box is off, along the car, across it, in heading, length and width.
-- **alarms**: how many boxes there are of nothing, in bands of scores.
+- **look**: a drone's own confidence in a car, the logit of its heat map there. A mixture of two normals.
+- **rank**: the share of the drone's cells that rank above the car's cell. It decides whether a budget sends the cell.
+- **find**: whether fusion gives a box, and its score.
+- **place**: the localisation error of that box, along and across the car, in heading, length and width.
+- **alarms**: the number of false positives, in bands of scores.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
 from sortie.perception.errors import InputError
+from sortie.perception.files import replacing
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
@@ -51,24 +52,26 @@ SPREAD = (-3.5, 2.0)
 RATES = (-12.0, 8.0)
 """Bounds of log rates of false alarms."""
 BAND = 64
-"""Residuals that were predicted as vaguely: a box's is one of these, and the best luck draws the one that lay best."""
+"""Residuals in a band, predicted with about equal uncertainty; a box draws one of these, the highest draw the best."""
 SQUARE = 0.5
 """Squareness from which on a car, or a drone, counts as square."""
 KINDS = 8
 """Of boxes, each with residuals of its own (`kind_of`)."""
 FEW, WHOLE = 0.015, 0.99
-"""The part of the cells that were asked for, be it a region's, up to which they are a few, and from which on all."""
+"""Shares of the requested cells (of the map, or of a region): up to the first they are few, from the second on all."""
 _ROWS = 192
 """At a time: few enough for the cache, and for the matrix library to start no threads."""
 _STEP = 2.0**-20
 """Of activations and of weights alike."""
+_SHARED_TENSOR = "mirages"
+"""Name of `Parameters.shared_false_positives` in the file, as in the shipped calibration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Net:
     """A network of one or more layers with rectifiers between them; `weight` [in, out] and `bias` [out] of each.
 
-    Its sums are exact, so that a row comes out the same to the bit whatever else is asked, and in whichever order the
+    Its sums are exact, so a row is the same to the bit whatever else is computed, and in whichever order the
     matrix library of a machine adds: activations and weights are multiples of 2⁻²⁰, and a double holds any sum of their
     products whose magnitudes add up to less than 2¹³.
     """
@@ -105,26 +108,26 @@ class Net:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Everything that a calibration leaves behind.
-
-    `alike` [4]: the part of the cars whose luck is their own, whoever looks: of a look, of being found, of where the box lies;
-    and the part of those whose boxes lie off to the same side for all.
-    `residuals` [8, r, 6]: how boxes were off in units of the predicted deviations, together, in bands of `BAND`, worst
-    first in each, and how vague (`vague`) predictions are from which on a band stands for them; pools as `kind_of`. `alarm_edges` [b + 1]: scores
-    between which alarms are counted; `alarm_range` [2, covariates]: the least and the most that their network was fitted to; `alarm_pool` [2, b, p, 6] where and how large they
-    were (`ALARM_COLUMNS`, ego's frame), of drones turned anyhow and of square ones; `mirages` [4]: the part of the alarms that are of things which others may take for cars
-    as well, the chance that a drone does, and how far it puts them off, as deviations (m, rad); `boxes` [3, s]: thresholds, and for a drone alone the part of the cars that have a box
-    above each, and how many boxes of nothing there are.
-    """
+    """Everything that a calibration leaves behind."""
 
     nets: Mapping[str, Net]
     alike: Singles
+    """[4] shares of the cars that have one draw of their own, whoever looks and whenever: for the look, for being found, and for
+    where the box lies. The last is the share of the cars that all drones put off to the same side."""
     residuals: Singles
+    """[8, r, 6] localisation errors in units of the predicted deviations, in bands of `BAND` rows, worst first in each. The last
+    column is the uncertainty (`vague`) from which on a band is used. Pools are those of `kind_of`."""
     alarm_edges: Singles
+    """[b + 1] scores between which false positives are counted."""
     alarm_range: Singles
+    """[2, covariates] the least and the most that the network of false positives was fitted to."""
     alarm_pool: Singles
-    mirages: Singles
+    """[2, b, p, 6] false positives to draw from (`ALARM_COLUMNS`, ego's frame): of drones turned anyhow, and of square ones."""
+    shared_false_positives: Singles
+    """[4] the share of false positives that other drones may have as well, the chance that a drone has one, and the standard
+    deviations of where it puts them (m, rad)."""
     boxes: Singles
+    """[3, s] score thresholds; for a drone alone, the share of the cars with a box above each, and its number of false positives."""
     card: Mapping[str, Any]
 
     @property
@@ -139,36 +142,42 @@ class Parameters:
 
     # --- the five parts ---------------------------------------------------------------------------
 
-    def confidence(self, covariates: Singles, luck: Singles) -> Singles:
-        """How sure each drone is of each car on its own, a logit [n]; `luck` [n] uniform: the worst falls to the lower
-        of the two normals, and within each to its lower end."""
-        return _of_two(self.nets["look"](covariates), luck)
+    def confidence(self, covariates: Singles, draw: Singles) -> Singles:
+        """Each drone's own confidence in each car, a logit [n].
 
-    def rank(self, covariates: Singles, luck: Singles, by: str = "confidence") -> Singles:
-        """The fraction [n] of the drone's cells that rank above; `luck` [n] standard normal."""
+        `draw` [n] uniform: the lowest draws fall to the lower of the two normals, and within each to its lower end.
+        """
+        return _of_two(self.nets["look"](covariates), draw)
+
+    def rank(self, covariates: Singles, draw: Singles, by: str = "confidence") -> Singles:
+        """The fraction [n] of the drone's cells that rank above the car's cell; `draw` [n] standard normal."""
         out = self.nets["rank" if by == "confidence" else "rank_norm"](covariates)
-        return np.asarray(np.minimum(np.exp(out[:, 0] + _spread(out[:, 1]) * luck), 1.0), np.float32)
+        return np.asarray(np.minimum(np.exp(out[:, 0] + _spread(out[:, 1]) * draw), 1.0), np.float32)
 
-    def find(self, covariates: Singles, luck: Singles) -> Singles:
-        """Scores [n], 0 where there is no box; `luck` [n, 2] uniform: whether there is one, and how high its score."""
+    def find(self, covariates: Singles, draw: Singles) -> Singles:
+        """Scores [n], 0 where there is no box; `draw` [n, 2] uniform: whether there is one, and how high its score."""
         out = self.nets["find"](covariates)
-        score = expit(_of_two(out[:, 1:], luck[:, 1]))
-        return np.where((luck[:, 0] < expit(out[:, 0])) & (score >= self.floor), score, 0.0).astype(np.float32)
+        score = expit(_of_two(out[:, 1:], draw[:, 1]))
+        return np.where((draw[:, 0] < expit(out[:, 0])) & (score >= self.floor), score, 0.0).astype(np.float32)
 
-    def place(self, covariates: Singles, luck: Singles, thrown: Singles) -> tuple[Singles, Singles]:
-        """How boxes are off, [n, 5]: along the car and across it (m), heading (rad), log length, log width (see
-        `features.axes`); and what part [n] of
-        their peers' mean shift they follow. `luck` [n] uniform: which of the residuals that were as vague; `thrown` [n, 4]: as
-        `Drawn.thrown`, the sides as seen from here."""
+    def place(self, covariates: Singles, draw: Singles, offset_draw: Singles) -> tuple[Singles, Singles]:
+        """Localisation errors [n, 5], and the share [n] of the peers' mean shift that a box follows.
+
+        Errors are along the car and across it (m), heading (rad), log length and log width (`features.axes`).
+
+        Args:
+            draw: [n] uniform, picks one of the residuals that were predicted as uncertainly.
+            offset_draw: [n, 4] as `Drawn.offset_draw`, with sides as seen from here.
+        """
         out = self.nets["place"](covariates)
         which, unsure = kind_of(covariates), vague(out)
         drawn = np.empty((len(out), 5), np.float32)
         for k, pool in enumerate(self.residuals):
             kind = which == k
             band = np.maximum(np.searchsorted(pool[::BAND, 5], unsure[kind], side="right") - 1, 0)
-            drawn[kind] = pool[band * BAND + np.minimum((luck[kind] * BAND).astype(np.intp), BAND - 1), :5]
-        common = thrown[:, 0] < self.alike[3]
-        drawn[common, :3] = np.abs(drawn[common, :3]) * thrown[common, 1:]
+            drawn[kind] = pool[band * BAND + np.minimum((draw[kind] * BAND).astype(np.intp), BAND - 1), :5]
+        common = offset_draw[:, 0] < self.alike[3]
+        drawn[common, :3] = np.abs(drawn[common, :3]) * offset_draw[common, 1:]
         return np.asarray(out[:, :5] + _spread(out[:, 5:10]) * drawn, np.float32), expit(out[:, 10])
 
     def alarm_rates(self, covariates: Singles) -> Singles:
@@ -179,10 +188,10 @@ class Parameters:
         return np.asarray(np.exp(np.clip(self.nets["alarms"](x), *RATES)))
 
 
-def _of_two(out: Singles, luck: Singles) -> Singles:
+def _of_two(out: Singles, draw: Singles) -> Singles:
     """Draws [n] from mixtures of two normals, `out` [n, 5]: the upper one's logit, means and log deviations of the upper and of
-    the lower one. `luck` [n] uniform: the worst falls to the lower normal, and within each to its lower end."""
-    u, low = luck.astype(np.float64), expit(-out[:, 0].astype(np.float64))
+    the lower one. `draw` [n] uniform: the worst falls to the lower normal, and within each to its lower end."""
+    u, low = draw.astype(np.float64), expit(-out[:, 0].astype(np.float64))
     high = u >= low
     within = ndtri(np.clip(np.where(high, (u - low) / (1.0 - low), u / low), 1e-6, 1.0 - 1e-6))
     mean = np.where(high, out[:, 1], out[:, 2])
@@ -196,7 +205,7 @@ def _spread(log: Singles) -> Singles:
 
 def kind_of(fused: NDArray[Any]) -> NDArray[np.intp]:
     """Which of the pools of residuals is a box's [n]: 0 and 1 alone, 2 and 3 with a few cells of others' maps, 4 and 5 with more, 6
-    and 7 with all that were asked for, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
+    and 7 with all that were requested, which have no seams; the odd ones of cars that stand square on the map, which a network of cells puts
     elsewhere."""
     shared, part, square = (fused[:, FUSED_COVARIATES.index(name)] for name in ("senders", "part", "own_square"))
     kind = (shared > 0) * (1 + (part > FEW) + (part > WHOLE))
@@ -219,19 +228,16 @@ def rank_covariates(look: Singles, confidence: Singles, cars: NDArray[Any]) -> S
 
 def save(path: Path, parameters: Parameters) -> None:
     """Write them as safetensors with the card in the metadata, under a temporary name first."""
-    tensors: dict[str, Singles] = {
-        name: getattr(parameters, name)
-        for name in ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "mirages", "boxes")
-    }
+    names = ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "boxes")
+    tensors: dict[str, Singles] = {name: getattr(parameters, name) for name in names}
+    tensors[_SHARED_TENSOR] = parameters.shared_false_positives
     for name, net in parameters.nets.items():
         for k, (w, b) in enumerate(zip(net.weight, net.bias, strict=True)):
             tensors[f"{name}.{k}.weight"], tensors[f"{name}.{k}.bias"] = w, b
     tensors = {k: np.ascontiguousarray(v, np.float32) for k, v in tensors.items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    save_file(tensors, part, metadata={"surrogate": json.dumps({"format": FORMAT, **parameters.card})})
-    part.chmod(0o644)
-    part.replace(path)
+    with replacing(path) as part:
+        save_file(tensors, part, metadata={"surrogate": json.dumps({"format": FORMAT, **parameters.card})})
+        part.chmod(0o644)  # the library makes it private
 
 
 def load(path: Path) -> Parameters:
@@ -284,7 +290,7 @@ def load(path: Path) -> Parameters:
         take("alarm_edges", BANDS + 1),
         take("alarm_range", 2, len(ALARM_COVARIATES)),
         take("alarm_pool", 2, BANDS, None, len(ALARM_COLUMNS)),
-        take("mirages", 4),
+        take(_SHARED_TENSOR, 4),
         take("boxes", 3, None),
         card,
     )

@@ -1,4 +1,4 @@
-"""What the torch detector is asked for a calibration: scenes, fleets and shares by draws that anyone can make again. Free of torch."""
+"""The jobs that the torch detector runs for a calibration: scenes, fleets and shares, from seeded draws. Free of torch."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sortie.perception.benchmark.scenes import AREA_M, DRONES, model_of
 from sortie.perception.joining import Rule
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TargetPath
 from sortie.perception.types import Capture, Share
+from sortie.scenarios.disc import Disc
+from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scene, Target
 from sortie.scenarios.streams import stream
 
@@ -23,35 +26,34 @@ Manner = Literal["anywhere", "street"]
 MANNERS: tuple[Manner, ...] = ("anywhere", "street")
 """How a scene's first moment is flown, and its second: anywhere and turned anyhow, or along the street through the origin as
 sorties are, with a mission's target below, and cars that stand square on every drone's map."""
-AREA_M = 60.0
-"""The fleet's middle lies within ± this of the scene's origin."""
 LANE_M = 1.75
-"""From a street's middle to that of its lanes."""
+"""From a street's middle to the target's path. The town's lanes are 1.6 m away (`town.LANE_CENTRE_M`); the shipped calibration
+was drawn with this value."""
 FIRST_S, LAST_S = 5.0, 300.0
-"""Scenes are asked about between these times."""
-DRONES = 5
+"""Moments lie between these times."""
 THRESHOLD = 0.1
 """Boxes count from this score on."""
 BUDGETS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 DRAWN, PLAIN = 4, 3
-"""Exchanges that a drone is asked under for the fit."""
+"""Exchanges per drone for the fit: drawn in every respect, and plain."""
 AGES_S = (0.1, 0.2, 0.4)
 """How much older than the ego's a share may be."""
 STYLES = ("town", "old_town", "suburb", "yard")
 _SHAPES = {
-    "cross": np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64),
+    "cross": slots("cross", DRONES, 1.0),
     "line": np.array([(0, 0), (0, 1), (0, 2), (0, -1), (0, -2)], dtype=np.float64),
-    "wedge": np.array([(0, 0), (-1, 1), (-1, -1), (-2, 2), (-2, -2)], dtype=np.float64) / np.sqrt(2),
+    "wedge": slots("wedge", DRONES, 1.0),
     "circle": np.array([(np.cos(a), np.sin(a)) for a in np.arange(5) * 2 * np.pi / 5]) / (2 * np.sin(np.pi / 5)),
 }
-Disc = tuple[float, float, float]
+"""The shipped calibration was drawn with these. Line and circle are not the fleet's (`scenarios.formation.slots`): its line
+counts left and right in turn, and its circle is a little smaller, as it measures spacing along the arc."""
 Fleets = tuple[list[Capture], dict[float, list[Capture]]]
 """A fleet's captures now, and a little earlier by how much."""
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
-    """One question to the detector, and the condition under which it is asked."""
+class DetectorJob:
+    """One ego's detection, and the condition under which it is run."""
 
     ego: Capture
     shares: tuple[Share, ...]
@@ -96,7 +98,7 @@ def draw_scene(seed: int, split: Split, index: int) -> Scene:
 
 def draw_target(seed: int, split: Split, index: int) -> Target:
     """A mission's target: it keeps to the right of the street that the scene's fleet flies along, as fast as the fleet or not,
-    and is about its middle when the fleet is asked."""
+    and is near the fleet at the fleet's moment."""
     name = scene_seed(seed, split, index)
     flown = _Street.draw(stream(name, 0, MANNERS.index("street"), "calibrate.fleet"))
     u = stream(name, 0, (), "calibrate.target").random(3)
@@ -109,17 +111,15 @@ def draw_target(seed: int, split: Split, index: int) -> Target:
 
 
 def scene_model(seed: int, split: Split, index: int) -> SceneModel:
-    """The scene as every moment of it is asked for."""
-    bounds = (-AREA_M, -AREA_M, AREA_M, AREA_M)
-    return SceneModel(draw_scene(seed, split, index), draw_target(seed, split, index), bounds)
+    """The scene model of a drawn scene, with its target."""
+    return model_of(draw_scene(seed, split, index), draw_target(seed, split, index))
 
 
-def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[Question]:
-    """What is asked at moment `index` of a scene.
+def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int = 2) -> list[DetectorJob]:
+    """The jobs of moment `index` of a scene.
 
-    For the fit, every drone is asked alone, under some exchanges that are drawn in every respect, and under some plain ones: all
-    others, one budget, everywhere and at once. Held out, the first `condition_egos` drones are
-    asked under every condition of the moment's manner.
+    For the fit, every drone runs alone, under some exchanges that are drawn in every respect, and under some plain ones: all
+    others, one budget, everywhere and at once. Held out, some drones run under every condition of the moment's manner.
     """
     rng = stream(scene_seed(seed, split, scene), 0, index, "calibrate.fleet")
     manner = MANNERS[index]
@@ -129,19 +129,19 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
         if manner == "anywhere":
             return [job for ego in egos for job in conditions(ego, now, old)]
         x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
-        return [job for ego in egos for job in street_conditions(ego, now, old, (x, y, 32.0))]
-    jobs = [Question(ego, (), "masked", "confidence", "") for ego in now]
+        return [job for ego in egos for job in street_conditions(ego, now, old, Disc(x, y, 32.0))]
+    jobs = [DetectorJob(ego, (), "masked", "confidence", "") for ego in now]
     jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(DRAWN)]
     return jobs + [_plain(rng, ego, now) for ego in now for _ in range(PLAIN)]
 
 
-def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[Question]:
+def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) -> Iterator[DetectorJob]:
     """One drone under the exchanges that calibrations are judged by."""
     peers = [i for i in range(len(now)) if i != ego]
     near = sorted(peers, key=lambda i: np.hypot(*np.subtract(now[i].position_m, now[ego].position_m)[:2]))
     x, y, _ = now[ego].position_m
     turn = now[ego].true_yaw_rad
-    disc = (x + 20 * float(np.cos(turn)), y + 20 * float(np.sin(turn)), 32.0)
+    disc = Disc(x + 20 * float(np.cos(turn)), y + 20 * float(np.sin(turn)), 32.0)
 
     def job(
         name: str,
@@ -156,11 +156,11 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         weight: float = 1.0,
         boxes_of: list[int] | None = None,
         join: Rule = "nms",
-    ) -> Question:
+    ) -> DetectorJob:
         of = old[age_s] if age_s else now
         shares = tuple(Share(of[i], representation, rho, roi, weight) for i in who)
         shares += tuple(Share(of[i], "detections", 0.0, None, 1.0) for i in boxes_of or [])
-        return Question(now[ego], shares, unsent, cells_by, name, join)
+        return DetectorJob(now[ego], shares, unsent, cells_by, name, join)
 
     yield job("alone", 0.0, [])
     for rho in BUDGETS:
@@ -183,7 +183,9 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         yield job(f"nearest 2, ρ = 0.1, boxes of the others, {rule}", 0.1, near[:2], boxes_of=near[2:], join=rule)
 
 
-def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]], disc: Disc) -> Iterator[Question]:
+def street_conditions(
+    ego: int, now: list[Capture], old: dict[float, list[Capture]], disc: Disc
+) -> Iterator[DetectorJob]:
     """One drone of a fleet that flies along a street, under exchanges as sorties have them, in the mission's disc too."""
     peers = [i for i in range(len(now)) if i != ego]
 
@@ -194,9 +196,9 @@ def street_conditions(ego: int, now: list[Capture], old: dict[float, list[Captur
         representation: str = "features",
         roi: Disc | None = None,
         join: Rule = "nms",
-    ) -> Question:
+    ) -> DetectorJob:
         shares = tuple(Share(of[i], representation, rho, roi, 1.0) for i in peers if name != "alone")
-        return Question(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
+        return DetectorJob(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
 
     yield job("alone", 0.0)
     for rho in (0.006, 0.025, 0.1, 0.35):
@@ -219,9 +221,9 @@ def _anywhere(rng: np.random.Generator, split: Split) -> Fleets:
         position_error, heading_error = 0.05 + 0.5 * u[5], np.radians(1.0 * u[6])
     heading, speed = 2 * np.pi * u[7], 8 * u[8]
     c, s = np.cos(heading), np.sin(heading)
-    slots = rng.uniform(-AREA_M, AREA_M, 2) + spacing * _SHAPES[shape] @ np.array([[c, s], [-s, c]])
+    places = rng.uniform(-AREA_M, AREA_M, 2) + spacing * _SHAPES[shape] @ np.array([[c, s], [-s, c]])
     poses = []
-    for slot in slots:
+    for slot in places:
         place = np.array([*slot, altitude]) + 0.5 * rng.normal(size=3)
         yaw = heading + np.radians(1.0) * rng.normal()
         roll, pitch = np.radians(3.0) * rng.normal(size=2)
@@ -236,9 +238,11 @@ def _on_street(rng: np.random.Generator) -> Fleets:
     heading, speed = flown.heading, flown.speed_mps
     c, s = np.cos(heading), np.sin(heading)
     across_m = 2.0 * rng.normal()
-    slots = (np.array([flown.along_m, across_m]) + flown.spacing_m * _SHAPES[flown.shape]) @ np.array([[c, s], [-s, c]])
+    places = (np.array([flown.along_m, across_m]) + flown.spacing_m * _SHAPES[flown.shape]) @ np.array(
+        [[c, s], [-s, c]]
+    )
     poses = []
-    for slot in slots:
+    for slot in places:
         place = np.array([*slot, 60.0]) + 0.5 * rng.normal(size=3)
         yaw = heading + np.radians(0.15) * rng.normal()
         pitch, roll = np.radians(0.5 * speed + 1.7 * rng.normal()), np.radians(2.0) * rng.normal()
@@ -300,14 +304,16 @@ def _rho(everything: float, u: float) -> float:
     return 1.0 if everything < 0.3 else float(0.004 * 250.0**u)
 
 
-def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> Question:
+def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> DetectorJob:
     """All others send a drawn part of their maps as they are now."""
     rho = _rho(*rng.random(2))
     shares = tuple(Share(c, "features", rho, None, 1.0) for c in now if c is not ego)
-    return Question(ego, shares, "masked", "confidence", "")
+    return DetectorJob(ego, shares, "masked", "confidence", "")
 
 
-def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]) -> Question:
+def _exchange(
+    rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]
+) -> DetectorJob:
     """A drawn exchange: who, how many cells, where, how old, what a cell that was not sent counts as."""
     u = rng.random(9)
     peers = rng.permutation([c.drone for c in now if c is not ego])[: 1 + int(4 * u[0])]
@@ -317,7 +323,7 @@ def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: d
     roi = None
     if u[3] < 0.25:
         x, y = np.array(ego.position_m[:2]) + rng.uniform(-45, 45, 2)
-        roi = (float(x), float(y), float(20 + 30 * u[4]))
+        roi = Disc(float(x), float(y), float(20 + 30 * u[4]))
     ages = rng.choice((0.0, *AGES_S), size=len(peers)) if u[5] < 0.35 else np.zeros(len(peers))
     if u[5] < 0.2:
         ages[:] = ages[0]
@@ -328,4 +334,4 @@ def _exchange(rng: np.random.Generator, ego: Capture, now: list[Capture], old: d
         Share((old[float(a)] if a else now)[p], "features", rho, roi, float(w))
         for p, a, w in zip(peers, ages, weights, strict=True)
     )
-    return Question(ego, shares, "zero" if u[7] < 0.25 else "masked", "norm" if u[8] < 0.15 else "confidence", "")
+    return DetectorJob(ego, shares, "zero" if u[7] < 0.25 else "masked", "norm" if u[8] < 0.15 else "confidence", "")

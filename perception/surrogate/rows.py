@@ -1,4 +1,4 @@
-"""The detector's answers as rows to fit: what each look showed, what each fusion made of each car, and what was there besides."""
+"""Runs of the torch detector as rows to fit: each look, each fused car, and each false positive."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.geometry import to_local
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.collect import DetectorRuns, captures_of
 from sortie.perception.surrogate.exchange import (
@@ -78,15 +79,15 @@ class FitRows:
         return cls(**{name: np.concatenate(parts) for name, parts in out.items()})
 
 
-def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
-    """One scene's answers as rows; boxes below `floor` count as none."""
-    scene = scene_model(seed, asked.split, asked.scene)
+def rows_of(recorded: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
+    """One moment's runs as rows; boxes below `floor` are dropped."""
+    scene = scene_model(seed, recorded.split, recorded.scene)
     eyes = Eyes(scene)
-    captures = captures_of(asked.jobs)
+    captures = captures_of(recorded.jobs)
     column = {c: i for i, c in enumerate(captures)}
     fleet = CaptureColumns.of(captures)
     looks = eyes.look(fleet)
-    ranks = np.stack([asked.ranks[c] for c in captures])
+    ranks = np.stack([recorded.ranks[c] for c in captures])
     r, c = cell_of(looks.xy_m)
     there = ranks[looks.capture[:, None], 0, r, c]
     best = there.argmax(axis=1)
@@ -101,20 +102,20 @@ def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
         [4096 - np.searchsorted(order[k, 1], v, side="right") for k, v in zip(looks.capture, norm, strict=True)]
     )
 
-    jobs = [(j.ego, j.shares) for j in asked.jobs]
-    zeros = np.array([j.unsent == "zero" for j in asked.jobs])
+    jobs = [(j.ego, j.shares) for j in recorded.jobs]
+    zeros = np.array([j.unsent == "zero" for j in recorded.jobs])
     exchange = FeatureShares.of(jobs, column)
     pairs = pair(exchange, looks, fleet)
-    sent = _sent(asked, pairs, cell_r, cell_c, column)
-    by_norm = np.array([j.cells_by == "norm" for j in asked.jobs])[pairs.row, None]
+    sent = _sent(recorded, pairs, cell_r, cell_c, column)
+    by_norm = np.array([j.cells_by == "norm" for j in recorded.jobs])[pairs.row, None]
     rank = np.where(by_norm, above_norm[pairs.peer], above[pairs.peer]) / 4096.0
     fused = covariates(pairs, exchange, looks, confidence, sent, rank.astype(np.float32), zeros[pairs.row])
-    late = np.array([any(s.representation not in ("features", "raw") for s in j.shares) for j in asked.jobs])
+    late = np.array([any(not s.is_map for s in j.shares) for j in recorded.jobs])
     shift = mean_shift(pairs, exchange, sent)
     score, offset, alarms = [], [], []
-    for m, (job, boxes) in enumerate(zip(asked.jobs, asked.boxes, strict=True)):
+    for m, (job, boxes) in enumerate(zip(recorded.jobs, recorded.boxes, strict=True)):
         mine = pairs.look[pairs.row == m]
-        found, off, rest = claim(job.ego, boxes.take(boxes.score >= floor), looks, mine, eyes)
+        found, off, rest = assign_boxes(job.ego, boxes.take(boxes.score >= floor), looks, mine, eyes)
         score.append(found)
         offset.append(off)
         alarms.append(np.concatenate([np.full((len(rest), 1), m), rest], axis=1))
@@ -132,16 +133,18 @@ def rows_of(asked: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     )  # fmt: skip
 
 
-def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict[Any, int]) -> NDArray[np.bool_]:
+def _sent(
+    recorded: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, column: dict[Any, int]
+) -> NDArray[np.bool_]:
     """Whether the cell of each pair's car was sent, by the detector's own choice."""
     sent = np.zeros(pairs.peer.shape, bool)
-    for m, job in enumerate(asked.jobs):
+    for m, job in enumerate(recorded.jobs):
         mine = np.flatnonzero(pairs.row == m)
         slot = 0
         for s in job.shares:
-            if s.representation not in ("features", "raw") or s.weight <= 0:
+            if not s.is_map or s.weight <= 0:
                 continue
-            rank = asked.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
+            rank = recorded.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
             mask = budget.select(rank, s.rho, s.roi, *s.capture.est_pose)
             peer = pairs.peer[mine, slot]
             sent[mine, slot] = (peer >= 0) & mask[cell_r[peer], cell_c[peer]]
@@ -149,12 +152,9 @@ def _sent(asked: DetectorRuns, pairs: Pairs, cell_r: Array, cell_c: Array, colum
     return sent
 
 
-def claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
-    """Which box is of which car, best first: scores [cars] (0: none), offsets [cars, 5], and the boxes that are of none [a, 6]."""
-    x, y, yaw = ego.est_pose
-    c, s = np.cos(yaw), np.sin(yaw)
-    dx, dy = boxes.xy_m[:, 0] - x, boxes.xy_m[:, 1] - y
-    at: Floats = np.stack([c * dx + s * dy, c * dy - s * dx], axis=1)
+def assign_boxes(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tuple[Array, Array, Array]:
+    """Assign boxes to cars, best first: scores [cars] (0: none), offsets [cars, 5], and the false positives [a, 6]."""
+    at: Floats = np.stack(to_local(boxes.xy_m[:, 0], boxes.xy_m[:, 1], ego.est_pose), axis=1)
     cars = looks.xy_m[mine]
     score, offset = np.zeros(len(mine)), np.zeros((len(mine), 5))
     rest = []
@@ -163,7 +163,7 @@ def claim(ego: Any, boxes: Boxes, looks: Looks, mine: Array, eyes: Eyes) -> tupl
     for b in range(len(boxes)):  # they are best first
         away = np.hypot(*(cars - at[b]).T) + 1e3 * (score > 0)
         best = int(away.argmin()) if len(away) else -1
-        turn = float(boxes.yaw_rad[b] - yaw)
+        turn = float(boxes.yaw_rad[b] - ego.est_yaw_rad)
         if best < 0 or away[best] > REACH_M:
             rest.append((*at[b], *boxes.size_m[b], turn, boxes.score[b]))
             continue

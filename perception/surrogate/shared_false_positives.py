@@ -1,7 +1,7 @@
-"""What looks like a car to more drones than one: false alarms that stand in the world. Free of torch.
+"""False positives that several drones share, because they are of things that stand in the world. Free of torch.
 
-The town has things in it, thrown evenly; each drone that has one in its square takes it for a car with the same chance,
-at every look anew. How many there are follows from how many false alarms a drone has.
+Such things are spread evenly over the town. Each drone that has one in its square takes it for a car with the same chance,
+drawn anew at every look. Their number follows from the number of false positives of a drone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sortie.perception.geometry import FULL, in_square
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import CaptureColumns
-from sortie.perception.surrogate.hashing import GAMMA, Words, mixed, uniform
+from sortie.perception.surrogate.hashing import GAMMA, Hashes, mixed, uniform
 from sortie.scenarios.streams import stream
 
 TILE_M = 25.6
@@ -30,43 +30,47 @@ _A_TILE = (TILE_M / (2 * FULL.half_extent_m)) ** 2
 
 @dataclass(frozen=True, slots=True)
 class Things:
-    """What stands about a fleet: `xy_m` [n, 2] and `yaw_rad` [n], ENU; `word` [n], a number of its own; `rarity` [n]: it is
-    there where more than so many are expected in a square; `there` [c, n] whether it lies in the capture's square."""
+    """The things near a fleet.
+
+    `xy_m` [n, 2] and `yaw_rad` [n], ENU. `key` [n]: a number that its draws follow from. `rarity` [n]: it exists where more
+    than so many are expected in a square. `there` [c, n]: whether it lies in the capture's square.
+    """
 
     xy_m: Floats
     yaw_rad: Floats
-    word: Words
+    key: Hashes
     rarity: Floats
     there: NDArray[np.bool_]
 
 
-class Mirages:
-    """The things of one town."""
+class SharedFalsePositives:
+    """The things of one town that drones may take for cars."""
 
     def __init__(self, town: int) -> None:
         self._key = stream(town, 0, (), "surrogate.mirage").integers(2**64, dtype=np.uint64)
 
     def about(self, fleet: CaptureColumns, most: float) -> Things:
-        """Those in any capture's square, where at most so many are expected in one."""
+        """The things in any capture's square, where at most `most` are expected in one."""
         own = np.unique(np.floor(fleet.position_m[:, :2] / TILE_M).astype(np.int64), axis=0)
         around = np.array(list(itertools.product(_AROUND, _AROUND)))
         tiles = np.unique((own[:, None] + around).reshape(-1, 2), axis=0)
-        words = mixed(mixed(tiles[:, 0].astype(np.uint64) ^ self._key) ^ tiles[:, 1].astype(np.uint64))
-        word = words[:, None] + np.arange(1, THINGS + 1, dtype=np.uint64) * np.uint64(GAMMA)
-        rarity = np.cumsum(-np.log(uniform(word, 0)), axis=1) / _A_TILE
+        tile_keys = mixed(mixed(tiles[:, 0].astype(np.uint64) ^ self._key) ^ tiles[:, 1].astype(np.uint64))
+        key = tile_keys[:, None] + np.arange(1, THINGS + 1, dtype=np.uint64) * np.uint64(GAMMA)
+        rarity = np.cumsum(-np.log(uniform(key, 0)), axis=1) / _A_TILE
         tile, thing = np.nonzero(rarity < most)
-        word, rarity = word[tile, thing], rarity[tile, thing]
-        xy = (tiles[tile] + np.stack([uniform(word, 1), uniform(word, 2)], axis=1)) * TILE_M
+        key, rarity = key[tile, thing], rarity[tile, thing]
+        xy = (tiles[tile] + np.stack([uniform(key, 1), uniform(key, 2)], axis=1)) * TILE_M
         poses = np.column_stack([fleet.position_m[:, :2], fleet.yaw_rad])
-        return Things(xy, 2 * np.pi * uniform(word, 3), word, rarity, in_square(xy, poses).T)
+        return Things(xy, 2 * np.pi * uniform(key, 3), key, rarity, in_square(xy, poses).T)
 
 
-def in_common(seen: Sequence[int], others: int) -> tuple[float, float]:
-    """The part of false alarms that are of things that all can see, and the chance to see one, such that as many others see
-    them as did on average, and as many pairs of others.
+def estimate_shared(seen: Sequence[int], others: int) -> tuple[float, float]:
+    """The share of false positives that are of shared things, and the chance that a drone has one of those.
+
+    Chosen so that as many others have them, and as many pairs of others, as was counted on average.
 
     Args:
-        seen: of each false alarm, how many of the `others` who could have had it as well had it.
+        seen: for each false positive, how many of the `others` that could have had it as well had it.
     """
     n = np.asarray(seen, dtype=np.float64)
     if not n.sum():

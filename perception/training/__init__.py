@@ -1,1 +1,1 @@
-"""Learning: batches and losses, the run, what the weights are worth."""
+"""Training: batches and losses, the run, and validation of the weights."""

@@ -1,4 +1,4 @@
-"""What a training step is: batches of frames, what the head should say about them, losses and gradients."""
+"""One training step: batches of frames, targets for the head, losses and gradients."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.benchmark.scenes import DRONES
-from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry
+from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry, to_local
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.network.decode import REFERENCE_SIZE_M
 from sortie.perception.network.fusion.base import UnsentCells, takes_part
 from sortie.perception.network.model import CarNet
@@ -62,22 +63,16 @@ def draw_batch(frames: Frames, seed: int, step: int, shard: int) -> Batch:
 
 def local_cars(cars: NDArray[np.float64], pose: NDArray[np.float64], geometry: Geometry = FULL) -> NDArray[np.float64]:
     """The cars [n, 5] inside a drone's square, in its frame (x forward, y left)."""
-    cars = cars[~np.isnan(cars[:, 0])]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    dx, dy = cars[:, 0] - pose[0], cars[:, 1] - pose[1]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    inside = (np.abs(x) < geometry.half_extent_m) & (np.abs(y) < geometry.half_extent_m)
-    local: NDArray[np.float64] = np.stack([x, y, cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
-    kept: NDArray[np.float64] = local[inside]
-    return kept
+    cars = ground_truth(cars, pose, geometry.half_extent_m).table()
+    return np.stack([*to_local(cars[:, 0], cars[:, 1], pose), cars[:, 2], cars[:, 3], cars[:, 4] - pose[2]], axis=1)
 
 
 def targets(
     cars: NDArray[np.float64], geometry: Geometry = FULL
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """What the head should say: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
+    """The head's targets: heat [128, 128]; cells [p] (flat), values [p, 6] and weight [p] of the regressions.
 
-    Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are asked for on the 3 × 3 cells around it.
+    Heat is a Gaussian (σ 0.8 cells) about each car; offsets and sizes are learned on the 3 × 3 cells around it.
     """
     heat = np.zeros((HEAD_PX, HEAD_PX), np.float32)
     at = (cars[:, :2] + geometry.half_extent_m) / geometry.head_m - 0.5

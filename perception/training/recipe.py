@@ -1,4 +1,4 @@
-"""What a training run is, by its parameters, and the command that repeats it. Free of torch."""
+"""The parameters of a training run, and the command that repeats it. Free of torch."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Recipe:
     cell_dropout: float = 0.0
     """Probability that a link is thinned: only a fraction of its cells arrives, log-uniform from 1 % to all, cells at random."""
     unsent: Literal["masked", "zero"] = "masked"
-    """What a dropped cell is in training: it has no say, or takes part as zeros. Full sharing knows no difference."""
+    """What a dropped cell is in training: it is left out, or takes part as zeros. Under full sharing there is no difference."""
     warm_start: str = ""
     """Name of the weights that it begins from; empty for none. Tensors that do not fit begin anew."""
 
@@ -69,7 +69,7 @@ def benchmark_root() -> Path:
 
 
 def of_benchmark(bench: Benchmark) -> dict[str, Any]:
-    """What a weights file says of its data."""
+    """The facts about the data that a weights file stores."""
     return {
         "key": bench.key(),
         "seed": bench.seed,

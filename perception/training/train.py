@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
+from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.checkpoint import load_weights, read_config
 from sortie.perception.network.model import CarNet, ModelConfig
@@ -218,9 +219,8 @@ def _save(path: Path, facts: dict[str, Any], net: CarNet, optimiser: torch.optim
     for i, parameter in enumerate(net.parameters()):
         for key, value in optimiser.state[parameter].items():
             tensors[f"adam.{i}.{key}"] = torch.as_tensor(value).detach().cpu().contiguous()
-    part = path.with_name(path.name + ".part")
-    save_file(tensors, part, metadata={"sortie": json.dumps(facts)})
-    part.replace(path)
+    with replacing(path) as part:
+        save_file(tensors, part, metadata={"sortie": json.dumps(facts)})
 
 
 def _restore(

@@ -1,4 +1,4 @@
-"""What weights are worth on the validation split, and the card that says so."""
+"""The AP of weights on the validation split, and their card."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.results import TAU
+from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
 from sortie.perception.training.recipe import command, of_benchmark
 
-TAU = 0.1
-"""The score below which boxes are dropped: the schema's default, and UAV3D's own head's."""
 LEVELS = ((1.0, 1.0), (1.0, 2.5), (0.0, 0.0))
 """Factors on the benchmark's own pose errors, position and heading; its own first."""
 
@@ -82,13 +82,12 @@ def publish(
     """Write the weights with their history, and the card beside them (`<name>.md`)."""
     facts = {"runs": runs, "benchmark": of_benchmark(bench), "validation": [asdict(level) for level in levels]}
     save_weights(net, path, facts)
-    part = path.with_suffix(".md.part")
-    part.write_text(card(path.name, asdict(net.config), facts))
-    part.replace(path.with_suffix(".md"))
+    with replacing(path.with_suffix(".md")) as part:
+        part.write_text(card(path.name, asdict(net.config), facts))
 
 
 def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
-    """The model card, Markdown, from what the weights file says of itself."""
+    """The model card, Markdown, from the facts in the weights file."""
     bench = facts["benchmark"]
     made = "\n".join(
         f"| {k} | `{command(r, model, bench['seed'], name)}` | {r['done']} | {r['loss']:.3f} | {r['minutes']:.0f} |"

@@ -1,11 +1,11 @@
-"""Adaptive policies: one byte budget, spent by what mission, link, battery and geometry ask for.
+"""Adaptive policies: they choose how to spend one byte budget, by mission, link, battery and geometry.
 
-Each decision picks an arm, a way to spend the budget: to how many peers, features or boxes, all that is seen or the
-mission's region alone. `adaptive` picks by rules that read mission, coverage, budget and links jointly; `learned` asks a
-linear model that was fitted on simulated sorties (`sortie learn`) and is stored as plain numbers.
+Each decision chooses an arm, which is a way to spend the budget: how many peers get features, who gets boxes, and
+whether maps hold everything or the mission region alone. `adaptive` chooses by rules that read mission, coverage,
+budget and links. `learned` chooses by a linear model that was fitted on simulated sorties (`sortie learn`).
 
-`rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies: at equal
-`rho` no arm sends more bytes than they do.
+`rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies. At equal `rho`
+no arm sends more bytes than they do.
 """
 
 from __future__ import annotations
@@ -17,16 +17,23 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.policies.catalogue.coverage_cells import sees
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.catalogue.prior.full import RATE_HZ
+from sortie.policies.contract import (
+    FEATURE_CELLS,
+    FEATURE_MAP_MEGABITS,
+    Descriptor,
+    Directive,
+    FleetView,
+    Representation,
+    TaskPhase,
+    nothing,
+)
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 
-RATE_HZ = 10.0
-MAP_MB = 8 * 4096 * 160e-6
-"""All feature cells of one map, megabits."""
 CARRIED = 0.5
-"""A drone asks of the air no more than this part of its mean goodput: the others send as well."""
+"""A drone sends at most this share of its mean goodput, because the others send as well."""
 STEPS_A_HALVING = 2
-"""What the air carries is rounded down in steps of √2, so that a goodput that wavers moves no directive."""
+"""What the air carries is rounded down in steps of √2, so that a varying goodput does not change the directive."""
 EVERYONE = 255
 LEARNED = Path(__file__).with_name("learned.json")
 
@@ -35,35 +42,35 @@ class Arm(NamedTuple):
     """A way to spend the budget."""
 
     peers: int
-    """How many of the most overlapping peers get features and share the budget; more than there are is all."""
+    """How many of the most overlapping peers get features and share the budget (all, if there are fewer)."""
     boxes: bool
-    """Whether the others get boxes; otherwise nothing."""
+    """Whether the others get boxes; if not, they get nothing."""
     region: bool
-    """Features of the mission's region alone, where there is one."""
+    """Whether features are of the mission region alone, if there is one."""
 
     @property
-    def words(self) -> str:
-        """As it stands in a reason."""
+    def text(self) -> str:
+        """The arm as text for a reason."""
         who = "all" if self.peers >= EVERYONE else f"{self.peers}"
         rest = ", boxes to the rest" if self.boxes and self.peers < EVERYONE else ""
         return f"features to {who}{rest}" if self.peers else "boxes to all"
 
 
 ARMS: tuple[Arm, ...] = (Arm(EVERYONE, True, True), Arm(2, True, True), Arm(0, True, False))
-"""What the adaptive policies choose from; searching there is no region, and maps are of everything."""
+"""The arms that the adaptive policies choose from. While searching there is no region, and maps hold everything."""
 MAPS, BOXES = ARMS[0], ARMS[-1]
-FEW = 8 / 4096
-"""Of a map: with fewer cells than that to a link boxes are sent."""
+FEW = 8 / FEATURE_CELLS
+"""Share of a map. A link that would carry less gets boxes."""
 
 
 def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
-    """The directives of an arm: the budget shared evenly by the chosen peers, or what the air carries of it.
+    """The directives of an arm. The chosen peers share the budget evenly, as far as the air carries it.
 
     Args:
         view: the fleet's latest descriptors.
         arm: how to spend.
         rho: the budget, 0 … 1 of full sharing over all links.
-        why: the reason, before the arm's own words.
+        why: the reason; the arm's text is added.
     """
     me = view.me
     if me is None:
@@ -72,7 +79,7 @@ def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
     chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
     per_link = min(1.0, rho * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
     roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
-    reason = f"{why}: {arm.words}"
+    reason = f"{why}: {arm.text}"
     directives = []
     for peer in peers:
         if peer in chosen:
@@ -85,19 +92,19 @@ def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
 
 
 def carried(me: Descriptor, peers: Sequence[int]) -> float:
-    """Share of a map that each of so many links carries in time, by the goodput that the drone measured to them.
+    """The share of a map that each of these links carries in time, by the drone's measured goodput; 1 if none is measured.
 
-    More than that is sent in vain: samples wait for one another and miss their deadlines. 1 while nothing is measured.
+    Samples beyond that would wait for one another and miss their deadlines.
     """
     measured = [mbps for mbps in map(me.goodput_to, peers) if mbps > 0.0]
     if not measured:
         return 1.0
-    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * MAP_MB * RATE_HZ)
+    share = CARRIED * fsum(measured) / len(measured) / (len(peers) * FEATURE_MAP_MEGABITS * RATE_HZ)
     return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
 
 
 def arm(view: FleetView, *, index: int = 0, rho: float = 0.25) -> list[Directive]:
-    """One arm, always: what the adaptive policies choose from, for `sortie learn` and comparisons."""
+    """Always the same arm, for `sortie learn` and comparisons."""
     return spend(view, ARMS[index % len(ARMS)], rho, "fixed arm")
 
 
@@ -105,7 +112,7 @@ FEATURES = ("log10 of the budget", "tracking a region", "mean overlap of peers",
 
 
 def features(view: FleetView, rho: float) -> tuple[float, ...]:
-    """What the learned policy reads, in the order of `FEATURES`: budget, mission, coverage, links, battery."""
+    """The inputs of the learned policy, in the order of `FEATURES`: budget, mission, coverage, links, battery."""
     me = view.me
     if me is None:
         return (0.0,) * len(FEATURES)
@@ -117,15 +124,15 @@ def features(view: FleetView, rho: float) -> tuple[float, ...]:
 
 
 def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Boxes to every peer, whatever the context and the budget: the cheapest sharing that there is."""
+    """Boxes to every peer, whatever the context and the budget: the cheapest way of sharing."""
     return spend(view, BOXES, rho, "fixed")
 
 
 def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Rules over mission, coverage, budget and links: of a region that is tracked and seen its feature cells, otherwise boxes.
+    """Rules over mission, coverage, budget and links: feature cells of a tracked region that it sees, otherwise boxes.
 
-    A region is small, so that even a starved budget sends the cells that count, and maps of them find more than boxes; of
-    the whole scene boxes find more under every budget (the torch detector's word, by `sortie learn --by-torch`). Who sees
+    A region is small, so even a small budget carries its important cells, and maps of them find more than boxes. Of the
+    whole scene, boxes find more under every budget (by the torch detector, `sortie learn --by-torch`). A drone that sees
     nothing of the region has no cells of it to send.
     """
     me = view.me
@@ -142,7 +149,7 @@ def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
 
 def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """The arm that promises most by what simulated sorties taught (`sortie learn`); ties go to the earlier arm."""
+    """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
     seen = features(view, rho)
     z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
     gains = [w[0] + sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
@@ -151,7 +158,7 @@ def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
 
 
 class Model(NamedTuple):
-    """What `sortie learn` stores: per arm, the AP gained over the first arm as a linear function of `FEATURES`."""
+    """The model that `sortie learn` stores: for each arm, the AP gained over the first arm, linear in `FEATURES`."""
 
     mean: tuple[float, ...]
     scale: tuple[float, ...]
@@ -170,7 +177,7 @@ def read_model(path: Path) -> Model:
     numbers = [*model.mean, *model.scale, *(x for w in model.weights for x in w)]
     shapes = {len(model.mean), len(model.scale), *(len(w) - 1 for w in model.weights)}
     if shapes != {len(FEATURES)} or len(model.weights) != len(ARMS) or not all(map(isfinite, numbers)):
-        raise ValueError(f"{path}: must hold {len(ARMS)} arms of 1 + {len(FEATURES)} finite weights")
+        raise ValueError(f"{path}: must have {len(ARMS)} arms of 1 + {len(FEATURES)} finite weights")
     return model
 
 

@@ -1,4 +1,4 @@
-"""Fixed policies to compare with: everyone, the best, worst or random k peers, and silence.
+"""Fixed policies for comparisons: every peer, the best, worst or random k peers, and silence.
 
 `rho` is the paper's budget: what one drone sends, summed over its links, as a fraction of full sharing.
 k peers share it evenly, so policies with different k send the same bytes (up to a full map per link).
@@ -9,12 +9,12 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
+from sortie.policies.catalogue.prior.full import RATE_HZ
 from sortie.policies.contract import Directive, FleetView, Representation, nothing
 from sortie.policies.geometry import peers_by_overlap
 
-RATE_HZ = 10.0
 RESHUFFLE_S = 10
-"""random-k draws new peers this often: longer than any sensible dwell time, so that the links come up."""
+"""How often random-k draws new peers: longer than usual dwell times, so that links can be upgraded."""
 
 
 def _share_with(view: FleetView, chosen: Sequence[int], rho: float, why: str) -> list[Directive]:

@@ -1,4 +1,4 @@
-"""What coverage grids say, as sets of cells of the world's lattice, so that drones' grids can be compared."""
+"""Coverage grids as sets of cells of the world's lattice, so that drones' grids can be compared."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _HALF_DIAGONAL_M = COVERAGE_CELL_M * 2**0.5 / 2
 
 
 def seen_well(d: Descriptor) -> Cells:
-    """Cells that a drone says it sees well, new ones among them."""
+    """Cells that a drone reports as seen well, new ones included."""
     return _cells(d.coverage_grid, *d.coverage_corner)
 
 
 def seen_at_all(d: Descriptor) -> Cells:
-    """Cells that a drone says it sees, well or poorly: what its map holds."""
+    """Cells that a drone reports as seen, well or poorly: its map has them."""
     return _cells(d.coverage_grid, *d.coverage_corner, Coverage.POOR)
 
 
@@ -29,7 +29,7 @@ def centre_cell(d: Descriptor) -> Cells:
     return frozenset(((row + COVERAGE_CELLS // 2, column + COVERAGE_CELLS // 2),))
 
 
-@lru_cache(maxsize=4096)  # a grid stands for a second and is read by every drone
+@lru_cache(maxsize=4096)  # a grid is valid for a second and every drone reads it
 def _cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) -> Cells:
     seen = []
     for i, byte in enumerate(grid):
@@ -42,13 +42,13 @@ def _cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) 
 
 @lru_cache(maxsize=4096)
 def disc_around(cells: Cells) -> Disc:
-    """A disc that holds all of the cells, about the middle of their bounding box; ENU.
+    """A disc that contains all of the cells, centred on their bounding box; ENU.
 
     Raises:
         ValueError: no cells.
     """
     if not cells:
-        raise ValueError("cells is empty, must hold at least one")
+        raise ValueError("cells is empty, must have at least one")
     rows, columns = [r for r, _ in cells], [c for _, c in cells]
     x = (min(columns) + max(columns) + 1) / 2
     y = (min(rows) + max(rows) + 1) / 2
@@ -57,7 +57,7 @@ def disc_around(cells: Cells) -> Disc:
 
 
 def sees(d: Descriptor, disc: Disc) -> bool:
-    """Whether a drone says that it sees any cell whose middle lies in the disc, or within half a diagonal of it."""
+    """Whether a drone reports as seen any cell with its centre in the disc, or within half a diagonal of it."""
     reach_m = disc.radius_m + _HALF_DIAGONAL_M
     return any(
         hypot((c + 0.5) * COVERAGE_CELL_M - disc.x_m, (r + 0.5) * COVERAGE_CELL_M - disc.y_m) <= reach_m
@@ -66,6 +66,6 @@ def sees(d: Descriptor, disc: Disc) -> bool:
 
 
 @lru_cache(maxsize=65536)
-def answered(key: Cells, known: Cells) -> float:
-    """Share of what one sees well that another does not, 0 … 1: how far a key answers a query."""
+def new_share(key: Cells, known: Cells) -> float:
+    """The share of `key`, what one drone sees well, that another does not see well, 0 … 1."""
     return len(key - known) / len(key) if key else 0.0

@@ -1,23 +1,28 @@
-"""A policy that reads all four context axes and makes all six decisions: who serves whom, by what is not yet seen.
+"""A policy that reads all four context axes and makes all six decisions: each receiver is served by a few drones.
 
-For each receiver the fleet appoints the k drones that add most to what it sees, as far as link and battery carry
-them. Every drone works out the same appointment from the same descriptors, so nothing is negotiated; a drone whose
-claims are false can take a place from a better one, which is what trust (`sortie.fleet.trust`) is for.
+For each receiver, the k drones are appointed that add most to what it sees, weighted by link and battery. Every drone
+computes the same appointment from the same descriptors, so nothing is negotiated. A drone with false claims can take
+the place of a better one; trust (`sortie.fleet.trust`) is for that.
 """
 
 from __future__ import annotations
 
 from sortie.policies.catalogue.coverage_cells import seen_well
 from sortie.policies.catalogue.freshness import freshness
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.catalogue.worked import (
+    FULL_RATE_HZ,
+    HALF_RATE_HZ,
+    HIGH_BATTERY,
+    LOW_BATTERY,
+    MIN_GOODPUT_MBPS,
+    SLOW_RATE_HZ,
+)
+from sortie.policies.contract import AGENT_IDS, Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
 from sortie.policies.geometry import footprint_overlap
 
-HIGH_BATTERY, LOW_BATTERY = 0.60, 0.30
-FULL_RATE_HZ, HALF_RATE_HZ, SLOW_RATE_HZ = 10.0, 5.0, 2.0
-MIN_GOODPUT_MBPS, GOOD_GOODPUT_MBPS = 5.0, 20.0
+GOOD_GOODPUT_MBPS = 20.0
 RESTING_DUTY_PERCENT = 50
 SLOW_DEADLINE_S = 0.5
-_IDS = 256
 
 
 def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directive]:
@@ -40,7 +45,7 @@ def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directiv
 
 
 def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> Directive:
-    """How the ego serves a peer."""
+    """The directive by which the ego serves a peer."""
     roi = me.region if me.task_phase == TaskPhase.TRACK else None
     weight = freshness(view.age_s[peer], view.period_s)
     goodput_mbps = me.goodput_to(peer)
@@ -57,14 +62,14 @@ def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> 
 
 
 def _appointed(view: FleetView, receiver: int) -> list[int]:
-    """All other drones, those that add most to the receiver first."""
+    """All drones but the receiver, those that add most to it first."""
     served = view.descriptors[receiver]
     known = seen_well(served)
 
     def merit(i: int) -> tuple[float, float, int]:
         d = view.descriptors[i]
         adds = len(seen_well(d) - known) * _link(d.goodput_to(receiver)) * _battery(d.battery_soc)
-        return -round(adds), -round(footprint_overlap(d, served), 1), (i - receiver) % _IDS
+        return -round(adds), -round(footprint_overlap(d, served), 1), (i - receiver) % AGENT_IDS
 
     return sorted((i for i in view.descriptors if i != receiver), key=merit)
 

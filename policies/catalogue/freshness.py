@@ -1,18 +1,18 @@
-"""How far a link's payloads may count by the age of what is known about its other end."""
+"""The weight of a link's payloads by the age of the peer's descriptor."""
 
 from __future__ import annotations
 
 FRESH_PERIODS, GONE_PERIODS = 3.0, 10.0
 """The plane's two thresholds: degraded after three periods, detached after ten."""
 AGEING = 0.5
-"""Weight in between. One step and no slope, so that ageing by a frame is no new directive."""
+"""The weight between the thresholds. It is one step and no slope, so that each frame of age does not change the directive."""
 
 
 def freshness(age_s: float, period_s: float) -> float:
-    """1 up to three periods of age, a half up to ten, then 0: comparisons alone, so that proofs can follow it.
+    """1 up to three periods of age, a half up to ten, then 0. It only compares, so that proofs can follow it.
 
-    It is the freshness half of a fusion weight; the receiver's trust in the sender is the other
-    (`sortie.fleet.trust`), and is applied where the payload is fused.
+    It is one factor of a fusion weight. The other is the receiver's trust in the sender (`sortie.fleet.trust`), which
+    is applied where the payload is fused.
     """
     if age_s <= FRESH_PERIODS * period_s:
         return 1.0

@@ -1,6 +1,6 @@
-"""A policy that also chooses where to look from: while tracking, the fleet stands about the mission's region.
+"""A policy that also chooses viewpoints: while tracking, the fleet moves over the mission region.
 
-What is shared is full sharing's (`all-4`), so that a sortie under each differs by the viewpoints alone.
+It shares what `all-4` shares, so that their sorties differ by the viewpoints alone.
 """
 
 from __future__ import annotations
@@ -9,25 +9,24 @@ from collections.abc import Sequence
 from math import fsum, hypot
 
 from sortie.policies.catalogue.baselines import everyone
+from sortie.policies.catalogue.freshness import GONE_PERIODS
 from sortie.policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
 
-FRESH_PERIODS = 10.0
-"""Peers heard longer ago than this are detached: where they are now is not known."""
 NEAR_M = 5.0
-"""Nearer than this is near enough: everyone stays where it is."""
+"""If the fleet is nearer than this, all drones stay where they are."""
 MOST_M = 100.0
-"""It asks for no place farther away; the formation's reach is shorter."""
+"""The farthest move that it requests; the formation's reach is shorter."""
 
 
 def over_region(view: FleetView) -> Reposition | None:
-    """While tracking: where it would be if the fleet's middle stood over the region, each drone at its own side.
+    """While tracking: the drone's place if the fleet's centre were over the region. In other phases: its slot.
 
-    The fleet shifts as a whole, so that nobody crosses another's way. In other phases its slot.
+    The fleet shifts as a whole, so no paths cross.
     """
     me = view.me
     if me is None or me.region is None or me.task_phase != TaskPhase.TRACK:
         return None
-    fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= FRESH_PERIODS * view.period_s]
+    fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= GONE_PERIODS * view.period_s]
     if not fresh:
         return None
     middle_x, middle_y = (fsum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))
@@ -40,5 +39,5 @@ def over_region(view: FleetView) -> Reposition | None:
 
 @looks_from(over_region)
 def vantage(view: FleetView, *, rho: float = 0.25) -> Sequence[Directive]:
-    """Features to every peer, from about the mission's region."""
+    """Features to every peer, from places around the mission region."""
     return everyone(view, rho=rho)

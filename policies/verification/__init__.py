@@ -1,1 +1,1 @@
-"""Whether a policy keeps its promises: conformance, invariants, proofs and a shield in flight."""
+"""Verification of policies: the conformance kit, invariants, proofs, and a shield at run time."""

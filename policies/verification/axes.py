@@ -1,7 +1,7 @@
-"""What a policy reads and what it decides, watched while it decides: the paper's table of methods, generated.
+"""Which context axes a policy reads and what it decides, observed while it runs: generates the paper's table of methods.
 
-A policy is run on views whose descriptors note every field that is read. A decision is one that ever differs from
-full sharing (full maps to every peer, every frame, fused at weight 1).
+A policy is run on views whose descriptors record every field that is read. A method decides something if it ever differs
+from full sharing (full maps to every peer, every frame, fused at weight 1).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sortie.policies.contract import Descriptor, Directive, FleetView, Represent
 
 
 class Axis(Enum):
-    """The descriptor's groups of fields, as the paper's table heads its columns."""
+    """Groups of a descriptor's fields, named as the columns of the paper's table."""
 
     MISSION = "Mis."
     SCENE = "Scene"
@@ -37,7 +37,7 @@ FIELDS: dict[str, Axis | None] = {
     "peer_goodput_mbps": Axis.PLATFORM,
     "goodput_to": Axis.PLATFORM,
     "coverage_grid": Axis.SCENE,
-    "coverage_corner": Axis.SCENE,  # where the grid lies, to the cell: without it the grid says nothing
+    "coverage_corner": Axis.SCENE,  # the place of the grid, to one cell: without it the grid means nothing
     "novelty_flags": Axis.SCENE,
     "task_phase": Axis.MISSION,
     "region": Axis.MISSION,
@@ -50,14 +50,14 @@ DECISIONS = ("duty", "topology", "fidelity", "ROI", "rate", "fusion wts")
 
 
 class Observed(NamedTuple):
-    """What was seen of a policy."""
+    """The axes that a policy read and the decisions that it made."""
 
     axes: frozenset[Axis]
     decisions: frozenset[str]
 
 
-class _Watched:
-    """A descriptor that notes which fields are read; it is no tuple, so that nothing is read by place."""
+class _WatchedDescriptor:
+    """A descriptor that records which fields are read. It is no tuple, so nothing can be read by index."""
 
     def __init__(self, descriptor: Descriptor, read: set[str]) -> None:
         self._descriptor, self._read = descriptor, read
@@ -65,30 +65,30 @@ class _Watched:
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._descriptor, name)
         if name not in FIELDS:
-            raise AttributeError(f"a watched descriptor has fields alone, {name!r} is none")
+            raise AttributeError(f"a watched descriptor has fields alone, {name!r} is not one")
         self._read.add(name)
         return value
 
 
 def observe(policy: Callable[..., Sequence[Directive]], views: Iterable[FleetView]) -> Observed:
-    """Run a policy on watched views."""
+    """Run a policy on views that record what is read."""
     read: set[str] = set()
     decided: set[str] = set()
     for view in views:
-        watched = {i: cast(Descriptor, _Watched(d, read)) for i, d in view.descriptors.items()}
+        watched = {i: cast(Descriptor, _WatchedDescriptor(d, read)) for i, d in view.descriptors.items()}
         for directive in policy(view._replace(descriptors=watched)):
             decided |= decisions_of(directive)
     return Observed(frozenset(a for f in read if (a := FIELDS[f]) is not None), frozenset(decided))
 
 
 def decisions_of(d: Directive) -> set[str]:
-    """In which decisions a directive differs from full sharing."""
+    """The decisions in which a directive differs from full sharing."""
     full = full_sharing(d.source, d.destination, 1.0, "")
     differs = {
         "duty": d.duty_percent != full.duty_percent,
         "topology": d.representation == Representation.NONE,
     }
-    if d.representation != Representation.NONE:  # of a link that carries nothing the rest says nothing
+    if d.representation != Representation.NONE:  # for a link that carries nothing the rest has no meaning
         differs |= {
             "fidelity": (d.representation, d.rho) != (full.representation, full.rho),
             "ROI": d.roi is not None,
@@ -99,9 +99,9 @@ def decisions_of(d: Directive) -> set[str]:
 
 
 def method_table(views: Sequence[FleetView], everything: Iterable[Callable[..., Sequence[Directive]]]) -> str:
-    """The paper's table: a row a prior method, and one for the plane, which is what `everything` reads and decides.
+    """The paper's table: a row for each prior method, and one for the plane, from what `everything` reads and decides.
 
-    A method that brings a fusion network of its own decides fusion weights there.
+    A method with a fusion network of its own decides fusion weights there.
     """
     rows = ["| method | Mis. | Scene | Plat. | Geom. | decides |", "|---|---|---|---|---|---|"]
     for method in METHODS.values():

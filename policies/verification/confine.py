@@ -1,10 +1,10 @@
-"""The same policy with nothing in reach but its view: no clock, no files, no network, no other room of the fleet.
+"""A copy of a policy that can reach nothing but its view: no clock, no files, no network, no other room.
 
-    confined(my_policy)(view)    # raises Reached where the policy looks at a clock, a file, another room
+    confined(my_policy)(view)    # raises Reached if the policy uses a clock, a file, another room
 
-A policy's functions are built anew over a namespace that holds pure mathematics, the plane's types and the policy's
-own helpers; every other name in it raises when it is touched. It shows an honest policy's slip in a test. It is no
-prison for a hostile one: C extensions and further methods of a policy's own classes are not looked into.
+The policy's functions are copied with a new namespace. The namespace has pure mathematics, the contract's types and the
+policy's own helpers. Every other name raises when it is used. This finds an honest policy's mistake in a test. It does
+not stop a hostile policy: C extensions and further methods of a policy's own classes are not checked.
 """
 
 from __future__ import annotations
@@ -12,43 +12,44 @@ from __future__ import annotations
 import builtins
 import dis
 import functools
-import importlib
 import inspect
 import sys
 import types
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar, cast
 
+from sortie.policies.user_code import is_users
+
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 
-PURE = frozenset({
+ALLOWED = frozenset({
     "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
     "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions", "functools", "heapq", "itertools",
     "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
-"""Packages that know nothing but what they are handed; a policy may use them."""
-KEYED_RANDOMNESS = "sortie.scenarios.streams"
-"""Draws that follow from their key alone, so that the same view is the same decision."""
-FAR = frozenset({
+"""Packages that only use their arguments; a policy may use them."""
+SHARED = frozenset({"sortie.scenarios.disc", "sortie.scenarios.representation", "sortie.scenarios.streams"})
+"""Modules of another room that a policy may use: two types, and random draws that depend on their key alone."""
+FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip
-_ONLY = {"random": {"Random"}, "sortie": {"policies"}}
-"""Modules of which a policy may use so much: a generator with a seed of its own."""
-_BUT = {
+_ONLY = {"random": {"Random"}}
+"""Modules of which a policy may use these names only, such as a random generator with a seed of its own."""
+_EXCEPT = {
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
 }  # fmt: skip
 _NO_BUILTINS = {"breakpoint", "compile", "eval", "exec", "exit", "globals", "help", "input", "open", "print", "quit"}
 
 
 class Reached(BaseException):
-    """A policy reached for something that is not in its view; no ordinary `except` of its own swallows it."""
+    """A policy used something that is not in its view. An ordinary `except` in the policy does not catch it."""
 
     def __init__(self, what: str) -> None:
-        super().__init__(f"reaches for {what}, which is not in its view")
+        super().__init__(f"uses {what}, which is not in its view")
 
 
 class _Forbidden:
-    """Stands for what may not be touched."""
+    """A placeholder for a value that may not be used."""
 
     __slots__ = ("_name",)
 
@@ -63,7 +64,7 @@ class _Forbidden:
 
 
 class _Part:
-    """A module of which only a part is in reach."""
+    """A module of which only some names may be used."""
 
     __slots__ = ("_module",)
 
@@ -72,30 +73,42 @@ class _Part:
 
     def __getattr__(self, name: str) -> Any:
         home = self._module.__name__
-        if name in _BUT.get(home, ()) or (home in _ONLY and name not in _ONLY[home]):
+        if name in _EXCEPT.get(home, ()) or (home in _ONLY and name not in _ONLY[home]):
             raise Reached(f"{home}.{name}")
         return getattr(self._module, name)
 
 
-def confined(policy: Decides) -> Decides:
-    """The policy, or its viewpoint, over a namespace of its own: where it keeps to its view it decides the same.
+class _OwnModule:
+    """A module whose names are judged one by one: the policy's own, whose functions are confined as well, and `sortie`."""
 
-    Called, it raises `Reached`, naming what the policy reached for.
+    __slots__ = ("_allowed", "_module")
+
+    def __init__(self, module: types.ModuleType, allowed: Callable[[str, Any], Any]) -> None:
+        self._module, self._allowed = module, allowed
+
+    def __getattr__(self, name: str) -> Any:
+        return self._allowed(name, getattr(self._module, name))
+
+
+def confined(policy: Decides) -> Decides:
+    """A copy of a policy, or of its viewpoint, that decides the same as long as it only uses its view.
+
+    A call raises `Reached` with the name of whatever else the policy uses.
     """
     built: Any = _Rebuilding().function(policy)
     return cast(Decides, built)
 
 
 class _Rebuilding:
-    """One policy's functions and the names that they use, each built anew once."""
+    """Copies of one policy's functions and of the names that they use, each made once."""
 
     def __init__(self) -> None:
         self._functions: dict[int, types.FunctionType] = {}
         self._namespaces: dict[int, dict[str, Any]] = {}
 
     def function(self, found: Any) -> Callable[..., Any]:
-        """A callable over confined globals."""
-        found = getattr(found, "__wrapped__", found)  # a cache holds nothing that its arguments do not
+        """A copy of a callable with confined globals."""
+        found = getattr(found, "__wrapped__", found)  # the result of a cached function depends on its arguments alone
         if isinstance(found, functools.partial):
             return functools.partial(self.function(found.func), *found.args, **found.keywords)
         if isinstance(found, types.MethodType):
@@ -112,39 +125,62 @@ class _Rebuilding:
         if id(found) in self._functions:
             return self._functions[id(found)]
         module, code = found.__globals__, found.__code__
-        space = self._namespaces.setdefault(id(module), {"__builtins__": _builtins(), "__name__": module["__name__"]})
+        if id(module) not in self._namespaces:
+            plain = {name: module.get(name) for name in ("__name__", "__package__")}
+            self._namespaces[id(module)] = {"__builtins__": self._builtins(module["__builtins__"]), **plain}
+        space = self._namespaces[id(module)]
         cells = found.__closure__ and tuple(types.CellType() for _ in found.__closure__)
         built = types.FunctionType(code, space, found.__name__, found.__defaults__, cells)
         built.__kwdefaults__ = found.__kwdefaults__
         self._functions[id(found)] = built
         for name in _names(code) & module.keys() - space.keys():
-            space[name] = None  # met: what it stands for may use the same name
+            space[name] = None  # a placeholder: the value may use the same name
             space[name] = self._allowed(name, module[name])
         for name, old, new in zip(code.co_freevars, found.__closure__ or (), cells or (), strict=True):
             new.cell_contents = self._allowed(name, old.cell_contents)
         return built
 
     def _allowed(self, name: str, value: Any) -> Any:
-        """The value itself where it is harmless, built anew where it is the policy's own function, or forbidden."""
+        """The value itself if it is harmless, a confined copy of the policy's own function, or a forbidden placeholder."""
         if isinstance(value, types.ModuleType):
-            return _module(value)
+            return self._module(value)
         home: str = getattr(value, "__module__", None) or type(value).__module__
-        if home == KEYED_RANDOMNESS or (home in _ONLY and name in _ONLY[home]):
+        if home in SHARED or (home in _ONLY and name in _ONLY[home]):
             return value
-        if _far(home):
+        if _is_forbidden(home):
             return _Forbidden(f"{home}.{name}")
-        own = home.split(".")[0] == "policies" or home.split(".")[0] not in PURE
+        own = home.split(".")[0] not in ALLOWED
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):
             return self.function(value)
         return value
 
+    def _module(self, module: types.ModuleType) -> Any:
+        home = module.__name__
+        if home in _EXCEPT or home in _ONLY:
+            return _Part(module)
+        if is_users(home) or home == "sortie":  # the public API: each name is judged by where it is at home
+            return _OwnModule(module, self._allowed)
+        return _Forbidden(home) if _is_forbidden(home) else module
+
+    def _builtins(self, own: Any) -> dict[str, Any]:
+        """Builtins for the functions of a module that has `own`; its imports find what they find without confinement."""
+        find = own["__import__"] if isinstance(own, dict) else __import__
+
+        def importing(name: str, *rest: Any) -> Any:
+            if _is_forbidden(name) and name not in _ONLY:
+                raise Reached(name)
+            return self._module(find(name, *rest))
+
+        kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
+        return kept | {"__import__": importing}
+
 
 _FROZEN = ("__setattr__", "__delattr__")
-"""What `dataclass` writes into a frozen class; they ask for the class's own type."""
+"""Methods that `dataclass` adds to a frozen class; they use `type`."""
 
 
-def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
-    """Whether a policy's own code, or what it names outside installed packages, names a builtin such as `type`."""
+def uses_builtin(policy: Callable[..., Any], builtin: object) -> bool:
+    """Whether a policy's own code, or user code that it refers to, uses a builtin such as `type`."""
     met: dict[int, object] = {}
     waiting: list[Any] = [policy]
     while waiting:
@@ -159,7 +195,7 @@ def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
         elif isinstance(value, types.MethodType):
             waiting += [value.__func__, value.__self__]
         elif isinstance(value, types.FunctionType):
-            waiting += _named_by(value) if _is_own(value.__module__) else ()
+            waiting += _references(value) if _is_own(value.__module__) else ()
         elif isinstance(value, staticmethod | classmethod):
             waiting.append(value.__func__)
         elif isinstance(value, property):
@@ -174,8 +210,8 @@ def looks_up(policy: Callable[..., Any], builtin: object) -> bool:
     return False
 
 
-def _named_by(found: types.FunctionType) -> list[Any]:
-    """What a function names: globals and builtins, parts of its modules, what it closes over, its defaults."""
+def _references(found: types.FunctionType) -> list[Any]:
+    """What a function refers to: globals and builtins, attributes of its modules, closure variables, defaults."""
     names, parts, codes = set(), set(), [found.__code__]
     for code in codes:  # grows
         codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
@@ -197,41 +233,19 @@ def _named_by(found: types.FunctionType) -> list[Any]:
 
 
 def _is_own(home: str | None) -> bool:
-    """Whether a module is neither Python's nor an installed package's."""
+    """Whether a module is user code: neither the standard library's nor an installed package's."""
     file = getattr(sys.modules.get(home or ""), "__file__", None) or ""
     return (home or "").split(".")[0] not in sys.stdlib_module_names and "site-packages" not in file
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Names that a function, or one inside it, may look up."""
+    """Names that a function, or a function inside it, may use."""
     inner = [_names(c) for c in code.co_consts if isinstance(c, types.CodeType)]
     return set(code.co_names).union(*inner)
 
 
-def _module(module: types.ModuleType) -> Any:
-    home = module.__name__
-    if home in _BUT or home in _ONLY:
-        return _Part(module)
-    return _Forbidden(home) if _far(home) else module
-
-
-def _far(home: str) -> bool:
-    """Whether a module sees more than it is handed: another room, or the part of Python's library that does."""
+def _is_forbidden(home: str) -> bool:
+    """Whether a policy may not use a module: another room, or a part of the standard library that uses more than its arguments."""
     parts = home.split(".")
     root = ".".join(parts[: 2 if parts[0] == "sortie" else 1])
-    return root not in PURE and (root in FAR or root in sys.stdlib_module_names) and home != KEYED_RANDOMNESS
-
-
-def _import(name: str, *rest: Any) -> Any:
-    """What `import` inside a policy's function finds."""
-    if _far(name) and name not in _ONLY:
-        raise Reached(name)
-    importlib.import_module(name)
-    found = __import__(name, *rest)
-    return _module(found)
-
-
-@functools.cache
-def _builtins() -> dict[str, Any]:
-    kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
-    return kept | {"__import__": _import}
+    return root not in ALLOWED and (root in FORBIDDEN or root in sys.stdlib_module_names) and home not in SHARED

@@ -1,10 +1,10 @@
-"""The conformance kit: what every policy must keep, tried on drawn views; no policy is exempt.
+"""The conformance kit: rules that every policy must keep, tested on drawn views. No policy is exempt.
 
     checks = conform(my_policy)
     assert all(c.holds for c in checks)
 
-A rule is a function of a policy and a view that returns a complaint, or None where the policy keeps it. A rule
-that fails comes with the smallest view found on which it fails.
+A rule is a function of a policy and a view. It returns a complaint, or None if the policy keeps the rule. A check that
+fails has the smallest failing view that was found.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import contextlib
 import inspect
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -27,55 +27,55 @@ from sortie.policies.contract import (
     PolicyError,
     check_directives,
     check_reposition,
-    kind_fault,
+    find_wrong_type,
 )
 from sortie.policies.registry import viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
-from sortie.policies.verification.views import draw_view, draw_views, smaller
+from sortie.policies.verification.views import draw_view, draw_views, shrink
 
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)
 DECISION_LIMIT_S = 0.010
-"""A tenth of a frame at 10 Hz, at 20 drones: generous, since machines differ; the figure itself is reported."""
+"""A tenth of a frame at 10 Hz, at 20 drones. The limit is generous, because machines differ; the time is reported."""
 _STALE_PERIODS = 20.0  # beyond the plane's ten, at which a peer is detached
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One rule's verdict on one policy."""
+    """The verdict of one rule on one policy."""
 
     name: str
     holds: bool
     what: str
-    """The complaint where it fails, otherwise what was tried."""
+    """The complaint if the rule fails, otherwise what was tested."""
     counterexample: FleetView | None = None
-    """The smallest failing view found; None where the rule holds or needs no view."""
+    """The smallest failing view found; None if the rule holds or needs no view."""
 
 
 Rule = Callable[[Policy, FleetView], str | None]
 
 
 class _Raised(Exception):
-    """The policy itself raised, or gave no directives; `answers` and `bounds kept` report it, no other rule does."""
+    """The policy itself raised, or returned no directives. Only the rules `returns directives` and `bounds kept` report it."""
 
 
 def conform(
     policy: Policy, views: Iterable[FleetView] | None = None, *, seed: int = 0, count: int = VIEWS
 ) -> list[Check]:
-    """Hold a policy to every rule of the kit.
+    """Check a policy against every rule of the kit.
 
     Args:
-        policy: any callable of the contract's shape; a keyword parameter `rho` is taken for its budget.
-        views: what to try it on; left out, the first `count` views of `seed`.
+        policy: any callable of the contract; a keyword parameter `rho` is its budget.
+        views: the views to test it on; without them, the first `count` views of `seed`.
         seed: of the drawn views.
         count: how many.
 
     Returns:
-        One check a rule, always in the same order; a rule that no view could judge does not hold.
+        One check for each rule, always in the same order. A rule that no view could check does not hold.
     """
     tried = list(draw_views(seed, count) if views is None else views)
-    checks = [_judge(name, rule, policy, tried) for name, rule in RULES.items()]
+    checks = [_check_rule(name, rule, policy, tried) for name, rule in RULES.items()]
     return [*checks, _decides_in_time(policy)]
 
 
@@ -84,7 +84,7 @@ def failing(checks: Sequence[Check]) -> list[Check]:
     return [c for c in checks if not c.holds]
 
 
-def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
+def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
     def complaint(view: FleetView) -> str | None:
         try:
             return rule(policy, _copied(view))
@@ -99,33 +99,35 @@ def _judge(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) ->
             continue
         judged += 1
         if found is not None:
-            small = smaller(view, lambda v: complaint(v) is not None)
+            small = shrink(view, lambda v: complaint(v) is not None)
             return Check(name, False, complaint(small) or found, small)
     return Check(
-        name, judged > 0, f"{judged} views" if judged else "could be judged on no view: see answers, bounds kept"
+        name,
+        judged > 0,
+        f"{judged} views" if judged else "no view could be checked: see returns directives, bounds kept",
     )
 
 
 # --- the rules -----------------------------------------------------------------------------------
 
 
-def _ask(policy: Policy, view: FleetView) -> list[Directive]:
-    """What the policy decides on a copy of the view: one that changes its input spoils no other rule."""
-    directives = _answer(policy, view)
-    if any(kind_fault(d) is not None for d in directives):
+def _decide(policy: Policy, view: FleetView) -> list[Directive]:
+    """The policy's directives for a copy of the view, so that a policy that changes its input affects no other rule."""
+    directives = _decide_unchecked(policy, view)
+    if any(find_wrong_type(d) is not None for d in directives):
         raise _Raised
     return directives
 
 
-def _answer(policy: Policy, view: FleetView) -> list[Directive]:
-    """The same, whatever its directives are made of."""
+def _decide_unchecked(policy: Policy, view: FleetView) -> list[Directive]:
+    """The same, without a check of the directives' types."""
     try:
         return list(policy(_copied(view)))
     except Exception as error:
         raise _Raised from error
 
 
-def _answers(policy: Policy, view: FleetView) -> str | None:
+def _returns_a_sequence(policy: Policy, view: FleetView) -> str | None:
     try:
         answer = policy(view)
     except Exception as error:
@@ -137,25 +139,30 @@ def _answers(policy: Policy, view: FleetView) -> str | None:
 
 def _keeps_bounds(policy: Policy, view: FleetView) -> str | None:
     try:
-        check_directives(_answer(policy, view), view)
+        check_directives(_decide_unchecked(policy, view), view)
     except PolicyError as error:
         return str(error)
     return None
 
 
-def _one_a_link(policy: Policy, view: FleetView) -> str | None:
-    decided = sorted(d.destination for d in _ask(policy, view))
-    return None if decided == list(view.peers) else f"directives for {decided}, must be for each of {list(view.peers)}"
+def _one_directive_per_link(policy: Policy, view: FleetView) -> str | None:
+    return missing_links(_decide(policy, view), view)
 
 
-def _says_why(policy: Policy, view: FleetView) -> str | None:
-    silent = [f"{d.source}→{d.destination}" for d in _ask(policy, view) if not d.reason]
+def missing_links(directives: Iterable[Directive], view: FleetView) -> str | None:
+    """A complaint if the directives are not exactly one for each peer."""
+    decided, peers = sorted(d.destination for d in directives), list(view.peers)
+    return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
+
+
+def _gives_reasons(policy: Policy, view: FleetView) -> str | None:
+    silent = [f"{d.source}→{d.destination}" for d in _decide(policy, view) if not d.reason]
     return f"no reason given for {', '.join(silent)}" if silent else None
 
 
-def _leaves_its_input(policy: Policy, view: FleetView) -> str | None:
+def _keeps_its_input(policy: Policy, view: FleetView) -> str | None:
     before = _copied(view)
-    with contextlib.suppress(Exception):  # one that raises half-way may have changed it all the same
+    with contextlib.suppress(Exception):  # a policy that raises may have changed its input before
         policy(view)
     if view == before and list(view.descriptors) == list(before.descriptors) and list(view.age_s) == list(before.age_s):
         return None
@@ -163,36 +170,36 @@ def _leaves_its_input(policy: Policy, view: FleetView) -> str | None:
     return f"the policy changed its input: {', '.join(changed) or 'the order of drones'}"
 
 
-def _same_in_same_out(policy: Policy, view: FleetView) -> str | None:
-    first = _spelt(_ask(policy, view))
-    if _spelt(_ask(policy, view)) != first:
+def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
+    first = _as_tuples(_decide(policy, view))
+    if _as_tuples(_decide(policy, view)) != first:
         return "two calls with the same view differ"
-    _ask(policy, draw_view(1, 0))
-    return None if _spelt(_ask(policy, view)) == first else "differs after another view: it remembers"
+    _decide(policy, draw_view(1, 0))
+    return None if _as_tuples(_decide(policy, view)) == first else "differs after another view: it has a memory"
 
 
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
-    usual = _spelt(_ask(policy, view))
+    usual = _as_tuples(_decide(policy, view))
     try:
-        alone = _spelt(_ask(confined(policy), view))
+        alone = _as_tuples(_decide(confined(policy), view))
     except Reached as error:
         return str(error)
-    return None if alone == usual else "decides otherwise where only its view is in reach"
+    return None if alone == usual else "decides differently if it can only use its view"
 
 
 def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
-    usual = _by_peer(_ask(policy, view))
+    usual = _by_peer(_decide(policy, view))
     ids = list(view.descriptors)
     for order in (ids[::-1], sorted(ids), ids[1:] + ids[:1]):
         other = view._replace(
             descriptors={i: view.descriptors[i] for i in order}, age_s={i: view.age_s[i] for i in order}
         )
-        if _by_peer(_ask(policy, other)) != usual:
+        if _by_peer(_decide(policy, other)) != usual:
             return f"drones in the order {order} get other directives than in the order {ids}"
     return None
 
 
-def _alone_and_empty(policy: Policy, view: FleetView) -> str | None:
+def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
     alone = {i: d for i, d in view.descriptors.items() if i == view.ego}
     for few in (
         view._replace(descriptors=alone, age_s={i: view.age_s[i] for i in alone}),
@@ -207,7 +214,7 @@ def _alone_and_empty(policy: Policy, view: FleetView) -> str | None:
     return None
 
 
-def _stands_stale(policy: Policy, view: FleetView) -> str | None:
+def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
     stale = view._replace(age_s=dict.fromkeys(view.age_s, _STALE_PERIODS * view.period_s))
     try:
         check_directives(list(policy(stale)), stale)
@@ -217,23 +224,28 @@ def _stands_stale(policy: Policy, view: FleetView) -> str | None:
 
 
 def age_monotone(policy: Policy, view: FleetView) -> str | None:
-    """The plane's second rule: raising any descriptor's age raises no directive's fidelity or rate.
+    """The plane's second rule: an older descriptor raises no directive's representation, budget or rate.
 
-    Each descriptor's age is raised by itself, and all together, to beyond each of the plane's two thresholds.
+    Each descriptor's age is raised by itself, and all together, beyond each of the plane's two thresholds.
     """
-    before = _ask(policy, view)
-    for periods in (1.0, 3.5, 10.5, 1000.0):
-        add_s = periods * view.period_s
-        for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
-            older = view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
-            raised = raised_part(before, _ask(policy, older))
-            if raised is not None:
-                return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
+    before = _decide(policy, view)
+    for who, add_s, older in older_views(view):
+        raised = raised_part(before, _decide(policy, older))
+        if raised is not None:
+            return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
     return None
 
 
+def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
+    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view."""
+    for periods in (1.0, 3.5, 10.5, 1000.0):
+        add_s = periods * view.period_s
+        for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
+            yield who, add_s, view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
+
+
 def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str | None:
-    """The first directive of `after` that is above its link's in `before` in rung, budget (at one rung) or rate."""
+    """The first directive of `after` with a higher representation, budget (of the same representation) or rate than `before`."""
     usual = _by_peer(before)
     for d in after:
         old = usual.get(d.destination)
@@ -253,71 +265,73 @@ def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
     parameter = inspect.signature(policy).parameters.get("rho")
     if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
-        _ask(policy, view)
+        _decide(policy, view)
         return None
     takes_rho: Callable[..., Any] = policy
     for rho in BUDGETS:
         bound = partial(takes_rho, rho=rho)
-        spent, allowed = sum(d.rho for d in _ask(bound, view)), rho * len(view.peers)
+        spent, allowed = sum(d.rho for d in _decide(bound, view)), rho * len(view.peers)
         if not spent <= allowed * (1 + _ROUNDING):
-            return f"rho={rho:g}: its links sum to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
+            return f"rho={rho:g}: its links add up to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
     return None
 
 
-def _looks(policy: Policy, view: FleetView) -> str | None:
-    """A viewpoint keeps what directives keep: bounds, its input, no memory, no order of drones, nothing but its view."""
-    look = viewpoint_of(policy)
-    if look is None:
-        _ask(policy, view)
+def _viewpoint_keeps_rules(policy: Policy, view: FleetView) -> str | None:
+    """A viewpoint keeps the same rules: bounds, input unchanged, no memory, any order of drones, nothing but its view."""
+    viewpoint = viewpoint_of(policy)
+    if viewpoint is None:
+        _decide(policy, view)
         return None
     shown, alone = _copied(view), {i: d for i, d in view.descriptors.items() if i == view.ego}
     try:
-        asked = look(shown)
-        check_reposition(asked, view)
+        request = viewpoint(shown)
+        check_reposition(request, view)
         if shown != view:
             return "its viewpoint changed its input"
         others = {
-            "two calls with the same view differ": look(_copied(view)),
-            "drones in another order get another place": look(view._replace(descriptors=_turned(view.descriptors))),
-            "decides otherwise where only its view is in reach": confined(look)(view),
+            "two calls with the same view differ": viewpoint(_copied(view)),
+            "drones in another order get another place": viewpoint(
+                view._replace(descriptors=_reversed(view.descriptors))
+            ),
+            "decides differently if it can only use its view": confined(viewpoint)(view),
         }
         for few in (alone, {}):
             fewer = view._replace(descriptors=few, age_s={i: view.age_s[i] for i in few})
-            check_reposition(look(fewer), fewer)
+            check_reposition(viewpoint(fewer), fewer)
     except PolicyError as error:
         return str(error)
     except Reached as error:
         return f"its viewpoint {error}"
     except Exception as error:
         return f"its viewpoint raises {type(error).__name__}: {error}"
-    return next((f"its viewpoint: {what}" for what, other in others.items() if other != asked), None)
+    return next((f"its viewpoint: {what}" for what, other in others.items() if other != request), None)
 
 
-def _turned(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
-    """The same in the opposite order."""
+def _reversed(descriptors: Mapping[int, Descriptor]) -> dict[int, Descriptor]:
+    """The same descriptors in the opposite order."""
     return dict(reversed(list(descriptors.items())))
 
 
 RULES: dict[str, Rule] = {
-    "answers": _answers,
+    "returns directives": _returns_a_sequence,
     "bounds kept": _keeps_bounds,
-    "one directive a link": _one_a_link,
-    "says why": _says_why,
-    "input unchanged": _leaves_its_input,
-    "same in, same out": _same_in_same_out,
+    "one directive per link": _one_directive_per_link,
+    "gives reasons": _gives_reasons,
+    "input unchanged": _keeps_its_input,
+    "deterministic": _is_deterministic,
     "reads only its view": _reads_only_its_view,
     "order of drones irrelevant": _order_is_irrelevant,
-    "one drone and empty views": _alone_and_empty,
-    "stale views": _stands_stale,
+    "one drone and empty views": _accepts_small_views,
+    "stale views": _accepts_stale_views,
     "age-monotone": age_monotone,
     "budget kept": _keeps_budget,
-    "viewpoint kept": _looks,
+    "viewpoint kept": _viewpoint_keeps_rules,
 }
-"""The kit's rules by name; a policy without a parameter `rho` has no budget to break."""
+"""The kit's rules by name. A policy without a parameter `rho` always keeps `budget kept`."""
 
 
 def _decides_in_time(policy: Policy) -> Check:
-    """CPU time of a decision, the median of many, at 5 and at 20 drones."""
+    """Median CPU time of a decision, at 5 and at 20 drones."""
     name, took_s = "time per decision", {}
     for drones in (5, 20):
         view = full_view(drones)
@@ -337,7 +351,7 @@ def _decides_in_time(policy: Policy) -> Check:
 
 
 def full_view(drones: int) -> FleetView:
-    """A view of so many drones, all heard, in drawn states: what decisions are timed on."""
+    """A view of this many drones, all heard, in drawn states, for measuring the time of a decision."""
     drawn = next(v for v in draw_views(2, 10_000) if len(v.descriptors) >= 3)
     some = list(drawn.descriptors.values())
     descriptors = {
@@ -347,12 +361,12 @@ def full_view(drones: int) -> FleetView:
 
 
 def _copied(view: FleetView) -> FleetView:
-    """The view with mappings of its own; all below them is immutable."""
+    """The view with new mappings; everything in them is immutable."""
     return view._replace(descriptors=dict(view.descriptors), age_s=dict(view.age_s))
 
 
-def _spelt(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
-    return [tuple(d) for d in directives]  # with the reasons, which equality leaves out
+def _as_tuples(directives: Iterable[Directive]) -> list[tuple[object, ...]]:
+    return [tuple(d) for d in directives]  # with the reasons, which `==` ignores
 
 
 def _by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:

@@ -1,15 +1,15 @@
-"""Invariants: what must hold of a policy's directives whatever the view, as short lines of text.
+"""Invariants: conditions that a policy's directives must satisfy for every view, as short lines of text.
 
     when battery < 0.3: representation <= detections and rate_hz <= 2
     when target_in_region and peers >= 1: any_link(representation >= detections)
     rate_hz <= fresh.rate_hz
 
 A line is `REQUIREMENT`, or `when CONDITION: REQUIREMENT`; `#` begins a comment. An expression has comparisons,
-`and`, `or`, `not`, `+ - * /`, numbers, and the words of `WORDS`. One that speaks of a link must hold for each
-outgoing link; `any_link(…)`, `every_link(…)`, `count_links(…)` and `sum_links(…)` speak of all of them at once.
-`fresh.rate_hz` is what the same policy decides for the same link were every descriptor just heard (age 0).
+`and`, `or`, `not`, `+ - * /`, numbers, and the names in `WORDS`. A line that names a property of a link must hold for
+each outgoing link. `any_link(…)`, `every_link(…)`, `count_links(…)` and `sum_links(…)` cover all links at once.
+`fresh.rate_hz` is what the same policy decides for the same link if every descriptor has age 0.
 
-Python's parser reads the text and an allow-list of its nodes becomes a frozen tree; nothing is ever executed.
+Python's parser reads the text. An allow-list of its nodes becomes a frozen tree. Nothing is ever executed.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from typing import Any, Literal, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.representation import NAME_OF
 
 Kind = Literal["number", "truth"]
 
 
 class InvariantError(SortieError):
-    """An invariant's text is not one; the message names the line and what it stumbled over."""
+    """A text that is not an invariant; the message names the line and the part that is wrong."""
 
 
 # --- the words -----------------------------------------------------------------------------------
 
 
 class Scope(NamedTuple):
-    """What an expression is about: a view, all its directives, and one link of them where it speaks of a link."""
+    """The values that an expression is evaluated on: a view, all its directives, and one link if the line needs a link."""
 
     view: FleetView
     me: Descriptor
@@ -43,7 +44,7 @@ class Scope(NamedTuple):
 
 
 class Word(NamedTuple):
-    """A name of the language; `of_link` where it needs a link."""
+    """A name of the language; `of_link` if it needs a link."""
 
     about: str
     kind: Kind
@@ -77,7 +78,7 @@ DECISIONS: dict[str, Word] = {
     "duty": _decided("share of frames in which perception runs, 0 … 1", lambda d: d.duty_percent / 100),
     "roi": _decided("whether it is confined to a region", lambda d: d.roi is not None, "truth"),
 }
-"""What a directive says of its link."""
+"""The fields of a directive, as names of the language."""
 
 WORDS: dict[str, Word] = {
     "battery": _view_word("the ego's state of charge, 0 … 1", lambda s: s.me.battery_soc),
@@ -98,13 +99,13 @@ WORDS: dict[str, Word] = {
     "peer_battery": _of_peer("the peer's state of charge, 0 … 1", lambda s, p: s.view.descriptors[p].battery_soc),
     **DECISIONS,
 }
-"""Every name an invariant may use."""
+"""Every name that an invariant may use."""
 
-CONSTANTS: dict[str, int] = {r.name.lower(): int(r) for r in Representation} | {
+CONSTANTS: dict[str, int] = {name: int(r) for r, name in NAME_OF.items()} | {
     "transit": TaskPhase.TRANSIT,
     "search": TaskPhase.SEARCH,
     "track": TaskPhase.TRACK,
-    "returning": TaskPhase.RETURN,  # `return` is a word of Python's
+    "returning": TaskPhase.RETURN,  # `return` is a Python keyword
     "landing": TaskPhase.LANDING,
 }
 LINK_FUNCTIONS: dict[str, tuple[Kind, Kind]] = {
@@ -113,7 +114,7 @@ LINK_FUNCTIONS: dict[str, tuple[Kind, Kind]] = {
     "count_links": ("truth", "number"),
     "sum_links": ("number", "number"),
 }
-"""Functions over all links: the kind of what stands in the brackets, and of what comes out."""
+"""Functions over all links: the kind of the argument, and of the result."""
 
 
 # --- the tree ------------------------------------------------------------------------------------
@@ -131,7 +132,7 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class Fresh:
-    """The same decision, were every descriptor just heard."""
+    """The same field, as decided if every descriptor has age 0."""
 
     word: str
 
@@ -185,7 +186,7 @@ _SIGNS: dict[type[ast.AST], str] = {
 
 @dataclass(frozen=True, slots=True)
 class Invariant:
-    """One line: where `when` is true (None: always), `then` must be."""
+    """One line: if `when` is true (None: always), `then` must be true."""
 
     text: str
     when: Node | None
@@ -193,23 +194,23 @@ class Invariant:
 
     @property
     def of_link(self) -> bool:
-        """Whether it must hold for each link by itself."""
-        return any(_speaks_of_link(n) for n in (self.when, self.then) if n is not None)
+        """Whether it must hold for each link separately."""
+        return any(_needs_link(n) for n in (self.when, self.then) if n is not None)
 
     @property
     def needs_fresh(self) -> bool:
-        """Whether it compares with what the policy decides at age 0."""
+        """Whether it compares with the policy's decision at age 0."""
         return any(isinstance(n, Fresh) for top in (self.when, self.then) if top is not None for n in walk(top))
 
 
 def walk(node: Node) -> Iterator[Node]:
     """The node and all below it."""
     yield node
-    for below in _below(node):
+    for below in _children(node):
         yield from walk(below)
 
 
-def _below(node: Node) -> tuple[Node, ...]:
+def _children(node: Node) -> tuple[Node, ...]:
     match node:
         case Binary():
             return (node.left, node.right)
@@ -221,21 +222,21 @@ def _below(node: Node) -> tuple[Node, ...]:
             return ()
 
 
-def _speaks_of_link(node: Node) -> bool:
+def _needs_link(node: Node) -> bool:
     if isinstance(node, LinksTerm):
         return False  # it binds the link itself
     if isinstance(node, Fresh):
         return True
     if isinstance(node, Name):
         return node.word in WORDS and WORDS[node.word].of_link
-    return any(_speaks_of_link(below) for below in _below(node))
+    return any(_needs_link(below) for below in _children(node))
 
 
 # --- from text -----------------------------------------------------------------------------------
 
 
 def parse(text: str) -> tuple[Invariant, ...]:
-    """Invariants of a text, one a line.
+    """The invariants in a text, one on each line.
 
     Raises:
         InvariantError: naming the line and what is wrong with it.
@@ -259,25 +260,25 @@ def _parse_line(line: str) -> Invariant:
         condition, colon, requirement = line.removeprefix("when ").partition(":")
         if not colon:
             raise InvariantError("a condition ends with a colon, as in `when battery < 0.3: rate_hz <= 2`")
-        when = _truth(condition)
-    return Invariant(line, when, _truth(requirement))
+        when = _parse_expression(condition)
+    return Invariant(line, when, _parse_expression(requirement))
 
 
-def _truth(text: str) -> Node:
+def _parse_expression(text: str) -> Node:
     try:
         tree = ast.parse(text.strip(), mode="eval").body
-        node = _node(tree)
+        node = _to_node(tree)
     except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
         if isinstance(error, InvariantError):
             raise
-        raise InvariantError(f"{text.strip()!r} is no expression") from None
+        raise InvariantError(f"{text.strip()!r} is not an expression") from None
     if _kind(node) != "truth":
         raise InvariantError(f"{text.strip()!r} is a number, must be true or false")
     return node
 
 
-def _node(tree: ast.expr) -> Node:
-    """The allow-list: what is not named here is refused."""
+def _to_node(tree: ast.expr) -> Node:
+    """The tree of an expression, by an allow-list: everything else is refused."""
     match tree:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return Number(value)
@@ -290,29 +291,31 @@ def _node(tree: ast.expr) -> Node:
         case ast.Attribute(value=ast.Name(id="fresh"), attr=word) if word in DECISIONS:
             return Fresh(word)
         case ast.UnaryOp(op=ast.Not(), operand=operand):
-            return Logic("not", (_of_kind("truth", operand),))
+            return Logic("not", (_to_node_of_kind("truth", operand),))
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return Binary("-", Number(0), _of_kind("number", operand))
+            return Binary("-", Number(0), _to_node_of_kind("number", operand))
         case ast.BoolOp(op=op, values=values):
-            return Logic("and" if isinstance(op, ast.And) else "or", tuple(_of_kind("truth", v) for v in values))
+            return Logic(
+                "and" if isinstance(op, ast.And) else "or", tuple(_to_node_of_kind("truth", v) for v in values)
+            )
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
-            return Binary(_SIGNS[type(op)], _of_kind("number", left), _of_kind("number", right))
+            return Binary(_SIGNS[type(op)], _to_node_of_kind("number", left), _to_node_of_kind("number", right))
         case ast.Compare(left=first, ops=ops, comparators=rest) if all(type(op) in _SIGNS for op in ops):
-            sides = [_of_kind("number", side) for side in (first, *rest)]
+            sides = [_to_node_of_kind("number", side) for side in (first, *rest)]
             pairs = [
                 Binary(_SIGNS[type(op)], left, right) for op, left, right in zip(ops, sides, sides[1:], strict=False)
             ]
             return pairs[0] if len(pairs) == 1 else Logic("and", tuple(pairs))
         case ast.Call(func=ast.Name(id=function), args=[body], keywords=[]) if function in LINK_FUNCTIONS:
-            inner = _of_kind(LINK_FUNCTIONS[function][0], body)
+            inner = _to_node_of_kind(LINK_FUNCTIONS[function][0], body)
             if any(isinstance(n, LinksTerm) for n in walk(inner)):
-                raise InvariantError(f"{function}(…) holds another function over links")
+                raise InvariantError(f"{function}(…) has another function over links inside")
             return LinksTerm(function, inner)
-    raise InvariantError(f"{ast.unparse(tree)!r} has no place in an invariant")
+    raise InvariantError(f"{ast.unparse(tree)!r} is not allowed in an invariant")
 
 
-def _of_kind(kind: Kind, tree: ast.expr) -> Node:
-    node = _node(tree)
+def _to_node_of_kind(kind: Kind, tree: ast.expr) -> Node:
+    node = _to_node(tree)
     if _kind(node) != kind:
         wanted = "a number" if kind == "number" else "true or false"
         raise InvariantError(f"{ast.unparse(tree)!r} must be {wanted}")
@@ -339,13 +342,13 @@ def _kind(node: Node) -> Kind:
 def violations(
     invariant: Invariant, view: FleetView, directives: Sequence[Directive], fresh: Sequence[Directive] = ()
 ) -> list[Directive | None]:
-    """The directives that break an invariant; [None] where it is broken as a whole.
+    """The directives that break an invariant; [None] if they only break it together.
 
     Args:
         invariant: the line.
-        view: what the policy saw.
-        directives: what it decided.
-        fresh: what it decides on the same view at age 0, for invariants that ask.
+        view: the policy's input.
+        directives: its output.
+        fresh: its output for the same view at age 0, if the invariant needs it.
     """
     me = view.me
     if me is None:
@@ -391,8 +394,8 @@ def evaluate(node: Node, scope: Scope) -> Any:
             return sum(1 if v else 0 for v in links) if node.function == "count_links" else sum(links)
 
 
-def complaint(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
-    """What a policy breaks on a view, in words; None where it keeps every invariant."""
+def find_violation(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
+    """The first invariant that a policy breaks on a view, as text; None if it keeps all."""
     directives = list(policy(view))
     fresh: list[Directive] | None = None
     for invariant in invariants:
@@ -402,7 +405,7 @@ def complaint(invariants: Iterable[Invariant], policy: Policy, view: FleetView) 
             where = (
                 "the directives break" if broken is None else f"directive {broken.source}→{broken.destination} breaks"
             )
-            return f"{where} {invariant.text!r}: {spelt(directives if broken is None else [broken])}"
+            return f"{where} {invariant.text!r}: {describe_directives(directives if broken is None else [broken])}"
     return None
 
 
@@ -411,10 +414,10 @@ def just_heard(view: FleetView) -> FleetView:
     return view._replace(age_s=dict.fromkeys(view.age_s, 0.0))
 
 
-def spelt(directives: Iterable[Directive]) -> str:
-    """Directives in a few words each."""
+def describe_directives(directives: Iterable[Directive]) -> str:
+    """A short text for each directive."""
     return "; ".join(
-        f"→{d.destination} {Representation(d.representation).name.lower()} ρ {d.rho:g} {d.rate_hz:g} Hz "
+        f"→{d.destination} {NAME_OF[Representation(d.representation)]} ρ {d.rho:g} {d.rate_hz:g} Hz "
         f"duty {d.duty_percent} % ({d.reason})"
         for d in directives
     )

@@ -1,4 +1,4 @@
-"""What the registered rule policies promise, as invariants; `sortie verify NAME` proves them."""
+"""Invariants of the registered policies; `sortie verify NAME` proves them."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ PROMISES: dict[str, str] = {
     """,
     "silence": "representation == none",
 }
-"""By the policy's name; one that promises nothing of its own is held to the plane's properties alone."""
+"""Invariants by the policy's name. A policy without an entry is checked for the plane's properties alone."""

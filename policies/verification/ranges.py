@@ -1,4 +1,4 @@
-"""A fleet's view whose fields are ranges, for the search of `sortie.policies.verification.proof`, and a plain view of any of its cells."""
+"""Views with ranges as fields, for the search of `sortie.policies.verification.proof`, and plain examples of their cells."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
-from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, TaskPhase
 from sortie.policies.geometry import circle_overlap, peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
-from sortie.policies.verification.views import GRID_BYTES
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8
-"""Bits of a descriptor's novelty flags; the plane itself uses two."""
-_HIGHEST: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
+"""The bits of a descriptor's novelty flags; the plane uses two of them."""
+_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
 
 class FleetOfRanges:
@@ -33,24 +32,24 @@ class FleetOfRanges:
         return FleetView(self.ego, self.period_s, descriptors, ages)
 
     def _age(self, i: int) -> Ranged:
-        return self.path.number(f"age_s of drone {i}", 0.0, _HIGHEST["age"])
+        return self.path.number(f"age_s of drone {i}", 0.0, _SEARCHED_UP_TO["age"])
 
     def older_view(self) -> FleetView:
-        """The view at ages not below this cell's: each at least the lowest age of the cell reached so far.
+        """The view with ages of at least the lowest ages of the cell reached so far.
 
-        Exact, not an approximation: within the cell the policy decides the same, so that its lowest age stands
-        for it, and every age from there on is a raise of that one.
+        This is exact. Within the cell the policy decides the same, so the lowest age represents the cell, and every
+        age above it is a raise of it.
         """
         self._older = True
         ages: dict[int, Any] = {}
         for i in self.heard:
             self._age(i)
             low, _ = self.path.ranges[f"age_s of drone {i}"]
-            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _HIGHEST["age"])
+            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _SEARCHED_UP_TO["age"])
         return self.view()._replace(age_s=ages)
 
     def example(self) -> FleetView:
-        """A plain view of the cell: usual values where they lie in it, otherwise round ones."""
+        """A plain view of the cell, with usual values if they lie in it, otherwise with round ones."""
         path = self.path
 
         def number(axis: str, usual: float) -> float:
@@ -77,7 +76,7 @@ class FleetOfRanges:
                 peer_goodput_mbps=tuple(
                     number(f"goodput of drone {i} to slot {slot}", 100.0) for slot in range(self.drones - 1)
                 ),
-                coverage_grid=bytes(GRID_BYTES),
+                coverage_grid=bytes(COVERAGE_BYTES),
                 novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
                 task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
@@ -89,12 +88,12 @@ class FleetOfRanges:
         ages = {}
         for i in self.heard:
             low, high = self.path.ranges.get(f"age_s of drone {i}", (0.0, 0.0))
-            # Where ages were raised it is the lowest age of the cell that they were raised from.
+            # If ages were raised, this is the lowest age of the cell, from which they were raised.
             ages[i] = low if self._older or low == 0.0 else _round_within(low, high)
         return ages
 
     def raised_example(self) -> dict[int, float] | None:
-        """The raised ages of the example, where the property raised any."""
+        """The raised ages of the example; None if the property raised none."""
         if not self._older:
             return None
         from_s = self._example_ages()
@@ -106,7 +105,7 @@ class FleetOfRanges:
 
 
 class DescriptorOfRanges:
-    """A descriptor whose fields are ranges, forked where they have no order, refused where they cannot be searched."""
+    """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched raise `Refused`."""
 
     def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
         self._system = system
@@ -129,7 +128,7 @@ class DescriptorOfRanges:
 
     @property
     def peer_goodput_mbps(self) -> tuple[Any, ...]:
-        path, me, high = self._system.path, self.agent_id, _HIGHEST["goodput"]
+        path, me, high = self._system.path, self.agent_id, _SEARCHED_UP_TO["goodput"]
         slots = range(self._system.drones - 1)
         return tuple(path.number(f"goodput of drone {me} to slot {slot}", 0.0, high) for slot in slots)
 
@@ -157,7 +156,7 @@ class DescriptorOfRanges:
 
     @property
     def priority_target_ids(self) -> Any:
-        return _Counted(self._number("targets", 0, 16), self._system.path)
+        return _TargetIds(self._number("targets", 0, 16), self._system.path)
 
     @property
     def position_m(self) -> tuple[float, float, float]:
@@ -171,7 +170,7 @@ class DescriptorOfRanges:
         return _FOOTPRINT_M
 
     def _only_for_order(self, field: str) -> None:
-        """Geometry is read through `peers_by_overlap` of the ego alone: then its order is all that a policy sees."""
+        """Geometry may only be read through `peers_by_overlap` of the ego, so that a policy sees the order of peers alone."""
         frame = sys._getframe(2)
         while frame is not None:
             if frame.f_code is peers_by_overlap.__code__:
@@ -179,10 +178,10 @@ class DescriptorOfRanges:
                     return
                 break
             frame = frame.f_back  # type: ignore[assignment]
-        self._system.path.refuse(f"reads {field} otherwise than through peers_by_overlap")
+        self._system.path.refuse(f"reads {field} without peers_by_overlap")
 
     def __getattr__(self, name: str) -> NoReturn:
-        self._system.path.refuse(f"reads {name}, which has no boundaries to search")
+        self._system.path.refuse(f"reads {name}, which cannot be searched")
 
     def __eq__(self, other: object) -> bool:
         return self is other or self.__getattr__("whole descriptors")
@@ -191,18 +190,18 @@ class DescriptorOfRanges:
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
-        return Descriptor  # as `isinstance` finds it in flight
+        return Descriptor  # so that `isinstance` gives the same result as in flight
 
 
 class _Flags:
-    """A byte of flags, forked bit by bit as they are asked for, and into all its values by whatever asks for more."""
+    """A byte of flags. A mask forks the run for the bits that it reads; any other use forks it for all bits."""
 
     def __init__(self, path: Path, agent_id: int) -> None:
         self._path, self._id = path, agent_id
 
     def _bits(self, mask: int) -> int:
-        asked = [bit for bit in range(_FLAGS) if mask >> bit & 1]
-        return sum(self._path.pick(_flag(bit, self._id), (0, 1 << bit)) for bit in asked)
+        read = [bit for bit in range(_FLAGS) if mask >> bit & 1]
+        return sum(self._path.pick(_flag(bit, self._id), (0, 1 << bit)) for bit in read)
 
     def __and__(self, mask: object) -> Any:
         return self._bits(mask) if isinstance(mask, int) else NotImplemented
@@ -217,24 +216,24 @@ class _Flags:
         return int
 
 
-def _of_all_bits(name: str) -> Callable[..., Any]:
+def _by_value(name: str) -> Callable[..., Any]:
     def operator(*operands: Any) -> Any:
         return getattr(int, name)(*(x._bits(-1) if type(x) is _Flags else x for x in operands))
 
     return operator
 
 
-_UNASKED = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
-for _asked in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _UNASKED:
-    setattr(_Flags, _asked, _of_all_bits(_asked))  # where Python looks for operators
+_OWN_METHODS = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
+for _method in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _OWN_METHODS:
+    setattr(_Flags, _method, _by_value(_method))  # where Python looks for operators
 
 
 def _flag(bit: int, agent_id: int) -> str:
     return f"novelty flag {bit} of drone {agent_id}"
 
 
-class _Counted:
-    """Target ids of which only the number is known."""
+class _TargetIds:
+    """Target ids with a known range of their number. The ids themselves are not known."""
 
     def __init__(self, count: Any, path: Path) -> None:
         self._count, self._path = count, path
@@ -249,7 +248,7 @@ class _Counted:
         return 16
 
     def _cannot(self, *_: object) -> NoReturn:
-        self._path.refuse("reads what the targets' ids are")
+        self._path.refuse("reads the ids of targets")
 
     __iter__ = __contains__ = __getitem__ = __eq__ = __hash__ = __getattr__ = _cannot
 
@@ -264,7 +263,7 @@ def _orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
 
 @lru_cache(maxsize=4096)
 def _places(ego: int, order: tuple[int, ...]) -> dict[int, tuple[float, float, float]]:
-    """Positions whose footprints overlap the ego's in that order, each a clear step less than the one before."""
+    """Positions with footprints that overlap the ego's in that order, each clearly less than the one before."""
     places = {ego: (0.0, 0.0, 60.0)}
     for rank, peer in enumerate(order):
         wanted = 0.95 - 0.9 * (rank + 1) / (len(order) + 1)

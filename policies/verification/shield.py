@@ -1,12 +1,11 @@
-"""A shield: a policy that keeps its invariants at run time, and says where it had to step in.
+"""A shield: wraps a policy so that it keeps its invariants at run time, and reports each intervention.
 
     decide = shield(worked, parse("when battery < 0.3: rate_hz <= 1"))
 
-A directive that breaks an invariant is replaced by the nearest one that keeps them all, and its reason begins with
-"shield:", so that the record shows each intervention at the gate and `interventions` counts them. Nearest means:
-fewest fields changed, then the least change, a rung counting as a quarter of the ladder and every number as its
-share of its bounds. The shield stands where the policy stands: staleness and damping come after it and may lower
-what it raised, and damping holds a raise back for the dwell time.
+A directive that breaks an invariant is replaced by the nearest one that keeps them all. Its reason then begins with
+"shield:", so the record shows each intervention and `interventions` counts them. Nearest means: fewest fields changed,
+then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds. The staleness
+rules and damping come after the shield. They may lower what it raised, and damping delays a raise by the dwell time.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from sortie.policies.contract import MAX_DEADLINE_S, MAX_RATE_HZ, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
 from sortie.policies.verification.invariants import (
     Binary,
     Invariant,
@@ -29,26 +28,28 @@ from sortie.policies.verification.invariants import (
     just_heard,
     walk,
 )
+from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
 _HIGHEST: dict[str, float] = {
-    "representation": 4, "rho": 1.0, "rate_hz": MAX_RATE_HZ, "deadline_s": MAX_DEADLINE_S, "fusion_weight": 1.0,
-    "duty": 1.0, "roi": 1.0,
-}  # fmt: skip
-_SUMS = ("sum_links", "count_links", "every_link")
+    **{name: bound.high for name, bound in DIRECTIVE_BOUNDS.items() if name != "duty_percent"},
+    "duty": 1.0,
+    "roi": 1.0,
+}
+_NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
 def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
-    """The policy, kept to its invariants; a pure function as the policy is, and shielding it again changes nothing.
+    """A policy that decides as the given one but keeps the invariants. It is as pure; shielding it again changes nothing.
 
-    Where no change of one link keeps an invariant (it contradicts another, or asks something of the view alone)
-    the directives stay as decided and each one's reason says so.
+    An invariant may contradict another one, or depend on the view alone. If no change of one link keeps it, the
+    directives stay as decided, and each one's reason states it.
 
     Raises:
-        InvariantError: an invariant sums or counts links: which of them should yield is not the shield's to say; nor
-            `every_link(…)`, which says the same as its requirement alone.
+        InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change; or
+            `every_link`, which means the same as its requirement alone.
     """
-    rules = checked(invariants)
+    rules = check_shieldable(invariants)
     asks_fresh = any(rule.needs_fresh for rule in rules)
 
     def shielded(view: FleetView, /) -> list[Directive]:
@@ -60,8 +61,8 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     return shielded
 
 
-def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
-    """The invariants, all of them such that a shield can keep them.
+def check_shieldable(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
+    """Check that a shield can keep these invariants, and return them.
 
     Raises:
         InvariantError: as `shield` does.
@@ -70,8 +71,10 @@ def checked(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
     for rule in rules:
         for top in (rule.when, rule.then):
             for node in () if top is None else walk(top):
-                if isinstance(node, LinksTerm) and node.function in _SUMS:
-                    raise InvariantError(f"{rule.text!r}: a shield cannot keep {node.function}(…), only prove it")
+                if isinstance(node, LinksTerm) and node.function in _NOT_SHIELDED:
+                    raise InvariantError(
+                        f"{rule.text!r}: a shield cannot keep {node.function}(…); `sortie verify` can only prove it"
+                    )
     return rules
 
 
@@ -83,13 +86,13 @@ def interventions(directives: Iterable[Directive]) -> int:
 def enforce(
     rules: Sequence[Invariant], view: FleetView, decided: Sequence[Directive], fresh: Sequence[Directive] = ()
 ) -> list[Directive]:
-    """The directives, with those that break a rule replaced by the nearest that keep all.
+    """The directives; those that break a rule are replaced by the nearest ones that keep all rules.
 
     Args:
-        rules: what must hold.
-        view: what the policy saw.
-        decided: what it decided.
-        fresh: what it decides at age 0, for rules that ask.
+        rules: the invariants.
+        view: the policy's input.
+        decided: its output.
+        fresh: its output at age 0, if a rule needs it.
     """
     me, directives = view.me, list(decided)
     if me is None:
@@ -97,59 +100,59 @@ def enforce(
     of_link = [rule for rule in rules if rule.of_link]
     scope = Scope(view, me, directives, {d.destination: d for d in fresh})
     for k, directive in enumerate(directives):
-        broken = [r for r in of_link if not _keeps(r, scope, directive)]
+        broken = [r for r in of_link if not _satisfies(r, scope, directive)]
         if broken:
-            directives[k] = _mended(scope, k, of_link, broken)
+            directives[k] = _nearest_valid(scope, k, of_link, broken)
     for rule in rules:
-        if not rule.of_link and not _keeps(rule, scope, None):
-            _mend_together(scope, directives, rule, of_link)
+        if not rule.of_link and not _satisfies(rule, scope, None):
+            _replace_one_link(scope, directives, rule, of_link)
     return directives
 
 
-def _keeps(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
+def _satisfies(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
     here = scope._replace(link=link)
     return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
 
 
-def _mended(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
-    """The nearest directive on this link that keeps every rule of links."""
+def _nearest_valid(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
+    """The nearest directive for this link that keeps every rule about links."""
     before = scope.directives[k]
-    for _, after in _nearest(before, rules, scope):
-        if all(_keeps(r, scope, after) for r in rules):
-            return _told(before, after, broken)
-    return _unkept(before, broken)
+    for _, after in _candidates(before, rules, scope):
+        if all(_satisfies(r, scope, after) for r in rules):
+            return _replaced(before, after, broken)
+    return _not_replaced(before, broken)
 
 
-def _mend_together(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
-    """Change one link, the least change of all links', so that a rule over all of them holds.
+def _replace_one_link(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
+    """Change one link, by the smallest change of any, so that a rule about all links holds.
 
     Args:
-        scope: of these very directives.
+        scope: has these same directives.
     """
     best: tuple[tuple[int, float], int, Directive] | None = None
     for k, before in enumerate(list(directives)):
-        for far, after in _nearest(before, [*of_link, rule], scope):
+        for far, after in _candidates(before, [*of_link, rule], scope):
             if best is not None and far >= best[0]:
                 break
             directives[k] = after
-            if _keeps(rule, scope, None) and all(_keeps(r, scope, after) for r in of_link):
+            if _satisfies(rule, scope, None) and all(_satisfies(r, scope, after) for r in of_link):
                 best = (far, k, after)
                 break
         directives[k] = before
     if best is None:
-        directives[:] = [_unkept(d, [rule]) for d in directives]
+        directives[:] = [_not_replaced(d, [rule]) for d in directives]
     else:
         _, k, after = best
-        directives[k] = _told(directives[k], after, [rule])
+        directives[k] = _replaced(directives[k], after, [rule])
 
 
-def _told(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
+def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
     because = "; ".join(rule.text for rule in broken)
-    was = f"{Representation(before.representation).name.lower()} at {before.rate_hz:g} Hz"
+    was = f"{NAME_OF[Representation(before.representation)]} at {before.rate_hz:g} Hz"
     return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
 
 
-def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
+def _not_replaced(before: Directive, broken: Sequence[Invariant]) -> Directive:
     note = f"{MARK}cannot keep {'; '.join(rule.text for rule in broken)} "
     return before if before.reason.startswith(note) else before._replace(reason=f"{note}({before.reason})")
 
@@ -157,24 +160,24 @@ def _unkept(before: Directive, broken: Sequence[Invariant]) -> Directive:
 # --- candidates ----------------------------------------------------------------------------------
 
 
-def _nearest(
+def _candidates(
     before: Directive, rules: Sequence[Invariant], scope: Scope
 ) -> Iterator[tuple[tuple[int, float], Directive]]:
-    """How far, and which: directives that differ in the decisions that the rules speak of, nearest first."""
+    """Directives that differ in the fields that the rules name, nearest first, each with its distance."""
     here = scope._replace(link=before)
     values: dict[str, set[float]] = {}
     for rule in rules:
         for top in (rule.when, rule.then):
             if top is not None:
-                _collect(top, here, values)
+                _collect_boundaries(top, here, values)
     now = {word: _value(before, word) for word in values}
     steps = {w: sorted(({0.0, _HIGHEST[w]} | values[w]) - {now[w]}) for w in sorted(values)}
     waiting: list[tuple[tuple[int, float], Directive]] = []
-    # A change of so many words changes so many fields or, where a rung takes its budget along, one more.
+    # A change of this many names changes as many fields, or one more where a lower representation loses its budget.
     for changes in range(1, len(steps) + 2):
         for words in itertools.combinations(steps, changes):
             for pick in itertools.product(*(steps[w] for w in words)):
-                found = _with(before, dict(zip(words, pick, strict=True)), scope.me.region)
+                found = _changed(before, dict(zip(words, pick, strict=True)), scope.me.region)
                 if found is not None:
                     waiting.append((_distance(before, found), found))
         near = [w for w in waiting if w[0][0] <= changes]
@@ -182,8 +185,8 @@ def _nearest(
         yield from sorted(near, key=lambda w: w[0])
 
 
-def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
-    """Into `values`: for each decision spoken of, where the comparisons about it change their answer."""
+def _collect_boundaries(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
+    """Add to `values`, for each field that is named, the values at which the comparisons with it change their result."""
     for node in walk(top):
         if isinstance(node, Name) and node.word in _HIGHEST:
             values.setdefault(node.word, set())
@@ -197,7 +200,7 @@ def _collect(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
 
 
 def _around(edge: float) -> tuple[float, ...]:
-    """The edge, and a clear step to each side: what a strict comparison needs must survive the wire's rounding."""
+    """The edge, and a step to each side that is large enough to survive the wire's rounding."""
     step = max(abs(edge), 0.01) * 0.01
     return (edge - step, edge, edge + step) if math.isfinite(edge) else ()
 
@@ -208,8 +211,8 @@ def _value(d: Directive, word: str) -> float:
     return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
 
 
-def _with(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
-    """The directive with decisions changed; None where there is no such directive."""
+def _changed(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
+    """The directive with changed fields; None if there is no such directive."""
     changed: dict[str, Any] = {}
     for word, value in wanted.items():
         if word == "representation":
@@ -225,7 +228,7 @@ def _with(before: Directive, wanted: dict[str, float], region: Disc | None) -> D
         else:
             changed[word] = value
     if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
-        changed["rho"] = 0.0  # the budget is one of feature cells
+        changed["rho"] = 0.0  # only features have a budget of cells
     return before._replace(**changed)
 
 

@@ -1,14 +1,13 @@
-"""Numbers that stand for a whole range of inputs, and the search over every way a policy can take through them.
+"""Numbers that represent a whole range of inputs, and the search over all paths of a policy through its comparisons.
 
-A `Ranged` number compares with constants. Where the answer is the same for its whole range it gives that answer;
-where it is not, the run takes one side, narrows the range to it, and the search comes back later for the other.
-So the policy itself tells where its decision boundaries are, on whatever axis it looks at, and every run stands
-for a cell of views on which it decides the same. The search is complete when no side is left.
+A `Ranged` number can be compared with constants. If the result is the same for its whole range, it returns the result.
+Otherwise the run takes one side and narrows the range to it, and the search visits the other side later. The policy's
+own comparisons thus give its decision boundaries. Every run represents a cell of views on which the policy decides the
+same. The search is complete when no side is left.
 
-What a range cannot answer exactly (a comparison of two axes, a square root, a conversion to int, a look into its
-text) raises `Refused`.
-Arithmetic with constants is kept as steps and boundaries are found among the floats themselves: rounding is
-monotone, so that a bisection over the floats finds the very last one below.
+A range cannot answer everything exactly: a comparison of two axes, a square root, a conversion to int, a use of its text
+raise `Refused`. Arithmetic with constants is stored as steps. Rounding is monotone, so a bisection over the floats finds
+the last float below a boundary.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ T = TypeVar("T")
 
 
 class Refused(BaseException):
-    """The search cannot answer what the policy asks; the message says what. No ordinary `except` swallows it."""
+    """The search cannot follow the policy; the message says why. An ordinary `except` in the policy does not catch it."""
 
 
 class Path:
-    """One run: which side it took at every fork, and what is left of each axis."""
+    """One run: the side that it took at every fork, and the remaining range of each axis."""
 
     def __init__(self, script: Sequence[int]) -> None:
         self.ranges: dict[str, tuple[float, float]] = {}
@@ -37,7 +36,7 @@ class Path:
         self._script = script
 
     def choose(self, options: int) -> int:
-        """Which of so many sides this run takes: as the script says, then always the first."""
+        """The side that this run takes at a fork: by the script, after its end always the first."""
         k = len(self.taken)
         choice = self._script[k] if k < len(self._script) else 0
         if choice >= options:
@@ -46,30 +45,30 @@ class Path:
         return choice
 
     def pick(self, label: str, options: Sequence[T]) -> T:
-        """One of a few values of an axis that has no order; the same again within the run."""
+        """One of a few values of an axis without order; always the same one within a run."""
         if label not in self.picks:
             self.picks[label] = options[self.choose(len(options))]
         found: T = self.picks[label]
         return found
 
     def number(self, axis: str, low: float, high: float) -> Ranged:
-        """The number of an axis whose values are the floats (or, given two ints, the ints) of [low, high]."""
+        """The number of an axis with the floats of [low, high] as its values, or with the ints if both bounds are ints."""
         self.ranges.setdefault(axis, (low, high))
         return Ranged(self, axis)
 
     def refuse(self, why: str) -> NoReturn:
-        """End the run: it cannot be searched."""
+        """End the run, because the policy cannot be searched."""
         self.refusal = why
         raise Refused(why)
 
 
 def explore(run: Callable[[Path], T]) -> Iterator[tuple[Path, T]]:
-    """Every run of a deterministic function of one path, depth first, each with what it returns."""
+    """Every run of a deterministic function of one path, depth first, each with its result."""
     script: list[int] = []
     while True:
         path = Path(script)
         result = run(path)
-        if path.refusal is not None:  # a bare `except` may have swallowed it
+        if path.refusal is not None:  # a bare `except` may have caught it
             raise Refused(path.refusal)
         if len(path.taken) < len(script):
             raise Refused("decides differently on the same view")
@@ -84,7 +83,7 @@ def explore(run: Callable[[Path], T]) -> Iterator[tuple[Path, T]]:
 
 
 class Ranged:
-    """A number of which only the range is known: an axis, and what was done to it since, step by step."""
+    """A number with a known range: an axis, and the arithmetic steps applied to it."""
 
     __slots__ = ("_axis", "_path", "_steps")
 
@@ -99,7 +98,7 @@ class Ranged:
         return x
 
     def _below(self, c: float, or_at: bool) -> bool:
-        """Whether it is < c (≤ c where `or_at`), taking a side where both are possible."""
+        """Whether the number is < c (≤ c if `or_at`). If both are possible, the run takes a side."""
         path = self._path
 
         def holds(x: float) -> bool:
@@ -128,7 +127,7 @@ class Ranged:
         return at_high
 
     def _constant(self, other: object) -> float | None:
-        """The other side of a comparison as a plain number; None where it is no number."""
+        """The other operand as a plain number; None if it is not a number."""
         if isinstance(other, Ranged):
             low, high = other._path.ranges[other._axis]
             if low == high:
@@ -136,7 +135,7 @@ class Ranged:
             self._path.refuse(f"compares or combines two inputs, {self._axis} and {other._axis}")
         if isinstance(other, int | float):
             return other
-        if isinstance(other, numbers.Number):  # a Decimal, numpy's 32 bits: it would be rounded otherwise
+        if isinstance(other, numbers.Number):  # a Decimal or numpy's 32 bits would be rounded in another way
             self._path.refuse(f"compares or combines {self._axis} with a {type(other).__name__}")
         return None
 
@@ -225,20 +224,20 @@ class Ranged:
     # --- what it cannot do -------------------------------------------------------------------
 
     def _cannot(self, *_: object) -> NoReturn:
-        self._path.refuse(f"computes with {self._axis} otherwise than by constants and comparisons")
+        self._path.refuse(f"uses {self._axis} for more than arithmetic with constants and comparisons")
 
     __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = _cannot
     __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = _cannot
     __hash__ = _cannot
-    __array_ufunc__ = None  # numpy's scalars leave the operation to this side
+    __array_ufunc__ = None  # so that numpy's scalars leave the operation to this class
 
     def __getattr__(self, name: str) -> NoReturn:
         self._cannot()
 
     def __format__(self, spec: str) -> str:
-        """The number's text where the range is down to one; otherwise one that may be handed on as a reason alone."""
+        """The number's text if the range is a single number; otherwise a text that can only be used as a reason."""
         low, high = self._path.ranges[self._axis]
-        written = format(self._at(low), spec)  # also where the range is wide: a spec that fits no float is a fault
+        written = format(self._at(low), spec)  # also for a wide range, because a wrong spec must raise
         return written if low == high else Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
 
     def __str__(self) -> str:
@@ -248,16 +247,16 @@ class Ranged:
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
-        """The plain number's, so that `isinstance` and `match` answer as they do in flight; `type` cannot be answered."""
+        """The plain number's class, so that `isinstance` and `match` give the same result as in flight. `type` does not."""
         return type(self._at(self._path.ranges[self._axis][0]))
 
 
 class Text(str):
-    """The text of a number of which only the range is known: good as a reason, refused to whoever looks into it.
+    """The text of a number with a known range. It can be used as a reason; any other use raises `Refused`.
 
-    It stays so through `str`, `format`, `+`, and an f-string that holds nothing else. Among other text in an f-string,
-    in `join` and in `str.format` Python makes plain text of it, with a mark from the private use area in the number's
-    place, so that what reads a number there fails. A comparison of such text is not noticed.
+    It stays a `Text` in `str`, `format`, `+`, and an f-string that has nothing else. Among other text in an f-string,
+    in `join` and in `str.format`, Python makes plain text of it. The plain text has a mark from the private use area
+    instead of the number, so code that reads a number there fails. A comparison of such text is not noticed.
     """
 
     _path: Path
@@ -290,18 +289,18 @@ class Text(str):
         return Text(self._path, self._axis, str.__repr__(self))
 
     def __bool__(self) -> bool:
-        return True  # no number is written as nothing
+        return True  # the text of a number is never empty
 
-    def _looked_into(self, *_: object, **__: object) -> NoReturn:
-        self._path.refuse(f"looks into the text of {self._axis}, which is for reasons alone")
+    def _refused(self, *_: object, **__: object) -> NoReturn:
+        self._path.refuse(f"uses the text of {self._axis} for more than a reason")
 
 
-_HANDED_ON = {
+_INHERITED = {
     "__new__", "__init__", "__init_subclass__", "__subclasshook__", "__class__", "__doc__", "__dir__", "__getattribute__",
     "__setattr__", "__delattr__", *vars(Text),
 }  # fmt: skip
-for _asked in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _HANDED_ON:
-    setattr(Text, _asked, Text._looked_into)
+for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _INHERITED:
+    setattr(Text, _method, Text._refused)
 
 _MARK = "\ue000"
 
@@ -315,7 +314,7 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
 
 
 def _ordinal(x: float) -> int:
-    """The number of a float in the order of all floats; an int is its own."""
+    """The position of a float in the order of all floats; an int is its own position."""
     if isinstance(x, int):
         return x
     bits: int = struct.unpack("<q", struct.pack("<d", x))[0]

@@ -1,4 +1,4 @@
-"""Fleet views to try a policy on: drawn from a seed, made smaller where one fails, kept as JSON."""
+"""Fleet views for testing a policy: drawn from a seed, shrunk if the policy fails on one, written as JSON."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
-GRID_BYTES = 64
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
@@ -23,7 +22,7 @@ _PERIODS_S = (0.1, 0.2, 1.0)
 
 
 class ViewError(SortieError):
-    """A view's file is not one; the message names the field."""
+    """A file that is not a valid view; the message names the field."""
 
 
 # --- drawing -------------------------------------------------------------------------------------
@@ -32,7 +31,7 @@ class ViewError(SortieError):
 def draw_view(seed: int, number: int) -> FleetView:
     """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
 
-    Half of all numbers are drawn evenly, the other half from values where rules tend to change their mind.
+    Half of all numbers are drawn uniformly. The other half are values at which rules often change their decision.
     """
     rng = stream(seed, number, (), "verify.view")
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
@@ -69,7 +68,7 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
         cpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         peer_goodput_mbps=tuple(_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(drones - 1)),
-        coverage_grid=rng.bytes(GRID_BYTES) if rng.random() < 0.7 else bytes(GRID_BYTES),
+        coverage_grid=rng.bytes(COVERAGE_BYTES) if rng.random() < 0.7 else bytes(COVERAGE_BYTES),
         novelty_flags=int(rng.integers(4)),
         task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
         region=region,
@@ -81,7 +80,7 @@ def _mixed(rng: np.random.Generator, low: float, high: float, special: tuple[flo
     return float(rng.uniform(low, high)) if rng.random() < 0.5 else float(rng.choice(special))
 
 
-# --- making smaller ------------------------------------------------------------------------------
+# --- shrinking -----------------------------------------------------------------------------------
 
 _PLAIN: dict[str, Any] = {
     "stamp_ns": 0,
@@ -89,7 +88,7 @@ _PLAIN: dict[str, Any] = {
     "velocity_mps": (0.0, 0.0, 0.0),
     "cpu_headroom": 1.0,
     "gpu_headroom": 1.0,
-    "coverage_grid": bytes(GRID_BYTES),
+    "coverage_grid": bytes(COVERAGE_BYTES),
     "novelty_flags": 0,
     "region": None,
     "priority_target_ids": (),
@@ -100,12 +99,12 @@ _PLAIN: dict[str, Any] = {
 }
 
 
-def smaller(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
-    """A view that still fails, with as few drones and as plain fields as one pass over them finds.
+def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
+    """A view that still fails, with fewer drones and plainer fields, as found by one pass over them.
 
     Args:
         view: a view that fails.
-        fails: whether a view fails; asked some twenty times a drone.
+        fails: whether a view fails; called about twenty times for each drone.
     """
 
     def kept(candidate: FleetView) -> bool:
@@ -134,12 +133,12 @@ def _without(mapping: Mapping[int, Any], key: int) -> dict[int, Any]:
 
 
 def to_json(view: FleetView) -> str:
-    """The view as JSON, one drone a line; every number comes back exactly."""
+    """The view as JSON, one drone on each line; every number can be read back exactly."""
     drones = []
     for i, d in view.descriptors.items():
         fields = d._asdict() | {
             "coverage_grid": d.coverage_grid.hex(),
-            "task_phase": TaskPhase(d.task_phase).name.lower(),
+            "task_phase": PHASE_NAMES[TaskPhase(d.task_phase)],
             "region": None if d.region is None else list(d.region),
         }
         drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
@@ -170,7 +169,7 @@ def from_json(text: str) -> FleetView:
             raise ViewError(f"drones[{k}] must be an object")
         descriptor = _descriptor(entry, f"drones[{k}]")
         if descriptor.agent_id in descriptors:
-            raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id} for the second time")
+            raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id}, which another drone has already")
         descriptors[descriptor.agent_id] = descriptor
         age_s[descriptor.agent_id] = _number(entry, "age_s", f"drones[{k}]", 0.0)
     ego = _number(data, "ego", "view", 0, 255)
@@ -182,16 +181,16 @@ def from_json(text: str) -> FleetView:
 
 def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
     try:
-        phase = TaskPhase[str(entry.get("task_phase")).upper()]
+        phase = PHASE_OF[str(entry.get("task_phase"))]
     except KeyError as error:
-        known = ", ".join(p.name.lower() for p in TaskPhase)
+        known = ", ".join(PHASE_OF)
         raise ViewError(f"{where}.task_phase is {entry.get('task_phase')!r}, must be one of {known}") from error
     try:
         grid = bytes.fromhex(entry.get("coverage_grid", ""))
     except (TypeError, ValueError) as error:
         raise ViewError(f"{where}.coverage_grid must be hexadecimal") from error
-    if len(grid) != GRID_BYTES:
-        raise ViewError(f"{where}.coverage_grid has {len(grid)} bytes, must have {GRID_BYTES}")
+    if len(grid) != COVERAGE_BYTES:
+        raise ViewError(f"{where}.coverage_grid has {len(grid)} bytes, must have {COVERAGE_BYTES}")
     region = entry.get("region")
     x_m, y_m, z_m = _numbers(entry, "position_m", where, 3)
     vx_mps, vy_mps, vz_mps = _numbers(entry, "velocity_mps", where, 3)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.scenarios.schema import Bursts
+from sortie.radio.settings import BurstSettings
 from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -24,10 +24,10 @@ def bad_share(good_to_bad: float, bad_to_good: float) -> float:
     return good_to_bad / (good_to_bad + bad_to_good)
 
 
-def mean_loss(config: Bursts) -> float:
+def mean_loss(settings: BurstSettings) -> float:
     """Mean probability that a try is lost to bursts, in the long run."""
-    bad = bad_share(config.good_to_bad, config.bad_to_good)
-    return (1.0 - bad) * config.loss_good + bad * config.loss_bad
+    bad = bad_share(settings.good_to_bad, settings.bad_to_good)
+    return (1.0 - bad) * settings.loss_good + bad * settings.loss_bad
 
 
 def walk(bad: BoolArray, luck: FloatArray, good_to_bad: float, bad_to_good: float) -> BoolArray:
@@ -80,14 +80,14 @@ class PairStates:
     """Which pairs are bad, frame by frame; a frame is in the state of the step that it begins in.
 
     Args:
-        config: the scenario's radio.bursts section.
+        settings: see `sortie.radio.settings.BurstSettings`.
         n: number of drones.
         seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
     """
 
-    def __init__(self, config: Bursts, n: int, seed: int, replication: int, frame_s: float) -> None:
-        self.config = config
+    def __init__(self, settings: BurstSettings, n: int, seed: int, replication: int, frame_s: float) -> None:
+        self.settings = settings
         self._frame_s = frame_s
         self._numbers = PairNumbers(seed, replication, n, "bursts", ordered=False)
         self._frame = self._step = -1
@@ -96,7 +96,7 @@ class PairStates:
 
     def advance(self) -> FloatArray:
         """Move on by one frame; returns [N, N]: the probability that a try is lost, sender by receiver."""
-        c = self.config
+        c = self.settings
         self._frame += 1
         due = int(self._frame * self._frame_s / c.step_s + 1e-6)
         while self._step < due:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import chndtr, ndtri
 
 from sortie.radio.channel.shadowing import gauss_markov, keep
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.streams import stream
 
 Keys = NDArray[np.uint64]
@@ -39,9 +39,9 @@ def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
 class StreamDraws:
     """Shadowing, fades and luck of every link of n drones, block after block."""
 
-    def __init__(self, config: Radio, seed: int, replication: int, n: int, frame_s: float) -> None:
-        self._config, self._n = config, n
-        self._keep = keep(frame_s, config.shadowing_time_s)
+    def __init__(self, settings: AirSettings, seed: int, replication: int, n: int, frame_s: float) -> None:
+        self._settings, self._n = settings, n
+        self._keep = keep(frame_s, settings.shadowing_time_s)
         self._shadow = [stream(seed, replication, h, "shadowing") for h in range(n)]
         self._fade = [stream(seed, replication, h, "fading") for h in range(n)]
         self._luck = [stream(seed, replication, h, "group loss") for h in range(n)]
@@ -67,9 +67,9 @@ class StreamDraws:
             self._scatter(y, h, f, 1)
             self._scatter(luck, h, self._luck[h].random((b, 1, 2, h)), 0)
         luck[:, range(n), range(n)] = np.nan
-        shadow_db = gauss_markov(shadow_z, self._config.shadowing_sigma_db, self._keep, self._last_db)
+        shadow_db = gauss_markov(shadow_z, self._settings.shadowing_sigma_db, self._keep, self._last_db)
         self._last_db = shadow_db[-1]
-        gain = rician_gain(x[:flown], y[:flown], self._config.rician_k_db)
+        gain = rician_gain(x[:flown], y[:flown], self._settings.rician_k_db)
         return shadow_db[:flown], 10.0 * np.log10(np.maximum(gain, 1e-12)), luck[:flown]
 
     @staticmethod

@@ -26,7 +26,7 @@ from sortie.radio.channel.draws import (
 from sortie.radio.channel.earshot import IntArray, LinkList, both_ways, near_pairs
 from sortie.radio.channel.pathloss import path_loss_db
 from sortie.radio.channel.shadowing import ShadowField, gauss_markov, keep
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 Array = NDArray[np.floating[Any]]
 
@@ -49,7 +49,7 @@ class Crowd:
 
     def __init__(
         self,
-        config: Radio,
+        settings: AirSettings,
         n: int,
         early: StreamDraws,
         field: ShadowField | None,
@@ -60,12 +60,12 @@ class Crowd:
         replication: int,
         frame_s: float,
     ) -> None:
-        self._config, self._n, self._n_early = config, n, n_early
+        self._settings, self._n, self._n_early = settings, n, n_early
         self._early, self._field, self._earshot_m = early, field, earshot_m
         self._keys = drone_keys(seed, replication, n)
-        self._fades = fade_table_db(config.rician_k_db)
+        self._fades = fade_table_db(settings.rician_k_db)
         self._frame_s = frame_s
-        self._keep = keep(frame_s, config.shadowing_time_s)
+        self._keep = keep(frame_s, settings.shadowing_time_s)
         # the block
         self._frame = self._pairs = self._early_count = 0
         self._link_keys = self._keys[:0]
@@ -79,8 +79,8 @@ class Crowd:
         """The frames from `frame` on, of [frames, N, 3] positions (and vectors along the airframes' z axes)."""
         p = positions_m.astype(np.float32)
         low, high, distance = near_pairs(p, self._earshot_m)
-        loss_db = path_loss_db(self._config, distance, p[:, low, 2], p[:, high, 2])
-        if self._config.antenna != "isotropic":
+        loss_db = path_loss_db(self._settings, distance, p[:, low, 2], p[:, high, 2])
+        if self._settings.antenna != "isotropic":
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
         links = both_ways(self._n, low, high)
         self._frame, self._pairs = frame, len(low)
@@ -118,9 +118,9 @@ class Crowd:
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
         if up is None:
-            return 2.0 * antenna_loss_db(self._config.antenna, along[..., 2])
+            return 2.0 * antenna_loss_db(self._settings.antenna, along[..., 2])
         ends = (np.einsum("tpk,tpk->tp", along, up[:, end]) for end in (low, high))
-        return np.asarray(sum(antenna_loss_db(self._config.antenna, cosine) for cosine in ends))
+        return np.asarray(sum(antenna_loss_db(self._settings.antenna, cosine) for cosine in ends))
 
     def _shadowing(self, low: IntArray, high: IntArray, flown: int) -> Array:
         """[flown, P] dB; a pair that has come into earshot begins anew."""
@@ -131,6 +131,6 @@ class Crowd:
             known = self._last_pairs[where] == pairs
             begin_db[known] = self._last_db[where[known]]
         z = np.take(normal_table(), levels(numbers(self._link_keys[: len(low)], self._frame, flown), 1), mode="clip")
-        shadow_db = gauss_markov(z, self._config.shadowing_sigma_db, self._keep, begin_db)
+        shadow_db = gauss_markov(z, self._settings.shadowing_sigma_db, self._keep, begin_db)
         self._last_pairs, self._last_db = pairs, shadow_db[-1].copy()
         return shadow_db

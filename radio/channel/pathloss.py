@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -64,17 +64,19 @@ def two_ray_loss_db(
     return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) - 10.0 * np.log10(np.maximum(power, 1e-30)))
 
 
-def path_loss_db(config: Radio, distance_m: ArrayLike, height_a_m: ArrayLike, height_b_m: ArrayLike) -> FloatArray:
+def path_loss_db(
+    settings: AirSettings, distance_m: ArrayLike, height_a_m: ArrayLike, height_b_m: ArrayLike
+) -> FloatArray:
     """The path loss that a scenario asks for, dB; arguments as for `two_ray_loss_db`."""
-    if config.path_loss == "two_ray":
-        return two_ray_loss_db(distance_m, height_a_m, height_b_m, config.carrier_ghz, config.ground_roughness_m)
-    exponent = 2.0 if config.path_loss == "free_space" else config.path_loss_exponent
-    return log_distance_loss_db(distance_m, config.carrier_ghz, exponent)
+    if settings.path_loss == "two_ray":
+        return two_ray_loss_db(distance_m, height_a_m, height_b_m, settings.carrier_ghz, settings.ground_roughness_m)
+    exponent = 2.0 if settings.path_loss == "free_space" else settings.path_loss_exponent
+    return log_distance_loss_db(distance_m, settings.carrier_ghz, exponent)
 
 
-def range_m(config: Radio, loss_db: float) -> float:
+def range_m(settings: AirSettings, loss_db: float) -> float:
     """The distance beyond which the loss exceeds `loss_db` for certain (two rays can add up to 6 dB of gain)."""
-    exponent = config.path_loss_exponent if config.path_loss == "log_distance" else 2.0
-    gain_db = 6.1 if config.path_loss == "two_ray" else 0.0
-    beyond_1m_db = loss_db + gain_db - float(free_space_loss_db(1.0, config.carrier_ghz))
+    exponent = settings.path_loss_exponent if settings.path_loss == "log_distance" else 2.0
+    gain_db = 6.1 if settings.path_loss == "two_ray" else 0.0
+    beyond_1m_db = loss_db + gain_db - float(free_space_loss_db(1.0, settings.carrier_ghz))
     return float(10.0 ** (max(0.0, beyond_1m_db) / (10.0 * exponent)))

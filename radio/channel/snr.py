@@ -20,7 +20,7 @@ from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -44,16 +44,18 @@ def noise_dbm(bandwidth_mhz: float, noise_figure_db: float) -> float:
     return -174.0 + 10.0 * log10(bandwidth_mhz * 1e6) + noise_figure_db
 
 
-def earshot_m(config: Radio) -> float:
+def earshot_m(settings: AirSettings) -> float:
     """The distance beyond which no frame is heard.
 
     There a link with 5 σ of shadowing (one in 3.5 million) and the highest of 65,536 fades is still 2 dB short of
     half the group frames.
     """
-    gain_db = _EARSHOT_SIGMA * config.shadowing_sigma_db + float(fade_table_db(config.rician_k_db)[-1])
-    needed_db = min(S50_DB[0], S50_DB[group_mcs(config.group_rate_mbps)] - 10.0 * log10(config.bandwidth_mhz / 20.0))
-    noise = noise_dbm(config.bandwidth_mhz, config.noise_figure_db)
-    return range_m(config, config.tx_power_dbm - noise + gain_db - needed_db + 2.0)
+    gain_db = _EARSHOT_SIGMA * settings.shadowing_sigma_db + float(fade_table_db(settings.rician_k_db)[-1])
+    needed_db = min(
+        S50_DB[0], S50_DB[group_mcs(settings.group_rate_mbps)] - 10.0 * log10(settings.bandwidth_mhz / 20.0)
+    )
+    noise = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
+    return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
 
 
 def _reach_at_1(luck: AnyFloats) -> AnyFloats:
@@ -100,7 +102,7 @@ class Channel:
     else interferes is only looked up.
 
     Args:
-        config: the scenario's radio section.
+        settings: see `sortie.radio.settings.AirSettings`.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
@@ -112,7 +114,7 @@ class Channel:
 
     def __init__(
         self,
-        config: Radio,
+        settings: AirSettings,
         positions_m: ArrayLike,
         seed: int,
         replication: int,
@@ -131,27 +133,27 @@ class Channel:
             raise ValueError(f"up has shape {u.shape}, must be {p.shape}, as positions_m")
         if u is not None and not np.isfinite(u).all():
             raise ValueError("up holds a value that is not finite")
-        self.config = config
+        self.settings = settings
         self.n = n_drones = p.shape[1]
         self.frame = -1
-        self.noise_dbm = noise_dbm(config.bandwidth_mhz, config.noise_figure_db)
+        self.noise_dbm = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
-        self._group_gain_db = 10.0 * log10(config.bandwidth_mhz / 20.0)
-        mcs = group_mcs(config.group_rate_mbps)
+        self._group_gain_db = 10.0 * log10(settings.bandwidth_mhz / 20.0)
+        mcs = group_mcs(settings.group_rate_mbps)
         self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
         self._frame_s = frame_s
         self._field: ShadowField | None = None
-        if config.shadowing_distance_m is not None:
+        if settings.shadowing_distance_m is not None:
             self._field = ShadowField(
-                config.shadowing_sigma_db, config.shadowing_distance_m, config.shadowing_time_s, seed, replication
+                settings.shadowing_sigma_db, settings.shadowing_distance_m, settings.shadowing_time_s, seed, replication
             )
         early = min(n_drones, SQUARE)
-        self._draws = StreamDraws(config, seed, replication, early, frame_s)
+        self._draws = StreamDraws(settings, seed, replication, early, frame_s)
         self._crowd: Crowd | None = None
         if n_drones > SQUARE:
             self._crowd = Crowd(
-                config, n_drones, self._draws, self._field,
-                n_early=early, earshot_m=earshot_m(config), seed=seed, replication=replication, frame_s=frame_s,
+                settings, n_drones, self._draws, self._field,
+                n_early=early, earshot_m=earshot_m(settings), seed=seed, replication=replication, frame_s=frame_s,
             )  # fmt: skip
         self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
         self.links = all_links(0 if self._crowd else n_drones)
@@ -299,18 +301,18 @@ class Channel:
             where = np.asarray(place, dtype=float)
             toward = p - where
             d = np.sqrt((toward**2).sum(axis=1))
-            loss_db = path_loss_db(self.config, d, p[:, 2], np.full(self.n, where[2]))
-            if self.config.antenna != "isotropic":
+            loss_db = path_loss_db(self.settings, d, p[:, 2], np.full(self.n, where[2]))
+            if self.settings.antenna != "isotropic":
                 up = np.array([0.0, 0.0, 1.0]) if self._up is None else self._up[self.frame]
                 cosine = (toward * up).sum(axis=1) / np.maximum(d, 1e-9)
-                loss_db = loss_db + antenna_loss_db(self.config.antenna, cosine)
+                loss_db = loss_db + antenna_loss_db(self.settings.antenna, cosine)
             total_mw += 10.0 ** ((power_dbm - loss_db) / 10.0)
         return np.asarray(10.0 * np.log10(total_mw) - self.noise_dbm)
 
     # --- a block of frames ---------------------------------------------------------------------------
 
     def _refill(self) -> None:
-        c, p = self.config, self._positions_m[self.frame : self.frame + self._block]
+        c, p = self.settings, self._positions_m[self.frame : self.frame + self._block]
         up = None if self._up is None else self._up[self.frame : self.frame + self._block]
         if self._crowd is not None:
             self.links, gain_db, self._shadow_db = self._crowd.block(self.frame, p, up)
@@ -328,7 +330,7 @@ class Channel:
 
     def _work_out(self, first: int) -> None:
         """The block that begins with a frame, from what was drawn for it and where the drones are."""
-        c, p = self.config, self._positions_m[first : first + self._block]
+        c, p = self.settings, self._positions_m[first : first + self._block]
         up = None if self._up is None else self._up[first : first + self._block]
         loss_db = self._loss_db(p, up)
         if self._field is not None:
@@ -352,7 +354,7 @@ class Channel:
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""
-        links, c = self.links, self.config
+        links, c = self.links, self.settings
         delta = p[:, :, None, :] - p[:, None, :, :]
         distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
         heights = p[:, :, 2]

@@ -11,7 +11,7 @@ from sortie.radio.mac.airtime import frame_bytes, group_frame_s
 from sortie.radio.mac.jobs import GroupFrame
 from sortie.radio.mac.medium import CW_CONTEXT
 from sortie.radio.overrides import Overrides
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.streams import stream
 
 MAX_GROUP_PAYLOAD_BYTES = 2200
@@ -47,7 +47,7 @@ class Broadcasts:
 
     def __init__(
         self,
-        config: Radio,
+        settings: AirSettings,
         channel: Channel,
         counters: Counters,
         gone: Set[int],
@@ -58,7 +58,7 @@ class Broadcasts:
         frame_s: float,
         publish_spread: float,
     ) -> None:
-        self._rate_mbps = config.group_rate_mbps
+        self._rate_mbps = settings.group_rate_mbps
         self._channel = channel
         self._counters = counters
         self._gone = gone

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.reading.files import found_beside
-from sortie.scenarios.reading.load import campaigns, context_sets, library, load, read, read_scalar, tree, validated
+from sortie.scenarios.reading.load import campaigns, condition_sets, library, load, read, read_scalar, tree, validated
 from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
@@ -125,13 +125,13 @@ def _put(root: Node, name: str, new: Node) -> Node:
 def _base(name: str, here: Path, root: Node) -> Scenario:
     """From the library, or a file beside the campaign's; what is wrong within it is told at its own line."""
     at = f"{(child(root, 'base') or root).where}: base: "
-    path = {**library(), **campaigns(), **context_sets()}.get(name, here / name)
+    path = {**library(), **campaigns(), **condition_sets()}.get(name, here / name)
     try:
         text, source = read(path)
     except ScenarioError as error:
         raise ScenarioError(f"{at}{error}") from None
     top = tree(text, source)
-    for key, what in (("campaign", "a campaign itself"), ("contexts", "a set of contexts")):
+    for key, what in (("campaign", "a campaign itself"), ("conditions", "a set of conditions")):
         if child(top, key) is not None and child(top, "name") is None:
             raise ScenarioError(f"{at}{name}, must be a scenario, it is {what}")
     return load(path)

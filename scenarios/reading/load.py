@@ -34,8 +34,8 @@ from sortie.scenarios.reading.nodes import (
     plain,
     problems,
 )
-from sortie.scenarios.schema import Scenario
-from sortie.scenarios.schema.conditions import Contexts
+from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
+from sortie.scenarios.schema.conditions import ConditionSet
 
 __all__ = ["Overrides", "ScenarioError", "build", "dump", "library", "load", "loads"]
 
@@ -86,6 +86,7 @@ def build(sections: Mapping[str, object], overrides: Overrides = (), source: str
 
 
 def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
+    _refuse_old_key(root)
     for key, what, command in _OTHERS:
         if child(root, key) is not None and child(root, "name") is None:
             raise ScenarioError(f"{source}: is {what}, not a scenario; its command is: {command} {source}")
@@ -100,7 +101,7 @@ def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
 
 def read(path_or_name: str | Path) -> tuple[str, str]:
     """A file's text and its path; a bare name is looked up in the library first. Raises ScenarioError."""
-    path = {**library(), **campaigns(), **context_sets()}.get(str(path_or_name), Path(path_or_name))
+    path = {**library(), **campaigns(), **condition_sets()}.get(str(path_or_name), Path(path_or_name))
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -154,7 +155,7 @@ def dump(scenario: Scenario) -> str:
 
 def library() -> dict[str, Path]:
     """The shipped scenarios by name."""
-    others = campaigns().keys() | context_sets().keys()
+    others = campaigns().keys() | condition_sets().keys()
     return {path.stem: path for path in sorted(_LIBRARY.glob("*.yaml")) if path.stem not in others}
 
 
@@ -165,9 +166,9 @@ def campaigns() -> dict[str, Path]:
 
 
 @functools.cache
-def context_sets() -> dict[str, Path]:
-    """The shipped sets of contexts by name: files with `contexts` on top."""
-    return _with_on_top("contexts")
+def condition_sets() -> dict[str, Path]:
+    """The shipped sets of conditions by name: files with the key `conditions`."""
+    return _with_on_top("conditions")
 
 
 def _with_on_top(key: str) -> dict[str, Path]:
@@ -175,18 +176,25 @@ def _with_on_top(key: str) -> dict[str, Path]:
     return {path.stem: path for path, text in texts.items() if re.search(f"^{key}:", text, re.MULTILINE)}
 
 
-def load_contexts(path_or_name: str | Path) -> Contexts | None:
-    """A set of contexts; None where the file holds something else, a scenario say.
+def load_conditions(path_or_name: str | Path) -> ConditionSet | None:
+    """A set of conditions; None if the file holds something else, such as a scenario.
 
     Raises:
         ScenarioError: as `load` does.
     """
     text, source = read(path_or_name)
     root = tree(text, source)
-    return validated(root, Contexts) if child(root, "contexts") is not None else None
+    _refuse_old_key(root)
+    return validated(root, ConditionSet) if child(root, "conditions") is not None else None
 
 
-_OTHERS = (("campaign", "a campaign", "sortie campaign"), ("contexts", "a set of contexts", "sortie compare"))
+def _refuse_old_key(root: Node) -> None:
+    old = child(root, "contexts")
+    if old is not None and child(root, "name") is None:
+        raise ScenarioError(f"{old.where}: contexts: unknown key, it is now called conditions")
+
+
+_OTHERS = (("campaign", "a campaign", "sortie campaign"), ("conditions", "a set of conditions", "sortie compare"))
 """What else lies in files like these, by the key that only it has."""
 
 # --- overrides and errors ------------------------------------------------------------------------
@@ -207,7 +215,16 @@ def _assigned(root: Node, key: object, new: Node, source: str) -> Node:
         raise ScenarioError(f"{source}: {key!r} is no field, must be key.path")
     if len(parts) > MAX_DEPTH:
         raise ScenarioError(f"{source}: {len(parts)} levels deep, must be at most {MAX_DEPTH}")
-    return assign(root, parts, new)
+    return assign(_without_presets(root), parts, new)
+
+
+def _without_presets(root: Node) -> Node:
+    """A preset's name above the overridden field becomes the preset's values, so that the override changes one of them."""
+    for path, section in ((("fleet", "airframe"), Airframe), (("context", "form"), DescriptorForm)):
+        node = child(child(root, path[0]) or root, path[1])
+        if node is not None and isinstance(node.value, str) and node.value in section.presets:
+            root = assign(root, path, as_node(section.presets[node.value], node.source, node.line))
+    return root
 
 
 def _first(issues: Sequence[Issue]) -> ScenarioError:
@@ -222,7 +239,7 @@ def _nearby(path: Path) -> str:
         here = sorted(p.name for p in path.parent.glob("*.y*ml"))
     except (OSError, ValueError):
         here = []
-    known = {Path(name).stem: name for name in [*library(), *campaigns(), *context_sets(), *here]}
+    known = {Path(name).stem: name for name in [*library(), *campaigns(), *condition_sets(), *here]}
     near = nearest(path.stem, known)
     return f"did you mean {known[near]}?" if near else f"the library has {', '.join(library())}"
 

@@ -5,7 +5,7 @@ Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward,
 """
 
 from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, Soc
-from sortie.scenarios.schema.context import Context
+from sortie.scenarios.schema.context import Context, DescriptorForm
 from sortie.scenarios.schema.events import (
     BaseEvent,
     BatteryFault,
@@ -19,7 +19,17 @@ from sortie.scenarios.schema.events import (
     Spoof,
 )
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
-from sortie.scenarios.schema.fleet import Airframe, Battery, DroneOverride, Fleet, Formation, Motion, Route, Viewpoints
+from sortie.scenarios.schema.fleet import (
+    Airframe,
+    Battery,
+    DroneOverride,
+    Fleet,
+    Formation,
+    Motion,
+    Polarisation,
+    Route,
+    Viewpoints,
+)
 from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
 from sortie.scenarios.schema.perception import Perception, Scene
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
@@ -36,6 +46,7 @@ __all__ = [
     "ClockSkew",
     "Context",
     "DecisionExpectation",
+    "DescriptorForm",
     "DroneId",
     "DroneLost",
     "DroneOverride",
@@ -54,6 +65,7 @@ __all__ = [
     "Phase",
     "PhaseName",
     "PointM",
+    "Polarisation",
     "PolicySection",
     "PolicyChange",
     "PolicyCommand",

@@ -1,6 +1,6 @@
-"""The schema of a set of contexts: one base scenario under many conditions, on which policies are compared.
+"""The schema of a set of conditions: one base scenario under many conditions, on which policies are compared.
 
-`sortie.scenarios.reading.load.load_contexts` reads the file; `sortie compare FILE --policies …` flies it.
+`sortie.scenarios.reading.load.load_conditions` reads the file; `sortie compare FILE --policies …` flies it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ class Condition(Section):
     set: tuple[Override, ...] = Field((), max_length=50, description="What differs from the base scenario.")
 
 
-class Contexts(Section):
-    """A set of contexts, compared as a whole."""
+class ConditionSet(Section):
+    """A set of conditions, compared as a whole."""
 
     description: str = Field("", max_length=2000, description="One paragraph for people.")
     base: str = Field(min_length=1, description="A library scenario's name, or a file.")
-    set: tuple[Override, ...] = Field((), max_length=50, description="What holds in every context.")
+    set: tuple[Override, ...] = Field((), max_length=50, description="What holds in every condition.")
     seeds: tuple[Annotated[int, Field(ge=0, lt=2**63)], ...] = Field(
-        (1,), min_length=1, max_length=100, description="Each context is flown once with each."
+        (1,), min_length=1, max_length=100, description="Each condition is flown once with each."
     )
-    contexts: tuple[Condition, ...] = Field(min_length=1, max_length=1000, description="The contexts.")
+    conditions: tuple[Condition, ...] = Field(min_length=1, max_length=1000, description="The conditions.")
 
     @model_validator(mode="after")
-    def _named_once(self) -> Contexts:
-        names = [c.name for c in self.contexts]
+    def _named_once(self) -> ConditionSet:
+        names = [c.name for c in self.conditions]
         for i, name in enumerate(names):
             if name in names[:i]:
-                raise inconsistent(("contexts", i, "name"), repr(name), "named once")
+                raise inconsistent(("conditions", i, "name"), repr(name), "named once")
         return self

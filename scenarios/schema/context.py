@@ -2,11 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from sortie.scenarios.schema.base import Section
+from sortie.scenarios.schema.base import PresetSection, Section
+
+
+class DescriptorForm(PresetSection):
+    """How finely a descriptor is written: the paper's form, or one with fewer bytes."""
+
+    presets: ClassVar = {
+        "paper": {},
+        "grid_8": {"grid_cells": 8},
+        "grid_4": {"grid_cells": 4},
+        "no_grid": {"grid_cells": 0},
+        "cells_1_bit": {"grid_bits": 1},
+        "numbers_16_bit": {"number_bits": 16},
+        "numbers_12_bit": {"number_bits": 12},
+        "numbers_8_bit": {"number_bits": 8},
+        "small": {"grid_cells": 8, "grid_bits": 1, "number_bits": 16},
+    }
+    """`paper` is the paper's schema in CDR. `tests/validation/minimal_context.py` measures the others against it."""
+
+    grid_cells: Literal[0, 4, 8, 16] = Field(16, description="Coverage cells a side on the air; 0 leaves the grid out.")
+    grid_bits: Literal[1, 2] = Field(2, description="Bits of a coverage cell on the air; 1 is seen well or not.")
+    number_bits: Literal[8, 10, 12, 16, 24, 32] = Field(
+        32,
+        description="Bits of a descriptor's number on the air: fixed point over its field's range, or 32-bit floats.",
+    )
 
 
 class Context(Section):
@@ -26,11 +50,10 @@ class Context(Section):
     publish_every: int = Field(
         1, ge=1, le=100, description="A descriptor every so many frames; ages count in periods of that length."
     )
-    grid_cells: Literal[0, 4, 8, 16] = Field(16, description="Coverage cells a side on the air; 0 leaves the grid out.")
-    grid_bits: Literal[1, 2] = Field(2, description="Bits of a coverage cell on the air; 1 is seen well or not.")
-    number_bits: Literal[8, 10, 12, 16, 24, 32] = Field(
-        32,
-        description="Bits of a descriptor's number on the air: fixed point over its field's range, or 32-bit floats.",
+    form: DescriptorForm = Field(
+        DescriptorForm(),
+        description="Form of descriptors on the air: a preset or its values; small is 8 × 8 cells of 1 bit and 16-bit numbers.",
+        json_schema_extra=DescriptorForm.names_in_schema,
     )
     trust: bool = Field(
         True,

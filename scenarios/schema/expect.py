@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field, model_validator
 
+from sortie.scenarios.representation import RepresentationName
 from sortie.scenarios.schema.base import DroneId, Section, inconsistent
 
 
@@ -49,9 +48,7 @@ class DecisionExpectation(Section):
     peer: DroneId | None = Field(None, description="The link's other end; left out, any.")
     from_s: float = Field(ge=0, description="Begin of the window, inclusive.")
     until_s: float = Field(ge=0, description="End of the window, inclusive.")
-    representation: Literal["none", "tracks", "detections", "features", "raw"] | None = Field(
-        None, description="What the link is to carry."
-    )
+    representation: RepresentationName | None = Field(None, description="What the link is to carry.")
     rate_at_most_hz: float | None = Field(None, ge=0, le=30, description="Its highest rate.")
     roi: bool | None = Field(None, description="Whether it is confined to a region.")
     reason: str = Field("", description="Text that its reason contains.")

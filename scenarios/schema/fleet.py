@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, PointM, Section, Soc, inconsistent
+from sortie.scenarios.schema.base import DroneId, PointM, PresetSection, Section, Soc, inconsistent
 
 
 class Formation(Section):
@@ -75,7 +75,20 @@ class Viewpoints(Section):
         return self
 
 
-class Airframe(Section):
+class Airframe(PresetSection):
+    presets: ClassVar = {
+        "zeng_2019": {},
+        "solo": {
+            "mass_kg": 1.88,
+            "disc_area_m2": 0.2027,
+            "figure_of_merit": 0.674,
+            "tip_speed_mps": 71.8,
+            "power_model": "momentum",
+        },
+    }
+    """`zeng_2019`: the rotary-wing machine of Zeng, Xu & Zhang 2019. `solo`: a 3DR Solo with gimbal and camera, as in
+    `tests/validation/energy.py`, which names its sources and compares it with a recorded flight."""
+
     mass_kg: float = Field(2.04, gt=0, le=100, description="All-up mass without payload, battery included.")
     payload_kg: float = Field(0.0, ge=0, le=100, description="What is carried besides.")
     disc_area_m2: float = Field(0.503, gt=0, le=50, description="Area that all rotors sweep.")
@@ -92,6 +105,13 @@ class Airframe(Section):
         "level",
         description="level: the formula for level flight, and m·g·v_z while climbing; momentum: momentum theory with climb's inflow, vertical gusts and acceleration.",
     )
+
+
+class Polarisation(Section):
+    resistance_mohm: float = Field(
+        0.0, ge=0, le=500, description="Resistance of one cell that builds up over time_s under load; 0: none."
+    )
+    time_s: float = Field(20.0, gt=0, le=3600, description="Time constant of polarisation.")
 
 
 class Battery(Section):
@@ -116,10 +136,7 @@ class Battery(Section):
     cutoff_cell_v: float = Field(
         0.0, ge=0, le=4.2, description="It also lands when a cell's mean voltage under load falls below this; 0: never."
     )
-    polarisation_mohm: float = Field(
-        0.0, ge=0, le=500, description="Resistance of one cell that builds up over polarisation_time_s under load."
-    )
-    polarisation_time_s: float = Field(20.0, gt=0, le=3600, description="Time constant of polarisation.")
+    polarisation: Polarisation = Polarisation()
     ambient_c: float | None = Field(
         None,
         ge=-40,
@@ -154,7 +171,11 @@ class Fleet(Section):
     route: Route = Route()
     motion: Motion = Motion()
     viewpoints: Viewpoints = Viewpoints()
-    airframe: Airframe = Airframe()
+    airframe: Airframe = Field(
+        Airframe(),
+        description="A preset or its values; zeng_2019 is the published power model's machine, solo a 3DR Solo with camera.",
+        json_schema_extra=Airframe.names_in_schema,
+    )
     battery: Battery = Battery()
     overrides: tuple[DroneOverride, ...] = Field(
         (), description="Drones whose battery or payload differs from the fleet's."

@@ -62,7 +62,9 @@ def run_campaign(
     """
     store = CampaignStore(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
-        return _drive(plan, store, engine, progress)
+        done = _drive(plan, store, engine, progress)
+        store.export()
+        return done
     finally:
         store.close()
 
@@ -75,9 +77,12 @@ def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: C
     def enough() -> bool:
         """Look at finished parts in their order, so that it is the same whoever finished first."""
         nonlocal frontier
-        while frontier < store.shards and store.is_done(frontier):
+        while frontier < store.parts and store.is_done(frontier):
             frontier += 1
-            if plan.campaign.stop_when is not None and stop.enough(store.rows(frontier - 1)):
+            if plan.campaign.stop_when is None:
+                continue
+            rows = store.part(frontier - 1)
+            if rows is not None and stop.enough(rows):
                 store.drop_after(frontier - 1)
                 return True
         return False
@@ -110,17 +115,17 @@ class Stop:
     """
 
     def __init__(self, plan: CampaignPlan) -> None:
-        self._plan, self._asked = plan, plan.campaign.stop_when
+        self._plan, self._rule = plan, plan.campaign.stop_when
         self._means = [RunningMean() for _ in plan.policies]
         self._open: list[list[float]] = [[] for _ in plan.policies]
         self._unit = 0
 
     def enough(self, rows: pa.Table) -> bool:
         """Take a part's rows in; whether enough is known."""
-        asked = self._asked
-        assert asked is not None  # noqa: S101
+        rule = self._rule
+        assert rule is not None  # noqa: S101
         units, policies = rows["unit"].to_pylist(), rows["policy"].to_pylist()
-        for unit, label, value in zip(units, policies, rows[asked.metric].to_pylist(), strict=True):
+        for unit, label, value in zip(units, policies, rows[rule.metric].to_pylist(), strict=True):
             if unit != self._unit:
                 self._close()
                 self._unit = unit
@@ -128,13 +133,13 @@ class Stop:
                 self._open[self._plan.policies.index(label)].append(value)
         if rows["run"][-1].as_py() + 1 == self._plan.runs:
             self._close()
-        compared = self._means[1:] if asked.difference else self._means
-        return all(m.count >= asked.at_least and t_interval(m, asked.confidence) <= asked.half_width for m in compared)
+        compared = self._means[1:] if rule.difference else self._means
+        return all(m.count >= rule.at_least and t_interval(m, rule.confidence) <= rule.half_width for m in compared)
 
     def _close(self) -> None:
         means = [float(np.mean(v)) if v else math.nan for v in self._open]
         for kept, value in zip(self._means, means, strict=True):
-            value -= means[0] if self._asked is not None and self._asked.difference else 0.0
+            value -= means[0] if self._rule is not None and self._rule.difference else 0.0
             if not math.isnan(value):
                 kept.add(value)
         self._open = [[] for _ in self._open]

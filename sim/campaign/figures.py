@@ -65,11 +65,11 @@ def draw_varied(rows: CampaignRows, path: Path) -> bool:
             apart = APART * (max(places) - min(places) or 1.0)
             for p, label in enumerate(rows.plan.policies):
                 aside = apart * (p - (len(rows.plan.policies) - 1) / 2)
-                found = [(x + aside, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
+                points = [(x + aside, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
                 ax.errorbar(
-                    [x for x, _ in found],
-                    [e.mean for _, e in found],
-                    [0.0 if np.isnan(e.half_width) else e.half_width for _, e in found],
+                    [x for x, _ in points],
+                    [e.mean for _, e in points],
+                    [0.0 if np.isnan(e.half_width) else e.half_width for _, e in points],
                     marker="o",
                     markersize=3,
                     capsize=2,

@@ -19,6 +19,7 @@ import numpy as np
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
+from sortie.policies.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
 from sortie.scenarios.reading.load import loads
@@ -183,11 +184,11 @@ def make_plan(study: Study) -> CampaignPlan:
         (label or base.policy.name, with_files({"policy": _policy(study, i)}, place)["policy"])
         for i, label in enumerate(campaign.policies)
     ]
-    asked, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
+    spec, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
     reading = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
     for field in sorted(campaign.vary.keys() & set(FIELDS)):
         room, _, key = field.partition(".")
-        holder, within = (columns, field) if field in columns else (asked["vary"][field], "values")
+        holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
         varied = [with_files({room: {key: name}}, place) for name in holder[within]]
         holder[within] = [section[room][key] for section in varied]
         reading += varied
@@ -195,7 +196,7 @@ def make_plan(study: Study) -> CampaignPlan:
     return CampaignPlan(
         {
             "format": FORMAT,
-            "campaign": asked,
+            "campaign": spec,
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
@@ -233,18 +234,19 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
     return {name: section[name] for name in ("name", "params", "changes", "commands")}
 
 
-def _files(named: list[str]) -> dict[str, str]:
-    """Digests of the files that runs read beside the code, by path."""
-    paths = [Path(name) for name in named]
-    found = {}
-    for path in paths:
+def _files(names: list[str]) -> dict[str, str]:
+    """Digests of the files that runs read beside the code, by path; of Python files also of those that they import."""
+    digests = {}
+    for path in map(Path, names):
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        if path.suffix == ".py" and path.is_file():
+            inside = list(imported_files(path))
         for file in inside:
             try:
-                found[str(file)] = file_digest(file)
+                digests[str(file)] = file_digest(file)
             except OSError as error:
                 raise RunError(f"{file}: cannot be read: {error.strerror}") from None
-    return found
+    return digests
 
 
 def _check_metrics(study: Study, policies: Sequence[Mapping[str, Any]]) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pyarrow.compute as pc
 
+from sortie.scenarios.report_text import NONE, number, prefixed, table
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
-from sortie.sim.campaign.rows import CampaignRows, figure, figures, is_accuracy, judged, read_rows
+from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
-from sortie.sim.campaign.statistics import Estimate, Floats, estimate, paired
-from sortie.sim.campaign.winners import contexts, rule, winner
+from sortie.sim.campaign.statistics import Estimate, Floats, Paired, estimate, paired
+from sortie.sim.campaign.store import CampaignTable
+from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.folders import RunError, write_text
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
@@ -22,13 +25,15 @@ MAX_FAILED = 20
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.md and figures into a campaign's folder; returns the report's path.
+    """Write report.md, figures and the Parquet table into a campaign's folder; returns the report's path.
 
     Raises:
         RunError: no campaign there, nothing finished, or the disk refuses.
         ImportError: matplotlib is missing.
     """
     rows = read_rows(folder)
+    with closing(CampaignTable(folder)) as store:
+        store.export()
     try:
         pictures = {VARIED: False, PARETO: False}
         if _sampled(rows):
@@ -54,8 +59,8 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
         f"{len(plan.policies)} policies on the same draws; {failed} failed. Base scenario `{plan.campaign.base}`, "
         f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )
-    if (asked := plan.campaign.stop_when) is not None and _stopped(rows):
-        yield f"`stop_when` ended it: the interval of {asked.metric} is narrow enough."
+    if (stop := plan.campaign.stop_when) is not None and _stopped(rows):
+        yield f"`stop_when` ended it: the interval of {stop.metric} is narrow enough."
     if left := rows.all.num_rows - rows.table.num_rows:
         yield f"{left} of the runs are left out of all that follows: their {plan.unit} is not finished at every grid point."
     yield from _lost(rows)
@@ -93,30 +98,25 @@ def _lost(rows: CampaignRows) -> Iterator[str]:
 def _by_policy(rows: CampaignRows) -> Iterator[str]:
     labels = rows.plan.policies
     yield "\n## Metrics by policy\n"
-    yield _header("metric", *labels)
-    for metric in rows.plan.campaign.metrics:
-        means = rows.by_unit(metric)
-        yield _row(metric, *(_mean(rows, means[:, p]) for p in range(len(labels))))
+    yield from table(
+        ("metric", *labels),
+        ((metric, *(_mean(rows, m) for m in rows.by_unit(metric).T)) for metric in rows.plan.campaign.metrics),
+    )
     valued = with_values(rows)
     if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
         yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
     if len(labels) > 1 and _sampled(rows):
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
-        yield _header("metric", *labels[1:])
-        for metric in valued:
-            found = [paired(*rows.pair(metric, 0, p)) for p in range(1, len(labels))]
-            yield _row(
-                metric,
-                *(
-                    f"{_interval(f.difference, signed=True)}" + ("" if math.isnan(f.saved) else f" ×{f.saved:.3g}")
-                    for f in found
-                ),
-            )
+        others = range(1, len(labels))
+        yield from table(
+            ("metric", *labels[1:]),
+            ((metric, *(_difference(paired(*rows.pair(metric, 0, p))) for p in others)) for metric in valued),
+        )
 
 
 def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
     valued = with_values(rows)
-    metrics = judged(valued) or valued[:1]
+    metrics = winner_metrics(valued) or valued[:1]
     if not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## By varied field\n"
@@ -126,11 +126,14 @@ def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
         if missing := [name for name in (*valued, *rows.plan.campaign.vary) if name not in in_it]:
             yield f"Not in the figure, which has no more room: {', '.join(missing)}.\n"
     for metric in metrics:
-        yield _header(metric, "part", *rows.plan.policies)
-        for field in rows.plan.campaign.vary:
-            for label, _, mask in rows.bins(field):
-                means = rows.by_unit(metric, mask)
-                yield _row(field, label, *(_interval(estimate(means[:, p])) for p in range(means.shape[1])))
+        yield from table(
+            (metric, "part", *rows.plan.policies),
+            (
+                (field, label, *(_interval(estimate(m)) for m in rows.by_unit(metric, mask).T))
+                for field in rows.plan.campaign.vary
+                for label, _, mask in rows.bins(field)
+            ),
+        )
         yield ""
 
 
@@ -150,46 +153,51 @@ def _pareto(rows: CampaignRows, picture: bool) -> Iterator[str]:
 
 
 def _sensitivity(rows: CampaignRows) -> Iterator[str]:
-    found = [
+    results = [
         s
         for metric in rows.plan.campaign.metrics
         for p in range(len(rows.plan.policies))
         if (s := sensitivity(rows, metric, p)) is not None
     ]
-    if not found:
+    if not results:
         return
-    method = found[0].method
+    method = results[0].method
     yield f"\n## Sensitivity\n\n{MEANING[method]}\n"
     if method == "other":
-        if words := [f for f in rows.plan.campaign.vary if f not in found[0].fields]:
-            yield f"Fields of text have no ranks and are left out: {', '.join(words)}.\n"
-        yield _header("metric", "policy", *found[0].fields)
-        for s in found:
-            yield _row(s.metric, s.policy, *(f"{v:+.2f}" if not math.isnan(v) else "–" for v in s.figures[:, 0]))
+        if texts := [f for f in rows.plan.campaign.vary if f not in results[0].fields]:
+            yield f"Fields of text have no ranks and are left out: {', '.join(texts)}.\n"
+        yield from table(
+            ("metric", "policy", *results[0].fields),
+            ((s.metric, s.policy, *(number(v, "+.2f") for v in s.figures[:, 0])) for s in results),
+        )
         return
-    yield _header("metric", "policy", "field", *COLUMNS[method])
-    for s in found:
-        for field, row in zip(s.fields, s.figures.tolist(), strict=True):
-            yield _row(s.metric, s.policy, field, *(figure(v) for v in row))
+    yield from table(
+        ("metric", "policy", "field", *COLUMNS[method]),
+        (
+            (s.metric, s.policy, field, *(prefixed(v)[0] for v in row))
+            for s in results
+            for field, row in zip(s.fields, s.figures.tolist(), strict=True)
+        ),
+    )
 
 
 def _winners(rows: CampaignRows) -> Iterator[str]:
-    metrics = judged(with_values(rows))
+    metrics = winner_metrics(with_values(rows))
     if len(rows.plan.policies) < 2 or not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## Where the winner changes\n"
     for metric in metrics:
-        best, other = winner(rows, metric), contexts(rows, metric)
+        best, other = winner(rows, metric), other_winners(rows, metric)
         yield f"\n**{metric}**: {best} has the best mean over everything."
         if not other:
             yield "It has it in every part of every varied field, too."
         for c in other:
             sure = "surely" if c.sure else "not surely"
             yield f"- {c.field} {c.part}: {c.winner}, {sure}: {_interval(c.gain, signed=True)} over {best}"
-        if (found := rule(rows, metric)) is not None:
+        if (best_rule := rule(rows, metric)) is not None:
             yield (
-                f"\nBest one-threshold rule: {found.field} below {found.threshold:.3g} → {found.below}, above → "
-                f"{found.above}. Rules found on one half of the {rows.plan.unit}s gained {_interval(found.gain, signed=True)} over "
+                f"\nBest one-threshold rule: {best_rule.field} below {best_rule.threshold:.3g} → {best_rule.below}, above → "
+                f"{best_rule.above}. Rules found on one half of the {rows.plan.unit}s gained {_interval(best_rule.gain, signed=True)} over "
                 "the best fixed policy on the other half."
             )
     yield "\nIntervals of parts are widened for all parts looked at (Bonferroni)."
@@ -244,23 +252,20 @@ def _stopped(rows: CampaignRows) -> bool:
 
 
 def _mean(rows: CampaignRows, values: Floats) -> str:
-    found = estimate(values)
-    return _interval(found) if _sampled(rows) else figure(found.mean)
+    result = estimate(values)
+    return _interval(result) if _sampled(rows) else prefixed(result.mean)[0]
+
+
+def _difference(compared: Paired) -> str:
+    saved = "" if math.isnan(compared.saved) else f" ×{compared.saved:.3g}"
+    return _interval(compared.difference, signed=True) + saved
 
 
 def _interval(e: Estimate, *, signed: bool = False) -> str:
     if math.isnan(e.mean):
-        return "–"
+        return NONE
     plus = "+" if signed and e.mean >= 0 else ""
     if math.isnan(e.low) or e.low == e.high:
-        return f"{plus}{figure(e.mean)}"
-    mean, low, high = figures(e.mean, e.low, e.high)
+        return f"{plus}{prefixed(e.mean)[0]}"
+    mean, low, high = prefixed(e.mean, e.low, e.high)
     return f"{plus}{mean} [{low}, {high}]"
-
-
-def _header(*cells: str) -> str:
-    return f"{_row(*cells)}\n|{'---|' * len(cells)}"
-
-
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"

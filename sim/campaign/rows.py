@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sortie.sim.campaign.parts import columns, find_in_journal, journal_file, read_part, read_plan, row_of, shards
 from sortie.sim.campaign.plan import CampaignPlan
+from sortie.sim.campaign.store import CampaignTable
 from sortie.sim.folders import RunError
 
 Floats = NDArray[np.float64]
@@ -66,10 +67,10 @@ class CampaignRows:
         values = self.values(metric)
         mask = np.ones(len(values), bool) if mask is None else mask
         use = mask & ~np.isnan(values)
-        told = self._count(use)
+        counts = self._count(use)
         with np.errstate(invalid="ignore"):
-            of_points = self._count(use, values) / told
-            means = np.nansum(of_points, axis=1) / (told > 0).sum(axis=1)
+            of_points = self._count(use, values) / counts
+            means = np.nansum(of_points, axis=1) / (counts > 0).sum(axis=1)
         means[self.lost(mask).any(axis=1)] = math.nan
         return np.asarray(means[~np.isnan(means).all(axis=1)])
 
@@ -118,14 +119,14 @@ def read_rows(folder: Path) -> CampaignRows:
     """The finished parts of a campaign's folder.
 
     Raises:
-        RunError: no campaign there, no unit of it finished at all its grid points, or a part that is broken.
+        RunError: no campaign there, no unit of it finished at all its grid points, or a row that is broken.
     """
-    plan = read_plan(folder)
-    numbers = range(shards(plan))
-    parts = [part for n in numbers if (part := read_part(folder, plan, n)) is not None]
-    if not parts:
-        waiting = any(journal_file(folder, n).is_file() for n in numbers)
-        raise RunError(f"{folder}: no part is finished yet" + (", go on with the campaign" if waiting else ""))
+    with closing(CampaignTable(folder)) as store:
+        plan = store.plan
+        parts = [part for n in range(store.parts) if (part := store.part(n)) is not None]
+        if not parts:
+            go_on = "" if store.is_empty() else ", go on with the campaign"
+            raise RunError(f"{folder}: no part is finished yet{go_on}")
     table = pa.concat_tables(parts)
     unit = table["unit"].to_numpy()
     whole = np.bincount(unit)[unit] == plan.runs // plan.units
@@ -155,35 +156,18 @@ def is_accuracy(metric: str) -> bool:
     return "ap50" in parts and parts[-1] in ACCURACIES
 
 
-def find_row(folder: Path, run: int) -> dict[str, Any] | None:
-    """One run's row; None where it is not flown yet.
+def find_row(folder: Path, run: int) -> tuple[CampaignPlan, dict[str, Any] | None]:
+    """A campaign's plan and one run's row; None for a run that has not been flown yet.
 
     Raises:
-        RunError: no campaign there, no such run, or its part is broken.
+        RunError: no campaign there, no such run, or its row is broken.
     """
-    plan = read_plan(folder)
-    if not 0 <= run < plan.runs:
-        raise RunError(f"--run {run}: {folder} has runs 0 … {plan.runs - 1}")
-    table = read_part(folder, plan, run // plan.shard)
-    if table is None:
-        found = find_in_journal(folder, plan, run)
-        return None if found is None else row_of(plan, columns(plan), found)
-    row: dict[str, Any] = table.slice(run % plan.shard, 1).to_pylist()[0]
-    return row
+    with closing(CampaignTable(folder)) as store:
+        if not 0 <= run < store.plan.runs:
+            raise RunError(f"--run {run}: {folder} has runs 0 … {store.plan.runs - 1}")
+        return store.plan, store.row(run)
 
 
-def judged(metrics: Sequence[str]) -> list[str]:
-    """The metrics by which a winner is told: accuracies, or the first one of which it is known what is better."""
+def winner_metrics(metrics: Sequence[str]) -> list[str]:
+    """The metrics that decide a winner: accuracies, or else the first metric with a known better direction."""
     return [m for m in metrics if is_accuracy(m)] or [m for m in metrics if sign(m)][:1]
-
-
-def figures(*values: float) -> list[str]:
-    """Four digits that count, with one unit prefix for all of them beyond a thousand."""
-    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
-    limit, prefix = next(((x, p) for x, p in ((1e9, " G"), (1e6, " M"), (1e3, " k")) if largest >= x), (1.0, ""))
-    return ["–" if math.isnan(v) else f"{v / limit:.4g}{prefix}" for v in values]
-
-
-def figure(value: float) -> str:
-    """One of them."""
-    return figures(value)[0]

@@ -103,8 +103,8 @@ def _morris(points: Floats, y: Floats) -> Floats:
 
     if np.ptp(y) == 0:
         return np.zeros((points.shape[1], 3))
-    found = morris.analyze(unit_problem(points.shape[1]), points, y, num_levels=MORRIS_LEVELS, seed=0)
-    return np.column_stack([np.asarray(found[k], float) for k in ("mu_star", "mu_star_conf", "sigma")])
+    indices = morris.analyze(unit_problem(points.shape[1]), points, y, num_levels=MORRIS_LEVELS, seed=0)
+    return np.column_stack([np.asarray(indices[k], float) for k in ("mu_star", "mu_star_conf", "sigma")])
 
 
 def _saltelli(fields: int, y: Floats) -> Floats:
@@ -112,8 +112,8 @@ def _saltelli(fields: int, y: Floats) -> Floats:
 
     if np.ptp(y) == 0:
         return np.zeros((fields, 4))
-    found = sobol.analyze(unit_problem(fields), y, calc_second_order=False, seed=0)
-    return np.column_stack([np.asarray(found[k], float) for k in ("S1", "S1_conf", "ST", "ST_conf")])
+    indices = sobol.analyze(unit_problem(fields), y, calc_second_order=False, seed=1)  # SALib reads 0 as no seed
+    return np.column_stack([np.asarray(indices[k], float) for k in ("S1", "S1_conf", "ST", "ST_conf")])
 
 
 def _spearman(x: Floats, y: Floats) -> float:

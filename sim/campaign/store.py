@@ -1,46 +1,146 @@
-"""A campaign's folder while it runs: what is finished stays, whatever happens to the driver. `parts.py` has the files."""
+"""A campaign's folder: one SQLite file with the plan and a row per finished run, and the Parquet table made of it.
+
+    campaign.sqlite     the plan, and the rows; a row is committed before progress counts it
+    runs/table.parquet  the rows of finished parts, in the order of runs; written at the end and with every report
+
+A part is a fixed stretch of runs. The table is a function of the rows alone, so an interruption leaves no trace in it.
+"""
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import sqlite3
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sortie.sim.campaign.parts import (
-    JOURNAL,
-    MANIFEST,
-    RUNS,
-    BrokenPartError,
-    check_same,
-    columns,
-    journal_file,
-    line_of,
-    part_file,
-    read_lines,
-    read_part,
-    row_of,
-    runs_of,
-    schema_of,
-    shards,
-)
-from sortie.sim.campaign.plan import CampaignPlan
+from sortie.scenarios.schema.campaign import Choice, Column, Grid
+from sortie.sim.campaign.plan import FORMAT, CampaignPlan
 from sortie.sim.campaign.work import RunResult
-from sortie.sim.folders import RunError, ensure_folder, partial_file, sync_folder, write_durably
+from sortie.sim.folders import RunError, ensure_folder, writing_durably
 
-LOCK = ".lock"
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FILE, TABLE, LOCK = "campaign.sqlite", "runs/table.parquet", ".lock"
+FIXED: dict[str, pa.DataType] = {
+    "run": pa.int64(), "unit": pa.int64(), "cell": pa.int64(), "replication": pa.int64(), "policy": pa.string(),
+    "seed": pa.int64(), "status": pa.string(), "error": pa.string(), "fingerprint": pa.string(), "key": pa.string(),
+}  # fmt: skip
+"""Columns of every table. Each varied field (its value) and each metric (float, null without one) adds a column."""
+TIMEOUT_S = 60
+"""How long a driver waits for a report that reads, and a report for a driver that writes."""
+_DISK = {
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_BUSY,
+}
 
 
-class CampaignStore:
-    """The folder while a campaign runs: rows go in, finished parts come out.
+class CampaignTable:
+    """The rows of a campaign's folder, for reading; a driver may write at the same time.
+
+    Raises:
+        RunError: no campaign there, or a file that is broken or of another format.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        if not (folder / FILE).is_file():
+            raise RunError(f"{folder}: no campaign there ({FILE} is missing)")
+        self._db = sqlite3.connect(folder / FILE, timeout=TIMEOUT_S)
+        try:
+            with _errors(folder):
+                plan = _plan(self._db, folder)
+            if plan is None:
+                raise RunError(f"{folder}: no campaign there ({FILE} is empty)")
+            self._use(plan)
+        except BaseException:
+            self._db.close()
+            raise
+
+    def _use(self, plan: CampaignPlan) -> None:
+        self.plan = plan
+        self._schema = pa.schema(list(columns(plan).items()), {"sortie.campaign": plan.digest})
+        self.parts = -(-plan.runs // plan.shard)
+
+    def runs_of(self, part: int) -> range:
+        """The runs of a part."""
+        return range(part * self.plan.shard, min(self.plan.runs, (part + 1) * self.plan.shard))
+
+    def part(self, part: int) -> pa.Table | None:
+        """The rows of a part in the order of runs; None until all of them are there.
+
+        Raises:
+            RunError: one is broken.
+        """
+        runs = self.runs_of(part)
+        rows = list(self._rows(runs.start, runs.stop))
+        return pa.Table.from_pylist(rows, schema=self._schema) if len(rows) == len(runs) else None
+
+    def row(self, run: int) -> dict[str, Any] | None:
+        """One run's row; None where it has not been flown. Raises RunError where it is broken."""
+        return next(self._rows(run, run + 1), None)
+
+    def is_empty(self) -> bool:
+        """Whether no run has a row yet."""
+        with _errors(self.folder):
+            return self._db.execute("SELECT run FROM rows LIMIT 1").fetchone() is None
+
+    def export(self) -> None:
+        """Write the finished parts as a Parquet table.
+
+        Raises:
+            RunError: the disk refuses, or a row is broken.
+        """
+        path = self.folder / TABLE
+        with _errors(self.folder):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with (self.folder / ".table.lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # a report and a driver may write at the same time
+                with (
+                    writing_durably(path) as file,
+                    pq.ParquetWriter(file, self._schema, compression="zstd", write_page_checksum=True) as writer,
+                ):
+                    for table in filter(None, map(self.part, range(self.parts))):
+                        writer.write_table(table)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def _rows(self, start: int, stop: int) -> Iterator[dict[str, Any]]:
+        for run, row in self._read(start, stop):
+            if row is None:
+                raise RunError(
+                    f"{self.folder / FILE}: the row of run {run} is broken; the campaign's command flies it again"
+                )
+            yield row
+
+    def _read(self, start: int, stop: int) -> Iterator[tuple[int, dict[str, Any] | None]]:
+        """Runs and their rows, in order; None for a row whose checksum is wrong."""
+        ask = "SELECT run, row, checksum FROM rows WHERE run >= ? AND run < ? ORDER BY run"
+        with _errors(self.folder):
+            for run, text, checksum in self._db.execute(ask, (start, stop)):
+                yield (
+                    run,
+                    dict(zip(self._schema.names, json.loads(text), strict=True))
+                    if checksum == self._checksum(run, text)
+                    else None,
+                )
+
+    def _checksum(self, run: int, text: Any) -> int:
+        """Of a row of this campaign: a row that was copied from another has another checksum."""
+        return zlib.crc32(f"{self.plan.digest} {run} {text}".encode(errors="replace"))
+
+
+class CampaignStore(CampaignTable):
+    """The folder while a campaign runs.
 
     Raises:
         RunError: a folder that cannot be used, that another driver uses, or that holds another campaign's results.
@@ -49,233 +149,119 @@ class CampaignStore:
     def __init__(
         self, folder: Path, plan: CampaignPlan, *, resume_only: bool = False, retry_failed: bool = False
     ) -> None:
-        self.folder, self.plan = folder, plan
-        self._columns = columns(plan)
-        self._journals: dict[int, Any] = {}
+        self.folder = folder
+        self._use(plan)
         ensure_usable(folder, plan)
-        if resume_only and not (folder / MANIFEST).is_file():
-            raise RunError(f"{folder}: no campaign there to resume ({MANIFEST} is missing)")
-        with self._disk():
-            for path in (folder / RUNS, folder / JOURNAL):
-                path.mkdir(parents=True, exist_ok=True)
-            self._lock = (folder / JOURNAL / LOCK).open("w")
+        if resume_only and not (folder / FILE).is_file():
+            raise RunError(f"{folder}: no campaign there to resume ({FILE} is missing)")
+        with _errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (folder / LOCK).open("w")
+        self._db = sqlite3.connect(folder / FILE, timeout=TIMEOUT_S)  # makes no file before it is used
         try:
-            self._take(retry_failed)
+            self._open(retry_failed)
         except BaseException:
-            self._lock.close()
+            self.close()
             raise
 
-    def _take(self, retry_failed: bool) -> None:
-        """Lock the folder and take up what is in it."""
+    def _open(self, retry_failed: bool) -> None:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise RunError(f"{self.folder}: another driver is at work there") from None
-        check_same(self.folder, self.plan)  # once more: another driver may have begun before the lock
-        self._left = {shard: len(self.runs_of(shard)) for shard in range(self.shards)}
-        self._known: dict[int, set[int]] = {}
-        self._failed: dict[int, int] = {}
-        self._again: dict[int, list[int]] = {}
-        with self._disk():
-            if not (self.folder / MANIFEST).is_file():
-                text = json.dumps({"digest": self.plan.digest, "spec": self.plan.spec}, indent=1) + "\n"
-                write_durably(self.folder / MANIFEST, text.encode())
-            self._recover(retry_failed)
-
-    @contextmanager
-    def _disk(self) -> Iterator[None]:
-        """A disk that refuses is told in one line."""
-        try:
-            yield
-        except OSError as error:
-            when = " once there is room" if error.errno in FULL else ""
-            raise RunError(
-                f"{self.folder}: cannot be written: {error.strerror or error}; what is finished is kept, "
-                f"the same command goes on{when}"
-            ) from error
-
-    # --- parts and what is in them -----------------------------------------------------------------
-
-    @property
-    def shards(self) -> int:
-        """Parts of the whole campaign."""
-        return shards(self.plan)
-
-    def runs_of(self, shard: int) -> range:
-        """The runs of a part."""
-        return runs_of(self.plan, shard)
-
-    def is_done(self, shard: int) -> bool:
-        """Whether a part is written."""
-        return self._left[shard] == 0
-
-    @property
-    def finished(self) -> int:
+        with _errors(self.folder):
+            self._db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
+            if _check_same(self._db, self.folder, self.plan):
+                with self._db:
+                    self._db.execute("BEGIN")
+                    self._db.execute("CREATE TABLE plan (digest TEXT, spec TEXT)")
+                    self._db.execute("CREATE TABLE rows (run INTEGER PRIMARY KEY, row TEXT, checksum INTEGER)")
+                    self._db.execute("INSERT INTO plan VALUES (?, ?)", (self.plan.digest, json.dumps(self.plan.spec)))
+        self._done = bytearray(self.plan.runs)
+        self.failed = 0
+        """Runs on disk that failed."""
+        for run, row in self._read(0, self.plan.runs):
+            failed = row is not None and row["status"] == "failed"
+            if row is not None and not (failed and retry_failed):
+                self._done[run] = 1
+                self.failed += failed
+        self.finished = sum(self._done)
         """Runs whose rows are on disk."""
-        return self.plan.runs - sum(self._left.values())
 
-    @property
-    def failed(self) -> int:
-        """Of those, the ones that failed."""
-        return sum(self._failed.values())
+    def is_done(self, part: int) -> bool:
+        """Whether all rows of a part are on disk."""
+        runs = self.runs_of(part)
+        return self._done.find(0, runs.start, runs.stop) < 0
 
-    def missing(self, shards: Iterable[int] | None = None) -> Iterator[int]:
+    def missing(self) -> Iterator[int]:
         """Runs that have no row yet, in order."""
-        for shard in range(self.shards) if shards is None else shards:
-            if shard in self._again:
-                yield from self._again[shard]
-            elif not self.is_done(shard):
-                known = self._known.get(shard, set())
-                yield from (run for run in self.runs_of(shard) if run not in known)
+        return (run for run in range(self.plan.runs) if not self._done[run])
 
-    def add(self, results: Sequence[RunResult]) -> list[int]:
-        """Put rows on disk; returns the parts that became complete by them.
+    def add(self, results: Sequence[RunResult]) -> None:
+        """Put rows on disk; a row that is there already stays.
 
         Raises:
-            RunError: the disk refuses; what was added before stays.
+            RunError: the disk refuses; none of these rows is kept, those added before are.
         """
-        by_shard: dict[int, list[RunResult]] = {}
-        for result in results:
-            by_shard.setdefault(result.run // self.plan.shard, []).append(result)
-        complete = []
-        with self._disk():
-            for shard, found in by_shard.items():
-                if self.is_done(shard):
-                    continue  # a worker thought dead may answer after all
-                if shard in self._again:
-                    self._open_again(shard)
-                known = self._known.setdefault(shard, set())
-                rows = list({r.run: r for r in found if r.run not in known}.values())
-                if not rows:
-                    continue
-                self._append(shard, rows)
-                known.update(row.run for row in rows)
-                self._left[shard] -= len(rows)
-                self._failed[shard] = self._failed.get(shard, 0) + sum(row.status == "failed" for row in rows)
-                if self.is_done(shard):
-                    self._write_part(shard)
-                    complete.append(shard)
-        return complete
+        new = {r.run: r for r in results if not self._done[r.run]}  # a worker thought dead may answer after all
+        with _errors(self.folder), self._db:
+            for run, result in new.items():
+                text = json.dumps(list(row_of(self.plan, self._schema, result).values()))
+                self._db.execute("REPLACE INTO rows VALUES (?, ?, ?)", (run, text, self._checksum(run, text)))
+        for run, result in new.items():
+            self._done[run] = 1
+            self.failed += result.status == "failed"
+        self.finished += len(new)
 
-    def rows(self, shard: int) -> pa.Table:
-        """A finished part."""
-        table = read_part(self.folder, self.plan, shard)
-        if table is None:
-            raise RunError(f"{part_file(self.folder, shard)}: is gone; the same command flies it again")
-        return table
-
-    def drop_after(self, shard: int) -> None:
-        """Forget what was flown beyond a part: the campaign has stopped there."""
-        for beyond in range(shard + 1, self.shards):
-            self._close_journal(beyond)
-            self._failed.pop(beyond, None)
-            for path in (journal_file(self.folder, beyond), part_file(self.folder, beyond)):
-                path.unlink(missing_ok=True)
+    def drop_after(self, part: int) -> None:
+        """Remove what was flown beyond a part: the campaign has stopped there."""
+        stop = self.runs_of(part).stop
+        with _errors(self.folder), self._db:
+            self._db.execute("DELETE FROM rows WHERE run >= ?", (stop,))
+        self.failed = sum(row["status"] == "failed" for row in self._rows(0, stop))
 
     def close(self) -> None:
-        """Let the folder go."""
-        for shard in list(self._journals):
-            self._close_journal(shard)
+        """Release the folder."""
+        super().close()
         self._lock.close()
 
-    # --- on disk -----------------------------------------------------------------------------------
 
-    def _append(self, shard: int, rows: Sequence[RunResult]) -> None:
-        """Rows into a journal, on disk at the return; where the disk refuses, none of them."""
-        if shard not in self._journals:
-            self._journals[shard] = journal_file(self.folder, shard).open("ab", buffering=0)
-            sync_folder(self.folder / JOURNAL)
-        file = self._journals[shard]
-        begin = os.fstat(file.fileno()).st_size
-        try:
-            left = memoryview(b"".join(map(line_of, rows)))
-            while left:  # a disk or quota that is nearly full takes a part of them, and that is no exception
-                taken = file.write(left)
-                if not taken:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                left = left[taken:]
-            os.fsync(file.fileno())
-        except OSError:
-            os.truncate(file.fileno(), begin)  # a line after a torn one would not be read
-            raise
+def columns(plan: CampaignPlan) -> dict[str, pa.DataType]:
+    """The table's columns and their types."""
+    types = dict(FIXED)
+    for name, spread in plan.campaign.vary.items():
+        values: Sequence[Any] = ()
+        if isinstance(spread, Choice | Grid):
+            values = spread.values
+        elif isinstance(spread, Column):
+            values = plan.spec["columns"][name]
+        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        types[name] = pa.float64() if numbers else pa.string()
+    for name in plan.campaign.metrics:
+        if name in types:
+            raise RunError(f"metrics: {name}, is the name of another column")
+        types[name] = pa.float64()
+    return types
 
-    def _close_journal(self, shard: int) -> None:
-        if shard in self._journals:
-            self._journals.pop(shard).close()
 
-    def _write_part(self, shard: int) -> None:
-        results = {r.run: r for r in read_lines(journal_file(self.folder, shard))[0]}
-        rows = [row_of(self.plan, self._columns, results[run]) for run in self.runs_of(shard)]
-        table = pa.Table.from_pylist(rows, schema=schema_of(self.plan))
-        file = pa.BufferOutputStream()
-        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-        write_durably(part_file(self.folder, shard), file.getvalue().to_pybytes())
-        self._close_journal(shard)
-        journal_file(self.folder, shard).unlink(missing_ok=True)
-        self._known.pop(shard, None)
-
-    def _recover(self, retry_failed: bool) -> None:
-        """Take up what an earlier driver left; a broken part, a torn line, or a row of another key counts as not flown.
-        Files that are not named as the plan's own are left alone."""
-        for path in (self.folder / RUNS).glob(".part-*.partial"):
-            path.unlink()
-        for shard in range(self.shards):
-            if not self._recover_part(shard, retry_failed):
-                self._recover_journal(shard, retry_failed)
-
-    def _recover_part(self, shard: int, retry_failed: bool) -> bool:
-        """Whether a part is whole; its failed runs are to be flown again where that is asked."""
-        try:
-            table = read_part(self.folder, self.plan, shard)
-        except BrokenPartError:
-            return False  # it stays until its runs are flown and take its place
-        if table is None:
-            return False
-        failed = [
-            run
-            for run, ended in zip(self.runs_of(shard), table["status"].to_pylist(), strict=True)
-            if ended == "failed"
-        ]
-        journal_file(self.folder, shard).unlink(missing_ok=True)
-        if retry_failed and failed:
-            self._again[shard], self._left[shard] = failed, len(failed)
-        else:
-            self._failed[shard], self._left[shard] = len(failed), 0
-        return True
-
-    def _recover_journal(self, shard: int, retry_failed: bool) -> None:
-        path = journal_file(self.folder, shard)
-        if not path.is_file():
-            return
-        results, good = read_lines(path)
-        os.truncate(path, good)
-        kept = {r.run: r for r in results if r.run in self.runs_of(shard) and r.key == self.plan.key(r.run)}
-        if retry_failed:
-            kept = {run: r for run, r in kept.items() if r.status != "failed"}
-        if len(kept) < len(results):  # anew, without the others
-            write_durably(path, b"".join(map(line_of, kept.values())))
-        self._known[shard] = set(kept)
-        self._left[shard] -= len(kept)
-        self._failed[shard] = sum(r.status == "failed" for r in kept.values())
-        if self._left[shard] == 0:
-            self._write_part(shard)
-
-    def _open_again(self, shard: int) -> None:
-        """A part back to a journal, without the rows that failed; at the first new row, so that until then it stands."""
-        metrics = self.plan.campaign.metrics
-        kept = [
-            RunResult(
-                row["run"], row["key"], row["status"], row["error"], row["fingerprint"], tuple(row[m] for m in metrics)
-            )
-            for row in self.rows(shard).to_pylist()
-            if row["status"] != "failed"
-        ]
-        # a driver killed between these two finds the part whole, and the journal goes
-        write_durably(journal_file(self.folder, shard), b"".join(map(line_of, kept)))
-        part_file(self.folder, shard).unlink()
-        sync_folder(self.folder / RUNS)  # before a new row: a part that came back would take its place
-        self._known[shard] = {result.run for result in kept}
-        del self._again[shard]
+def row_of(plan: CampaignPlan, schema: pa.Schema, result: RunResult) -> dict[str, Any]:
+    """A result's row of the table, its columns in the schema's order."""
+    at = plan.at(result.run)
+    varied = {
+        name: json.dumps(value) if schema.field(name).type == pa.string() and not isinstance(value, str) else value
+        for name, value in plan.varied(at.cell).items()
+    }
+    return {
+        **at._asdict(),
+        "policy": plan.policies[at.policy],
+        "seed": plan.seed(at.cell),
+        "status": result.status,
+        "error": result.error,
+        "fingerprint": result.fingerprint,
+        "key": result.key,
+        **varied,
+        **dict(zip(plan.campaign.metrics, result.values, strict=True)),
+    }
 
 
 def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
@@ -284,12 +270,66 @@ def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
     Raises:
         RunError: it cannot be written, or holds something else than this campaign.
     """
-    if not _is_begun(folder):
-        ensure_folder(folder, MANIFEST, "campaign")
-    check_same(folder, plan)
+    if (folder / FILE).is_file():
+        with _errors(folder), closing(sqlite3.connect(folder / FILE, timeout=TIMEOUT_S)) as db:
+            _check_same(db, folder, plan)
+    elif not folder.is_dir() or [path.name for path in folder.iterdir()] != [LOCK]:
+        ensure_folder(folder, FILE, "campaign")
 
 
-def _is_begun(folder: Path) -> bool:
-    """Whether a driver broke off there before it wrote the manifest: nothing but its own folders, and no rows."""
-    own = {RUNS, JOURNAL, partial_file(Path(MANIFEST)).name, f"{JOURNAL}/{LOCK}"}
-    return folder.is_dir() and all(p.relative_to(folder).as_posix() in own for p in folder.rglob("*"))
+def _check_same(db: sqlite3.Connection, folder: Path, plan: CampaignPlan) -> bool:
+    """Refuse results of another campaign, or of other code; returns whether there are none yet."""
+    old, spec = _plan(db, folder), json.loads(json.dumps(plan.spec))
+    if old is None or old.digest == plan.digest:
+        return old is None
+    if {**old.spec, "code": 0} == {**spec, "code": 0}:
+        raise RunError(f"{folder}: holds results of Sortie {old.code}, this is {plan.code}; name another folder")
+    differs = next(key for key in spec if old.spec.get(key) != spec[key])
+    raise RunError(
+        f"{folder}: holds results of another campaign, its {_name(old.spec, spec, differs)} differs; name another folder"
+    )
+
+
+def _name(old: Mapping[str, Any], new: Mapping[str, Any], key: str) -> str:
+    """A specification's field that differs, named to its second level."""
+    a, b = old.get(key), new[key]
+    if isinstance(a, dict) and isinstance(b, dict):
+        return f"{key}.{next(k for k in {**b, **a} if a.get(k) != b.get(k))}"
+    return key
+
+
+def _plan(db: sqlite3.Connection, folder: Path) -> CampaignPlan | None:
+    """The plan that a file holds; None where a driver broke off before it wrote one."""
+    if db.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
+        return None
+    digest, text = db.execute("SELECT digest, spec FROM plan").fetchone()
+    spec = json.loads(text)
+    if spec["format"] != FORMAT:
+        raise RunError(f"{folder}: holds results of format {spec['format']}, must be {FORMAT}; name another folder")
+    plan = CampaignPlan(spec)
+    if plan.digest != digest:
+        raise RunError(f"{folder / FILE}: was changed by hand, its digest is another")
+    return plan
+
+
+@contextmanager
+def _errors(folder: Path) -> Iterator[None]:
+    """What a disk or a broken file does, as one line."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF not in _DISK:
+            raise RunError(f"{folder / FILE}: is broken ({error}); remove it to fly the campaign again") from error
+        raise _refused(folder, str(error)) from error
+    except OSError as error:
+        raise _refused(folder, error.strerror or str(error)) from error
+    except RunError:
+        raise
+    except (ValueError, TypeError, KeyError) as error:
+        raise RunError(f"{folder / FILE}: is broken ({error}); remove it to fly the campaign again") from error
+
+
+def _refused(folder: Path, reason: str) -> RunError:
+    return RunError(
+        f"{folder}: cannot be written: {reason}; what is finished is kept, the same command goes on once this is put right"
+    )

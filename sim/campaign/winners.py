@@ -1,4 +1,4 @@
-"""In which contexts another policy wins: the flip, looked for in a campaign's own rows."""
+"""In which conditions another policy wins: the flip, looked for in a campaign's own rows."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def winner(rows: CampaignRows, metric: str) -> str:
     return rows.plan.policies[_first(sign(metric) * rows.by_unit(metric))]
 
 
-def contexts(rows: CampaignRows, metric: str) -> list[OtherWinner]:
+def other_winners(rows: CampaignRows, metric: str) -> list[OtherWinner]:
     """Every part of every varied field in which another policy than the overall winner has the best mean."""
     policies = rows.plan.policies
     best = policies.index(winner(rows, metric))
     parts = [(field, *part) for field in rows.plan.campaign.vary for part in rows.bins(field)]
     level = 1 - (1 - LEVEL) / max(1, len(parts) * (len(policies) - 1))
-    found = []
+    others = []
     for field, label, _, mask in parts:
         means = sign(metric) * rows.by_unit(metric, mask)
         if not len(means):
@@ -59,8 +59,8 @@ def contexts(rows: CampaignRows, metric: str) -> list[OtherWinner]:
         here = _first(means)
         if here != best:
             gain = estimate(means[:, here] - means[:, best], level)
-            found.append(OtherWinner(field, label, policies[here], gain))
-    return found
+            others.append(OtherWinner(field, label, policies[here], gain))
+    return others
 
 
 def _first(means: Floats) -> int:
@@ -83,10 +83,10 @@ def rule(rows: CampaignRows, metric: str) -> Rule | None:
     even = number % 2 == 0
     gains: list[float] = []
     for learn, judge in ((even, ~even), (~even, even)):
-        found = _best({k: v[learn] for k, v in x.items()}, y[learn])
-        if found is None:
+        fitted = _best({k: v[learn] for k, v in x.items()}, y[learn])
+        if fitted is None:
             return None
-        field, threshold, below, above = found
+        field, threshold, below, above = fitted
         fixed = int(np.argmax(y[learn].mean(axis=0)))
         chosen = np.where(x[field][judge] < threshold, y[judge][:, below], y[judge][:, above])
         gain, of = chosen - y[judge][:, fixed], number[judge]
@@ -123,7 +123,7 @@ def _cells(rows: CampaignRows, metric: str) -> tuple[NDArray[np.int64], dict[str
 
 def _best(x: dict[str, Floats], y: Floats) -> tuple[str, float, int, int] | None:
     """The threshold with the highest mean, at least an eighth of the cells on either side; ties go to the first."""
-    best, found = -math.inf, None
+    best, split = -math.inf, None
     least = max(2, len(y) // 8)
     for field, values in x.items():
         order = np.argsort(values, kind="stable")
@@ -135,5 +135,5 @@ def _best(x: dict[str, Floats], y: Floats) -> tuple[str, float, int, int] | None
             below, above = int(np.argmax(upto[i - 1])), int(np.argmax(upto[-1] - upto[i - 1]))
             score = float(upto[i - 1, below] + upto[-1, above] - upto[i - 1, above])
             if score > best + 1e-12:
-                best, found = score, (field, float((ordered[i - 1] + ordered[i]) / 2), below, above)
-    return found
+                best, split = score, (field, float((ordered[i - 1] + ordered[i]) / 2), below, above)
+    return split

@@ -92,21 +92,21 @@ def unpack(task: str) -> tuple[Scenario, int, int]:
     Raises:
         ValidationError: a drawn value that the schema does not allow.
     """
-    asked = json.loads(task)
-    scenario = Scenario.model_validate_json(json.dumps(asked["scenario"]), strict=True)
-    return scenario, asked["seed"], asked["replication"]
+    fields = json.loads(task)
+    scenario = Scenario.model_validate_json(json.dumps(fields["scenario"]), strict=True)
+    return scenario, fields["seed"], fields["replication"]
 
 
 def _fly(run: int, task: str, code: str) -> RunResult:
-    asked, key = json.loads(task), task_key(task, code)
-    for path, digest in asked["files"].items():
+    fields, key = json.loads(task), task_key(task, code)
+    for path, digest in fields["files"].items():
         _check_file(path, digest)
     try:
         record = fly_task(task)
         result = outcome(record)
-        values = tuple(number(result, name) for name in asked["metrics"])
+        values = tuple(number(result, name) for name in fields["metrics"])
     except Exception as error:  # whatever it is, the other runs go on
-        return RunResult(run, key, "failed", _in_one_line(error), "", (None,) * len(asked["metrics"]))
+        return RunResult(run, key, "failed", _in_one_line(error), "", (None,) * len(fields["metrics"]))
     return RunResult(run, key, "done", "", record.fingerprint[:16], values)
 
 

@@ -1,4 +1,4 @@
-"""Fly a scenario as often as its expectations ask for, and hold what comes out against them. For command line and pytest."""
+"""Fly a scenario as often as its expectations need, and compare the outcomes with them. For the command line and pytest."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sortie.scenarios.reading.files import named_files
 from sortie.scenarios.reading.load import library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.check.expectations import Verdict, check
-from sortie.sim.check.golden import golden_path, moved, named_from, write_golden
+from sortie.sim.check.golden import differences, golden_path, with_relative_files, write_golden
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.results.explain import why
+from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 SHOWN = 4
-"""Moved golden figures that a verdict names."""
+"""How many changed figures of a golden outcome a verdict names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,18 +30,18 @@ class Checked:
     scenario: Scenario
     verdicts: tuple[Verdict, ...]
     command: tuple[str, ...]
-    """Which flies it."""
+    """The command that flies it."""
     written: str = ""
-    """Which golden outcome was written, in words; empty if none was."""
+    """A line that names the golden outcome that was written; empty if none was."""
 
     @property
     def failed(self) -> list[Verdict]:
         return [v for v in self.verdicts if not v.holds]
 
     def replay(self, verdict: Verdict) -> str:
-        """The command that shows the sortie that a verdict is best seen in."""
-        again = ["--replication", str(verdict.replication)] if verdict.replication else []
-        return shlex.join([*self.command, *again, "--view"])
+        """The command that plays the replication that shows a verdict best."""
+        option = ["--replication", str(verdict.replication)] if verdict.replication else []
+        return shlex.join([*self.command, *option, "--view"])
 
 
 def check_scenario(
@@ -65,32 +65,15 @@ def check_scenario(
     scenario = load(path_or_name, overrides)
     record = run_sortie(scenario, progress=progress)
     result = outcome(record)
-    results = [result, *_more(scenario, progress)]
-    verdicts = [_explained(v, scenario, record, results) for v in check(scenario, record, result, results)]
+    results = [result, *_replicate(scenario, progress)]
+    verdicts = [_with_explanation(v, scenario, record, results) for v in check(scenario, record, result, results)]
     golden = golden_path(library().get(path_or_name, Path(path_or_name)))
-    portable = named_from(golden.parent, result, named_files(scenario.model_dump(mode="json")))
+    portable = with_relative_files(golden.parent, result, named_files(scenario.model_dump(mode="json")))
     written = write_golden(golden, portable) if update else ""
     if golden.is_file() and not overrides and not update:
         verdicts.append(_golden(golden, portable))
     command = ("sortie", "fly", path_or_name, *(x for o in overrides for x in ("--set", o)))
     return Checked(scenario, tuple(verdicts), command, written)
-
-
-def scenario_files(place: str | Path) -> list[str]:
-    """What `place` names: itself, or, where it is a folder, every scenario file below it that expects something.
-
-    Raises:
-        RunError: a folder without any.
-    """
-    from sortie.sim.check.plugin import is_scenario
-
-    folder = Path(place)
-    if str(place) in library() or not folder.is_dir():
-        return [str(place)]
-    found = sorted(str(path) for path in folder.rglob("*.y*ml") if is_scenario(path))
-    if not found:
-        raise RunError(f"{folder}: no scenario below it expects anything")
-    return found
 
 
 def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
@@ -104,38 +87,38 @@ def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
 
 
 def flights(scenario: Scenario) -> int:
-    """Sorties that its expectations ask for."""
+    """How many sorties its expectations need."""
     return max([1, *(e.replications for e in scenario.expect if e.replications is not None)])
 
 
-def _more(scenario: Scenario, progress: Callable[[float], None] | None) -> list[dict[str, Any]]:
-    found = []
+def _replicate(scenario: Scenario, progress: Callable[[float], None] | None) -> list[dict[str, Any]]:
+    outcomes = []
     for replication in range(1, flights(scenario)):
         begin_s = replication * scenario.duration_s
         watch = None if progress is None else (lambda t_s, b=begin_s: progress(b + t_s))
-        found.append(outcome(run_sortie(scenario, replication=replication, progress=watch)))
-    return found
+        outcomes.append(outcome(run_sortie(scenario, replication=replication, progress=watch)))
+    return outcomes
 
 
-def _explained(
+def _with_explanation(
     verdict: Verdict, scenario: Scenario, record: SortieRecord, results: Sequence[dict[str, Any]]
 ) -> Verdict:
-    """With the reason from the record of its replication, which is flown again where it is not the first: kept are
-    outcomes alone."""
+    """A failed verdict with facts from the record of its replication. Only the first replication's record is kept, so
+    another one is flown once more."""
     if verdict.holds or not verdict.metric:
         return verdict
     k = verdict.replication
-    shown = record if k == 0 else run_sortie(scenario, replication=k)
-    return replace(verdict, why=why(verdict.metric, shown, results[k]))
+    flight = record if k == 0 else run_sortie(scenario, replication=k)
+    return replace(verdict, explanation=explain_metric(verdict.metric, flight, results[k]))
 
 
 def _golden(path: Path, result: dict[str, Any]) -> Verdict:
-    found = moved(path, result)
-    shown = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(found.items())[:SHOWN])
-    more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-    got = f"{len(found)} moved: {shown}{more}" if found else "the same"
+    moved = differences(path, result)
+    listed = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(moved.items())[:SHOWN])
+    more = f"; and {len(moved) - SHOWN} more" if len(moved) > SHOWN else ""
+    got = f"{len(moved)} moved: {listed}{more}" if moved else "the same"
     renew = "renew it with --update (pytest: --sortie-update) where it was meant to move"
-    return Verdict(f"the outcome in {path.name}", got, not found, renew)
+    return Verdict(f"the outcome in {path.name}", got, not moved, renew)
 
 
 def _short(value: Any) -> str:

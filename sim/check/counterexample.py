@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
+from sortie.policies.contract import PHASE_NAMES, Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
 from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.proof import RepeatableView
 from sortie.policies.verification.views import to_json
@@ -46,7 +46,7 @@ def replay_scenario(
     period_s, ego = view.period_s, view.ego
     views = [view] if raised_age_s is None else [view, view._replace(age_s=dict(raised_age_s))]
     me = view.me
-    phase = "search" if me is None else TaskPhase(me.task_phase).name.lower()
+    phase = "search" if me is None else PHASE_NAMES[TaskPhase(me.task_phase)]
     return Scenario.model_validate(
         {
             "name": slug(rule),

@@ -1,4 +1,4 @@
-"""A scenario's own expectations, held against its outcome."""
+"""Compare an outcome with its scenario's own expectations."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One expectation, what was got, and whether it holds."""
+    """One expectation, the value that came out, and whether the expectation holds."""
 
     expected: str
     got: str
     holds: bool
     because: str
     metric: str = ""
-    """The metric that it is about; empty for decisions and golden outcomes."""
-    why: str = ""
-    """What the record says about it, where it does not hold."""
+    """The expectation's metric; empty for decisions and golden outcomes."""
+    explanation: str = ""
+    """Facts from the record, where the expectation fails."""
     replication: int = 0
-    """Which one shows it best."""
+    """The replication that shows the result best."""
 
 
 def metric(result: dict[str, Any], dotted: str) -> Any:
@@ -96,7 +96,7 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
         return Verdict(expected, error.args[0], False, expectation.because, name)
     holds = True
     if expectation.equals is not None:
-        truths = [isinstance(x, bool) for x in (got, expectation.equals)]  # which are numbers to Python, and not here
+        truths = [isinstance(x, bool) for x in (got, expectation.equals)]  # Python counts them as numbers
         holds = got == expectation.equals and truths[0] == truths[1]
         if not any(truths) and isinstance(got, int | float) and isinstance(expectation.equals, int | float):
             holds = abs(got - expectation.equals) <= max(TOLERANCE, slack)
@@ -115,7 +115,7 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
 def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
     """The mean over replications lies within each bound with the confidence asked for: Student's one-sided limit.
 
-    An expectation holds where the replications show it; one that they leave open fails, and more of them may settle it.
+    An expectation that the replications leave open fails; more replications may settle it.
     """
     assert e.replications is not None and e.confidence is not None  # noqa: S101, PT018
     expected, values = in_words(e), []

@@ -1,4 +1,4 @@
-"""Golden outcomes: `NAME.golden.json` beside `NAME.yaml` holds what a scenario came to, renewed only when asked to."""
+"""Golden outcomes: `NAME.golden.json` beside `NAME.yaml` holds a scenario's outcome; only `--update` renews it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def figures(result: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def named_from(folder: Path, result: dict[str, Any], files: Iterable[str]) -> dict[str, Any]:
+def with_relative_files(folder: Path, result: dict[str, Any], files: Iterable[str]) -> dict[str, Any]:
     """The outcome with its scenario's files named from `folder`: it is the same wherever a project lies or is flown from."""
     names = {name: Path(os.path.relpath(name, folder)).as_posix() for name in files if Path(name).exists()}
     if not names:
@@ -53,7 +53,7 @@ def named_from(folder: Path, result: dict[str, Any], files: Iterable[str]) -> di
             return {renamed(key): renamed(inner) for key, inner in value.items()}
         if isinstance(value, list):
             return [renamed(inner) for inner in value]
-        return any_file.sub(lambda found: names[found[0]], value) if isinstance(value, str) else value
+        return any_file.sub(lambda match: names[match[0]], value) if isinstance(value, str) else value
 
     return {key: renamed(value) for key, value in result.items()}
 
@@ -77,8 +77,8 @@ def write_golden(path: Path, result: dict[str, Any]) -> str:
     return f"golden outcome written: {path}{instead}"
 
 
-def moved(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Figures that are not the golden ones: expected and got, by dotted name.
+def differences(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Figures that differ from the golden ones: expected and actual, by dotted name.
 
     Raises:
         RunError: no golden outcome there, or a broken one.

@@ -7,7 +7,6 @@ once, when its first test runs.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,14 +17,7 @@ if TYPE_CHECKING:
     from sortie.sim.check.checking import Checked
     from sortie.sim.check.expectations import Verdict
 
-MAX_BYTES = 1_000_000
 WRITTEN = pytest.StashKey[list[str]]()
-_NAME = re.compile(r"""^(["']?)name\1\s*:""", re.MULTILINE)
-_EXPECTS = re.compile(r"""^(["']?)expect(_decisions)?\1\s*:""", re.MULTILINE)
-_FLOW = re.compile(r"(\s|#[^\n]*\n|---(?=\s))*\{")
-"""How a file begins that is one section in braces."""
-_FLOW_NAMED = re.compile(_FLOW.pattern + r"""\s*(["']?)name\2\s*:""")
-_FLOW_EXPECTS = re.compile(r"""[{,]\s*(["']?)expect(_decisions)?\1\s*:""")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -38,7 +30,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Both options at once would write the outcome of another sortie than the scenario's."""
+    """Refuse both options together: they would write the outcome of a changed scenario as its golden outcome."""
     if config.getoption("sortie_update") and config.getoption("sortie_set"):
         from sortie.sim.check.checking import ensure_own
         from sortie.sim.folders import RunError
@@ -57,37 +49,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
     """A scenario file with expectations."""
-    if file_path.suffix in (".yaml", ".yml") and is_scenario(file_path):
-        return ScenarioFile.from_parent(parent, path=file_path)
-    return None
+    if file_path.suffix not in (".yaml", ".yml"):  # nothing is imported for other projects' files
+        return None
+    from sortie.sim.check.discovery import is_scenario
 
-
-def is_scenario(path: Path) -> bool:
-    from sortie.sim.check.golden import golden_path
-
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES).decode("utf-8", "replace")
-    except OSError:
-        return False
-    text = text.removeprefix("\ufeff")
-    golden = golden_path(path).is_file()
-    if _FLOW.match(text):
-        return (golden or bool(_FLOW_EXPECTS.search(text))) and _is_flow_scenario(text, golden=golden)
-    return bool(_NAME.search(text) and (golden or _EXPECTS.search(text)))
-
-
-def _is_flow_scenario(text: str, *, golden: bool) -> bool:
-    """Which keys stand on top only the reader can tell; a file that it cannot read is a scenario's if it begins as one."""
-    from sortie.scenarios.reading.load import ScenarioError, tree
-    from sortie.scenarios.reading.nodes import child
-
-    try:
-        root = tree(text, "")
-    except ScenarioError:
-        return bool(_FLOW_NAMED.match(text))
-    expects = golden or any(child(root, key) is not None for key in ("expect", "expect_decisions"))
-    return expects and child(root, "name") is not None
+    return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
 
 
 class ScenarioFile(pytest.File):
@@ -132,7 +98,7 @@ class ScenarioItem(pytest.Item):
         self.number = number
 
     def runtest(self) -> None:
-        """Fly if nobody has, and look at the verdict."""
+        """Fly the scenario if this is its first test, and raise where the verdict is a failure."""
         assert isinstance(self.parent, ScenarioFile)  # noqa: S101
         checked = self.parent.checked()
         if self.number >= len(checked.verdicts):  # the golden outcome
@@ -144,7 +110,7 @@ class ScenarioItem(pytest.Item):
             raise ExpectationFailed(verdict, checked.replay(verdict))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """An expectation in its own words; what a user can mend in one line."""
+        """A failed expectation in words; an error that the user can correct in one line."""
         if isinstance(excinfo.value, ExpectationFailed):
             return excinfo.value.in_words()
         if isinstance(excinfo.value, ValueError):  # scenarios, policies and files tell what is wrong in one line
@@ -152,7 +118,7 @@ class ScenarioItem(pytest.Item):
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where the test stands."""
+        """The test's file and name."""
         return self.path, None, f"{self.path.name}: {self.name}"
 
 
@@ -164,7 +130,13 @@ class ExpectationFailed(AssertionError):
         self.verdict, self.replay = verdict, replay
 
     def in_words(self) -> str:
-        """Expected, got, why, and how to see it."""
+        """The expected and the actual value, the reason, and the command that shows it."""
         v = self.verdict
-        lines = {"expected": v.expected, "got": v.got, "because": v.because, "the record": v.why, "see it": self.replay}
+        lines = {
+            "expected": v.expected,
+            "got": v.got,
+            "because": v.because,
+            "the record": v.explanation,
+            "see it": self.replay,
+        }
         return "\n".join(f"{name:>10}  {text}" for name, text in lines.items() if text)

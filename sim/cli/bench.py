@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from sortie.perception.benchmark.difficulty import Difficulty
-from sortie.perception.benchmark.manifest import complaints, read
+from sortie.perception.benchmark.manifest import problems, read
 from sortie.perception.geometry import Geometry
 from sortie.sim.cli.console import err, out, stages
 from sortie.sim.user_errors import user_errors
@@ -78,7 +78,7 @@ def show(
 ) -> None:
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
     with user_errors():
-        from sortie.perception.benchmark.contact_sheet import save, sheet
+        from sortie.perception.benchmark.contact_sheet import draw, save
         from sortie.perception.benchmark.dataset import SIZES, Benchmark
 
         bench = Benchmark.at(folder)
@@ -88,7 +88,7 @@ def show(
         if frame >= frames:
             raise ValueError(f"frame is {frame}, must be 0 to {frames - 1} in the {split.value} split")
         path = out_file or folder / "sheets" / f"{split.value}_{index}_{frame}.png"
-        save(sheet(bench, split.value, index, frame), path)
+        save(draw(bench, split.value, index, frame), path)
     out.print(f"drawn in [bold]{path}[/bold]", soft_wrap=True)
 
 
@@ -99,7 +99,7 @@ def verify(folder: FolderArgument) -> None:
         from sortie.perception.benchmark.dataset import Benchmark
 
         Benchmark.at(folder)
-        found = complaints(folder, partial(report, "files"))
+        found = problems(folder, partial(report, "files"))
     for line in found:
         err.print(f"[red]{line}[/red]", soft_wrap=True)
     if found:

@@ -11,10 +11,10 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from sortie.policies.registry import resolve
-from sortie.scenarios.reading.load import load, load_contexts
+from sortie.scenarios.reading.load import load, load_conditions
+from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import ensure_files
-from sortie.sim.results.numbers import points
 from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 from sortie.sim.user_errors import user_errors
 
@@ -34,7 +34,7 @@ def calibrate(
         "runs/calibrate"
     ),
     fly: Annotated[
-        str | None, typer.Option(help="Then fly this scenario or set of contexts by both detectors, side by side.")
+        str | None, typer.Option(help="Then fly this scenario or set of conditions by both detectors, side by side.")
     ] = None,
     made: Annotated[Path | None, typer.Option(help="Take this calibration and make none; with --fly.")] = None,
     policies: Annotated[str, typer.Option(help="Comma-separated: under which.")] = "silence,all-4,boxes",
@@ -48,7 +48,7 @@ def calibrate(
     with user_errors():
         for p in chosen if fly is not None else ():
             resolve(p)
-        if fly is not None and load_contexts(fly) is None:
+        if fly is not None and load_conditions(fly) is None:
             load(fly)
         if made is not None and fly is None:
             raise ValueError("--made goes with --fly: there is nothing else to do with it")
@@ -86,7 +86,7 @@ def _tell(verdict: CalibrationVerdict, out_file: Path) -> None:
 
 
 def _in_flight(levels: Sequence[ConditionAp], title: str) -> Iterator[Table]:
-    """AP by both detectors, and what policies gain over one another; in points, with 95 % intervals over contexts."""
+    """AP by both detectors, and what policies gain over one another; in points, with 95 % intervals over conditions."""
     found = list(means(levels))
     for region, words in REGIONS.items():
         table = Table(title=f"{title}, {words}", box=SIMPLE, padding=(0, 1, 0, 0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bar
 from typer.core import TyperGroup
 
+import sortie
 from sortie.sim.cli.console import err, out
 from sortie.sim.user_errors import user_errors
 
@@ -53,23 +53,19 @@ def run(
     """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
     folder = out_dir
     try:
+        from sortie._api import campaign_folder
         from sortie.scenarios.reading.campaign import load_campaign
-        from sortie.sim.campaign.drive import run_campaign
-        from sortie.sim.campaign.engine import open_engine
-        from sortie.sim.campaign.plan import make_plan
-        from sortie.sim.campaign.store import ensure_usable
         from sortie.sim.folders import RunError
 
         if scheduler is not None and workers is not None:
             raise RunError("--workers and --scheduler: name one of them")
-        study = load_campaign(campaign)
-        folder = out_dir or Path("runs") / f"campaign-{study.campaign.campaign}"
-        count = len(os.sched_getaffinity(0)) if workers is None else workers
-        with user_errors():
-            plan = make_plan(study)
-            ensure_usable(folder, plan)
-            with open_engine(count, scheduler) as engine, _bar(study.campaign.campaign) as show:
-                done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=show)
+        name = load_campaign(campaign).campaign.campaign
+        folder = out_dir or campaign_folder(name)
+        with _bar(name) as show:
+            done = sortie.campaign(
+                campaign, out=folder, workers=workers, scheduler=scheduler, resume=resume, retry_failed=retry_failed,
+                progress=show,
+            )  # fmt: skip
     except KeyboardInterrupt:
         where = "" if folder is None else f" in {folder}"
         err.print(f"interrupted; what is finished is kept{where}, the same command goes on", soft_wrap=True)
@@ -99,7 +95,6 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     Raises:
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
-    from sortie.sim.campaign.parts import read_plan
     from sortie.sim.campaign.rows import find_row
     from sortie.sim.campaign.work import unpack
     from sortie.sim.folders import RunError
@@ -109,7 +104,7 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         raise RunError("--from-campaign DIR and --run ID go together")
     if any(other is not None and other != [] for other in others):
         raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
-    row, plan = find_row(folder, run), read_plan(folder)
+    plan, row = find_row(folder, run)
     if code_version() != plan.code:
         err.print(f"[yellow]this is Sortie {code_version()}, the campaign was flown with {plan.code}[/yellow]")
     if row is None:
@@ -121,9 +116,13 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
 
 
-def _in_words(done: Progress) -> str:
+def _in_words(done: sortie.Campaign) -> str:
     failed = f", [red]{done.failed} failed[/red]" if done.failed else ""
-    speed = f"; {done.flown} of them now, {60 * done.per_second:.1f} a minute" if done.flown else ", none of them now"
+    speed = (
+        f"; {done.flown} of them now, {60 * done.flown / done.seconds:.1f} a minute"
+        if done.flown
+        else ", none of them now"
+    )
     return f"{done.finished} runs finished{failed}{speed}"
 
 

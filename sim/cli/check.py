@@ -6,29 +6,31 @@ from typing import Annotated
 
 import typer
 
-from sortie.scenarios.reading.load import library, load
+import sortie
+from sortie.scenarios.reading.load import library
 from sortie.sim.cli import tables
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import SetOption
 
 
 def check(
-    scenarios: Annotated[list[str], typer.Argument(help="Scenario files or names; all: the whole library.")],
+    scenarios: Annotated[list[str], typer.Argument(help="Scenario files, names or folders; all: the whole library.")],
     set_: SetOption = None,
     update: Annotated[
         bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing.")
     ] = False,
 ) -> None:
     """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
-    from sortie.sim.check.checking import check_scenario, flights
+    from sortie.sim.check.checking import flights
+    from sortie.sim.check.discovery import scenario_files
 
-    names = list(library()) if scenarios == ["all"] else scenarios
-    loaded = [(name, load(name, set_ or [])) for name in names]  # all of them, before the first one flies
+    names = list(library()) if scenarios == ["all"] else [file for name in scenarios for file in scenario_files(name)]
+    loaded = [(name, sortie.load(name, set_ or [])) for name in names]  # all of them, before the first one flies
     failed = 0
     for name, flown in loaded:
         with bars() as bar:
             watch = bar(flown.name, flown.duration_s * flights(flown))
-            checked = check_scenario(name, set_ or [], update=update, progress=watch)
+            (checked,) = sortie.check(name, set_ or [], update=update, progress=watch)
         failed += len(checked.failed)
         out.print(tables.verdict_table(flown.name, checked.verdicts))
         if checked.written:

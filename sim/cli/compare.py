@@ -1,4 +1,4 @@
-"""`sortie compare`: policies side by side, on a scenario or over a set of contexts."""
+"""`sortie compare`: policies side by side, on a scenario or over a set of conditions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import typer
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import POLICIES
 from sortie.policies.registry import own_fusion as own_fusion_of
-from sortie.scenarios.reading.load import load_contexts
+from sortie.scenarios.reading.load import load_conditions
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
-from sortie.sim.cli.conditions import compare_contexts, refuse
+from sortie.sim.cli.conditions import compare_conditions, refuse
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
@@ -25,7 +25,8 @@ from sortie.sim.studies.compare import compare as compare_policies
 def compare(
     scenario: ScenarioArgument,
     policies: Annotated[
-        str, typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence; all: every one, over contexts.")
+        str,
+        typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence; all: every one, over conditions."),
     ],
     seed: SeedOption = None,
     set_: SetOption = None,
@@ -38,17 +39,17 @@ def compare(
         Path | None, typer.Option(help="A Markdown file whose section between the comparison's markers is replaced.")
     ] = None,
     by_torch: Annotated[
-        bool, typer.Option("--by-torch", help="Contexts flown by the surrogate are scored by the torch detector.")
+        bool, typer.Option("--by-torch", help="Conditions flown by the surrogate are scored by the torch detector.")
     ] = False,
 ) -> None:
-    """Fly a scenario, or a set of contexts, under several policies, same seed and draws, and print them side by side."""
-    contexts = load_contexts(scenario)
-    if contexts is not None:
+    """Fly a scenario, or a set of conditions, under several policies, same seed and draws, and print them side by side."""
+    conditions = load_conditions(scenario)
+    if conditions is not None:
         refuse({"seed": seed, "own-fusion": own_fusion or None, "recording": recording, "readme": readme})
         chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
-        return compare_contexts(contexts, chosen, set_ or [], out_file, by_torch=by_torch)
+        return compare_conditions(conditions, chosen, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
-        raise RunError(f"--by-torch goes with a set of contexts; for {scenario}: --set perception.detector=torch")
+        raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     flown = [Contender(p, loaded(scenario, set_, p)) for p in _split_policies(policies)]
     ensure_files(out_file, recording)
     ensure_between(readme, tables.COMPARE_BEGIN, tables.COMPARE_END)

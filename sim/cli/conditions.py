@@ -1,4 +1,4 @@
-"""`sortie compare` over a set of contexts, and `sortie learn`."""
+"""`sortie compare` over a set of conditions, and `sortie learn`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from rich.table import Table
 from sortie.perception.detectors import make_detector
 from sortie.policies.catalogue.adaptive import ARMS
 from sortie.policies.registry import resolve
-from sortie.scenarios.schema.conditions import Contexts
+from sortie.scenarios.report_text import number, points, size
+from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import bars, out
 from sortie.sim.folders import RunError, ensure_files, write_text
-from sortie.sim.results.numbers import number, points, size
 from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
 from sortie.sim.studies.in_flight import torch_answers
 
 
 def refuse(options: Mapping[str, object]) -> None:
-    """Options of `sortie compare` that say nothing over a set of contexts, by name; None is not given.
+    """Options of `sortie compare` that say nothing over a set of conditions, by name; None is not given.
 
     Raises:
         RunError: the first that is given.
@@ -33,29 +33,34 @@ def refuse(options: Mapping[str, object]) -> None:
     for name, given in options.items():
         if given is not None:
             own = ": its file has its seeds" if name == "seed" else ""
-            raise RunError(f"--{name} goes with a scenario, not with a set of contexts{own}")
+            raise RunError(f"--{name} goes with a scenario, not with a set of conditions{own}")
 
 
-def compare_contexts(
-    contexts: Contexts, policies: Sequence[str], sets: Sequence[str], out_file: Path | None, *, by_torch: bool = False
+def compare_conditions(
+    conditions: ConditionSet,
+    policies: Sequence[str],
+    sets: Sequence[str],
+    out_file: Path | None,
+    *,
+    by_torch: bool = False,
 ) -> None:
-    """Fly every policy in every context, print AP by context and the sums, keep both as JSON."""
+    """Fly every policy in every condition, print AP by condition and the sums, keep both as JSON."""
     for policy in policies:
         resolve(policy)
     ensure_files(out_file)
-    contexts = contexts.model_copy(update={"set": (*contexts.set, *sets)})
+    conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
     with bars() as bar:
-        each = {p: bar(p, len(contexts.contexts)) for p in policies}
+        each = {p: bar(p, len(conditions.conditions)) for p in policies}
         detector_of = torch_answers() if by_torch else make_detector
-        cells = fly_all(contexts, policies, progress=lambda p, k: each[p](k), detector_of=detector_of)
-    for table in _by_context(contexts, policies, cells, out.width):
+        cells = fly_all(conditions, policies, progress=lambda p, k: each[p](k), detector_of=detector_of)
+    for table in _by_condition(conditions, policies, cells, out.width):
         out.print(table)
-    if blind := list(dict.fromkeys(c.context for c in cells if math.isnan(c.ap))):
+    if blind := list(dict.fromkeys(c.condition for c in cells if math.isnan(c.ap))):
         out.print(f"no car was to be seen in {', '.join(blind)}: no accuracy counts what was flown there")
     rows = summarise(cells)
     fixed = best_fixed(rows)
     table = _figures(
-        "all contexts", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
+        "all conditions", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
     )  # fmt: skip
     for r in rows:
         gain = "–" if r.policy == fixed else points(r.gain, "+.1f")
@@ -66,8 +71,8 @@ def compare_contexts(
     out.print(table)
     flown = ", ".join(p for p in policies if p in FIXED)
     out.print(
-        f"[dim]over {fixed}: AP points over the best fixed policy ({flown}), contexts resampled in pairs; oracle: of the AP of "
-        "the best fixed policy of each context; data and energy of a sortie; missed: payloads past their deadline[/dim]"
+        f"[dim]over {fixed}: AP points over the best fixed policy ({flown}), conditions resampled in pairs; oracle: of the AP of "
+        "the best fixed policy of each condition; data and energy of a sortie; missed: payloads past their deadline[/dim]"
     )
     if out_file is not None:
         found = {
@@ -83,17 +88,19 @@ def _known(figure: float) -> float | None:
     return None if math.isnan(figure) else figure
 
 
-def _by_context(contexts: Contexts, policies: Sequence[str], cells: Sequence[Cell], width: int) -> Iterator[Table]:
-    """AP of every policy in every context, in as many tables as the terminal is too narrow for one."""
-    at = {(c.policy, c.context): c.ap for c in cells}
-    left = width - max(len(c.name) for c in contexts.contexts) - 12
+def _by_condition(
+    conditions: ConditionSet, policies: Sequence[str], cells: Sequence[Cell], width: int
+) -> Iterator[Table]:
+    """AP of every policy in every condition, in as many tables as the terminal is too narrow for one."""
+    at = {(c.policy, c.condition): c.ap for c in cells}
+    left = width - max(len(c.name) for c in conditions.conditions) - 12
     rest = list(policies)
     while rest:
         few = [rest.pop(0)]
         while rest and sum(max(len(p), 5) + 2 for p in (*few, rest[0])) <= left:
             few.append(rest.pop(0))
-        table = _figures("AP@0.5; of the mission where the fleet tracks", "context", "rho", *few)
-        for c in contexts.contexts:
+        table = _figures("AP@0.5; of the mission where the fleet tracks", "condition", "rho", *few)
+        for c in conditions.conditions:
             best = max(at[p, c.name] for p in policies)
             figures = ((number(at[p, c.name]), at[p, c.name] == best) for p in few)
             table.add_row(c.name, f"{c.rho:g}", *(f"[bold]{a}[/bold]" if is_ else a for a, is_ in figures))
@@ -109,8 +116,8 @@ def _figures(title: str, *columns: str) -> Table:
 
 
 def learn(
-    contexts: Annotated[int, typer.Option(help="How many training contexts are drawn and flown.", min=8)] = 100,
-    seed: Annotated[int, typer.Option(help="Of the training contexts.", min=0)] = 0,
+    conditions: Annotated[int, typer.Option(help="How many training conditions are drawn and flown.", min=8)] = 100,
+    seed: Annotated[int, typer.Option(help="Of the training conditions.", min=0)] = 0,
     workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
     by_torch: Annotated[
         bool,
@@ -121,17 +128,19 @@ def learn(
         typer.Option("--out", help="Where the fit is kept; policies/catalogue/learned.json is the one that flies."),
     ] = Path("runs/learned.json"),
 ) -> None:
-    """Fit the policy `learned`: fly every arm in drawn contexts, and regress AP on what a policy sees."""
+    """Fit the policy `learned`: fly every arm in drawn conditions, and regress AP on what a policy sees."""
     from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     ensure_files(out_file)
     with bars() as bar:
-        lessons = fly_lessons(seed, contexts, by_torch=by_torch, workers=workers, progress=bar("contexts", contexts))
+        lessons = fly_lessons(
+            seed, conditions, by_torch=by_torch, workers=workers, progress=bar("conditions", conditions)
+        )
     save(out_file, lessons, seed, by_torch=by_torch)
     table = Table("arm", "mean AP", "best in")
     for k, arm in enumerate(ARMS):
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
-        table.add_row(arm.words, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
+        table.add_row(arm.text, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
     out.print(table)
     table = Table("over the first arm, AP points", *(f"rho {rho:g}" for rho in BUDGETS))
     for k, arm in enumerate(ARMS[1:], start=1):
@@ -139,7 +148,7 @@ def learn(
         for phase in ("search", "track"):
             cells = (found.get((phase, rho)) for rho in BUDGETS)
             table.add_row(
-                f"{arm.words}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
+                f"{arm.text}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
             )
     out.print(table)
     enough = ", ".join(f"{name} {rho:.3f}" for name, rho in thresholds(lessons).items())

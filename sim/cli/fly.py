@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
+import sortie
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
-from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
@@ -61,22 +61,16 @@ def fly(
     run_folder.ensure_writable(path)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
-        record = run_sortie(flown, None, seed, replication=number, progress=ticker, observer=watchers or None)
-
-    def save_recording(folder: Path) -> None:
-        from sortie.sim.playback.recording import save_rrd
-
-        save_rrd(record, folder / run_folder.RECORDING)
-
-    instead = run_folder.in_place_of(path, record.fingerprint)
-    result = run_folder.save(record, path, save_recording if recording else None)
-    out.print(tables.outcome_table(result))
-    out.print(tables.transitions_table(result))
-    report(result)
+        flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
+    instead = run_folder.in_place_of(path, flight.fingerprint)
+    flight.save(path, recording=recording)
+    out.print(tables.outcome_table(flight.outcome))
+    out.print(tables.transitions_table(flight.outcome))
+    report(flight.outcome)
     see = f", see it with: sortie view {path}" if recording else ""
     out.print(f"kept in [bold]{path}[/bold]{escape(instead)}{see}", soft_wrap=True)
     if expected is not None:
-        same = "is" if record.fingerprint[:16] == expected else "[red]is not[/red]"
+        same = "is" if flight.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")
     if view_:
         view(path)

@@ -100,7 +100,7 @@ def _share(value: float | None) -> str:
 
 def _show(result: LiveResult) -> None:
     from sortie.sim.live.result import overhead_rows
-    from sortie.sim.live.sentences import changes_in_words
+    from sortie.sim.live.sentences import describe_changes
 
     where = f"{result.begin_s:g}–{result.begin_s + result.flown_s:.0f} s"
     losses = f", {result.loss:.0%} of descriptors lost" if result.loss else ""
@@ -126,7 +126,7 @@ def _show(result: LiveResult) -> None:
             f"{1e3 * d.publishes_within_s:.0f} ms",
         )  # fmt: skip
     out.print(table)
-    lines = changes_in_words(result)
+    lines = describe_changes(result)
     for line in lines[:SHOWN]:
         out.print(line, soft_wrap=True, markup=False)
     if len(lines) > SHOWN:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+import sortie
 from sortie.sim.cli.console import out
-from sortie.sim.results import run_folder
 
 PAGE = "report.html"
 
@@ -20,9 +20,5 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one HTML page that needs nothing else: figures, outcome, and the decisions in words."""
-    from sortie.sim.results.report import save_page
-
-    record = run_folder.load(run)
-    path = out_path or run / PAGE
-    save_page(record, path)
+    path = sortie.open_run(run).report(out_path or run / PAGE)
     out.print(f"kept in [bold]{path}[/bold]", soft_wrap=True)

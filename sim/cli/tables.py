@@ -12,8 +12,8 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.check.expectations import Verdict
-from sortie.sim.results.numbers import number, percent, points, size
 from sortie.sim.studies.compare import Compared
 
 ROOMS = ("sim", "fleet", "radio", "policies", "perception", "scenarios")
@@ -114,8 +114,8 @@ def comparison_markdown(rows: Sequence[Compared], command: str) -> str:
     if first["ap50"]["scored_fusions"]:
         rate_hz = first["ap50"]["sample_rate_hz"]
         head += f", accuracy scored at {rate_hz:g} Hz, gains over {rows[0].policy} in AP points, paired, 95 %"
-    lines = [f"{head}.", "", f"| | {' | '.join(r.policy for r in rows)} |", f"|---|{'---|' * len(rows)}"]
-    lines += [f"| {name.strip()} | {' | '.join(cells)} |" for name, cells in _side_by_side(rows).items()]
+    cells = ((name.strip(), *values) for name, values in _side_by_side(rows).items())
+    lines = [f"{head}.", "", *table(("", *(r.policy for r in rows)), cells)]
     why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(rows)]
     return "\n".join([COMPARE_BEGIN, "", *lines, "", *(f"- {line}" for line in why), "", COMPARE_END])
 
@@ -176,7 +176,7 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for column in ("", "expected", "got", "because"):
         table.add_column(column)
     for v in verdicts:
-        because = escape(v.because) + (f"\n[dim]the record: {escape(v.why)}[/dim]" if v.why else "")
+        because = escape(v.because) + (f"\n[dim]the record: {escape(v.explanation)}[/dim]" if v.explanation else "")
         verdict = "[green]ok[/green]" if v.holds else "[red]FAILED[/red]"
         table.add_row(verdict, escape(v.expected), escape(v.got), because)
     return table

@@ -8,10 +8,8 @@ from typing import NamedTuple
 
 from sortie.fleet.agent import Task
 from sortie.perception.scene.traffic import TARGET_ID, TargetPath
-from sortie.policies.contract import Disc, TaskPhase
+from sortie.policies.contract import PHASE_OF, Disc
 from sortie.scenarios.schema import Mission
-
-_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 
 
 class MissionNow(NamedTuple):
@@ -29,7 +27,7 @@ class MissionNow(NamedTuple):
             dx_m, dy_m = target[0] - own_xy_m[0], target[1] - own_xy_m[1]
             if dx_m * dx_m + dy_m * dy_m <= footprint_m * footprint_m:
                 targets = (TARGET_ID,)
-        return Task(_PHASES[phase], region, targets)
+        return Task(PHASE_OF[phase], region, targets)
 
 
 class MissionPlan:

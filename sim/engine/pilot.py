@@ -14,6 +14,8 @@ from typing import NamedTuple
 import simpy
 
 from sortie.policies.contract import (
+    PHASE_NAMES,
+    PHASE_OF,
     Directive,
     FleetView,
     Policy,
@@ -23,16 +25,21 @@ from sortie.policies.contract import (
     check_directives,
     check_reposition,
 )
-from sortie.policies.registry import handshake_bytes, resolve, told, viewpoint_of
+from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part
-from sortie.policies.verification.invariants import Invariant, InvariantError, just_heard, parse, spelt, violations
-from sortie.policies.verification.shield import MARK, checked, enforce
+from sortie.policies.verification.invariants import (
+    Invariant,
+    InvariantError,
+    describe_directives,
+    just_heard,
+    parse,
+    violations,
+)
+from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.schema import PolicyChange, PolicySection
 from sortie.sim.engine.world import at, with_frame
 from sortie.sim.results.record import DECISIONS_OF, Recorder
-
-_PHASES = {phase.name.lower(): phase for phase in TaskPhase}
 
 
 class NamedPolicy(NamedTuple):
@@ -73,7 +80,7 @@ def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyP
         rules = parse(section.invariants)
         replays = tuple((r.at_s, r.drone, from_json(r.view)) for r in section.replays)
         if section.shield:
-            checked(rules)
+            check_shieldable(rules)
     except InvariantError as error:
         raise PolicyError(f"policy.invariants: {error}") from error
     except ViewError as error:
@@ -137,7 +144,7 @@ class Pilot:
         self.drone, self.policy, self._request = drone, plan.first, request_viewpoint
         self._viewpoint = viewpoint_of(plan.first.decide)
         changes = enumerate(plan.changes)
-        self._by_phase = {_PHASES[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
+        self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision
         self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
         self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
@@ -185,7 +192,7 @@ class Pilot:
             self._phase = me.task_phase
             place, policy = self._by_phase.get(me.task_phase, (-1, self.policy))
             if place > self._place:  # else a later one of the list came with the phase
-                self.take_over(policy, f"phase {TaskPhase(me.task_phase).name.lower()}", place)
+                self.take_over(policy, f"phase {PHASE_NAMES[TaskPhase(me.task_phase)]}", place)
 
     def _requested_viewpoint(self, view: FleetView) -> Reposition | None:
         """The viewpoint that the policy chooses; None keeps its slot."""
@@ -193,7 +200,7 @@ class Pilot:
         try:
             asked = self._viewpoint(view)
         except Exception as error:
-            what = f"its viewpoint raises {told(error)}"
+            what = f"its viewpoint raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
         check_reposition(asked, view)
         return asked
@@ -204,7 +211,7 @@ class Pilot:
         except PolicyError:
             raise
         except Exception as error:
-            what = f"raises {told(error)}"
+            what = f"raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
         if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
             what = f"returns {type(answer).__name__}, must be a sequence of directives"
@@ -224,9 +231,9 @@ class Pilot:
         for rule in self._rules:
             for broken in violations(rule, view, directives, fresh):
                 if broken is None:
-                    audit.broke(self.drone, -1, name, f"{rule.text}: {spelt(directives)}")
+                    audit.broke(self.drone, -1, name, f"{rule.text}: {describe_directives(directives)}")
                 else:
-                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {spelt([broken])}")
+                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {describe_directives([broken])}")
         return directives
 
     def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:

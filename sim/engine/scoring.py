@@ -14,8 +14,9 @@ from sortie.fleet.agent import Agent
 from sortie.fleet.memory import Received
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
-from sortie.sim.results.record import REPRESENTATIONS, Recorder
+from sortie.sim.results.record import Recorder
 
 
 def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
@@ -26,10 +27,9 @@ def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
 
 def as_share(received: Received, trust: float = 1.0) -> Share:
     """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender."""
-    payload, roi = received.payload, received.payload.roi
-    disc = None if roi is None else (roi.x_m, roi.y_m, roi.radius_m)
-    name, weight = REPRESENTATIONS[payload.representation], payload.fusion_weight * trust
-    return Share(received.capture, name, payload.rho, disc, weight, received.missing)
+    payload = received.payload
+    name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
+    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing)
 
 
 Job = tuple[Capture, list[Share]]

@@ -6,7 +6,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import pyarrow as pa
@@ -23,10 +22,10 @@ from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Capture
-from sortie.policies.contract import Disc, Policy
+from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
@@ -132,7 +131,13 @@ def build(
     batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, len(drones), charges)
     up = up_vector(motion.orientation_xyzw)
     air = Air(
-        env, scenario.radio, motion.position_m, seed=seed, replication=replication, frame_s=scenario.frame_s, up=up
+        env,
+        AirSettings.of(scenario.radio.model_dump(exclude={"framing"})),
+        motion.position_m,
+        seed=seed,
+        replication=replication,
+        frame_s=scenario.frame_s,
+        up=up,
     )
     scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
     world = World(env, scenario, statuses, motion, batteries, air, scene, MissionPlan(scenario.mission), recorder)
@@ -148,7 +153,7 @@ def build(
     pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.request) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     detector = detector_of(scene, scenario.perception, seed, replication)
-    count_boxes = None if detector is None else partial(_count_boxes, detector)
+    count_boxes = None if detector is None else detector.count_boxes
     agents = [
         Agent(
             env,
@@ -235,7 +240,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=context.trust,
         publish_every=context.publish_every,
-        form=Form(context.grid_cells, context.grid_bits, context.number_bits),
+        form=Form(**context.form.model_dump()),
     )
 
 
@@ -243,10 +248,6 @@ def _rates_mbps(scenario: Scenario) -> Sequence[float]:
     """The channel's data rates by MCS; none where links are traced."""
     radio = scenario.radio
     return STANDARDS[radio.standard].rates_mbps[radio.bandwidth_mhz] if radio.trace is None else ()
-
-
-def _count_boxes(detector: Detector, capture: Capture, roi: Disc | None) -> int:
-    return detector.count_boxes(capture, None if roi is None else (roi.x_m, roi.y_m, roi.radius_m))
 
 
 def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, PolicyPlan]:

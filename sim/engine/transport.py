@@ -20,7 +20,8 @@ from sortie.fleet.tiles import cells_of
 from sortie.perception.types import Capture
 from sortie.policies.contract import Representation
 from sortie.radio import Air, Transmission
-from sortie.sim.results.record import HANDSHAKE, REPRESENTATIONS, Recorder
+from sortie.scenarios.representation import NAME_OF
+from sortie.sim.results.record import HANDSHAKE, Recorder
 
 
 class Transport:
@@ -86,7 +87,7 @@ class Transport:
             drone,
             peer,
             payload.size_bytes,
-            kind=REPRESENTATIONS[payload.representation],
+            kind=NAME_OF[payload.representation],
             reliable=payload.reliable,
             deadline_s=deadline_s,
             on_done=self._done,

@@ -32,7 +32,8 @@ from sortie.fleet.messages.wire import (
     encode_directive,
 )
 from sortie.perception.scene.traffic import TARGET_ID
-from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
+from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import replacing
 from sortie.sim.results.outcome import transitions
@@ -86,7 +87,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             peer_goodput_mbps=tuple(row["goodput_mbps"]),
             coverage_grid=row["coverage_grid"],
             novelty_flags=row["novelty_flags"],
-            task_phase=TaskPhase[row["phase"].upper()],
+            task_phase=PHASE_OF[row["phase"]],
             region=region,
             priority_target_ids=(TARGET_ID,) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
@@ -101,7 +102,7 @@ def directives(record: SortieRecord) -> Iterator[tuple[float, Directive]]:
             Directive(
                 source=row["drone"],
                 destination=row["peer"],
-                representation=Representation[row["representation"].upper()],
+                representation=REPRESENTATION_OF[row["representation"]],
                 rho=row["rho"],
                 roi=None if math.isnan(radius) else Disc(x, y, radius),
                 rate_hz=row["rate_hz"],

@@ -1,4 +1,4 @@
-"""The bench node: hears every topic of the fleet, counts serialised bytes, and keeps what the processes report."""
+"""The bench node: it reads every topic of the fleet, counts serialised bytes, and collects the processes' reports."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind, links
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
 from sortie.sim.live.messages import unpack_bytes
-from sortie.sim.live.node import opened
-from sortie.sim.live.reports import Count, News, Report
+from sortie.sim.live.node import open_descriptor
+from sortie.sim.live.reports import Count, Report, SinceLastReport
 
 PAYLOAD_DEPTH = 16
-"""Samples kept of a payload topic until they are taken: a bench that is late by more loses count."""
+"""Samples of a payload topic that are stored until they are read. A bench that is later than that misses some."""
 
 
 class Bench:
@@ -26,13 +26,13 @@ class Bench:
         topics = [CONTEXT, *(Topic(kind, *link) for link in links(drones) for kind in (TopicKind.DIRECTIVE, *PAYLOADS))]
         self._readers = [self._bus.reader(topic, depths.get(topic.kind, PAYLOAD_DEPTH)) for topic in topics]
         self.counts: dict[Topic, Count] = dict.fromkeys(topics, Count())
-        """By topic: CDR as serialised, payloads without what their message puts in front of them."""
+        """By topic: bytes of CDR as serialised, payloads without the header of their message."""
         self.heard: Counter[int] = Counter()
-        """Descriptors by who published them."""
+        """Number of descriptors by their publisher."""
         self._began_cpu_s = 0.0
 
     def begin(self) -> None:
-        """Count from here; what came before is forgotten."""
+        """Start counting from zero."""
         self.take()
         self.counts = dict.fromkeys(self.counts, Count())
         self.heard.clear()
@@ -40,20 +40,20 @@ class Bench:
 
     @property
     def cpu_s(self) -> float:
-        """Processor time of this process since the begin."""
+        """Processor time of this process since `begin`."""
         return time.process_time() - self._began_cpu_s
 
     def wait(self, timeout_s: float) -> None:
-        """Sleep until something came in or the time is over."""
+        """Sleep until a sample arrives or the time is over."""
         self._bus.wait(timeout_s)
 
     def take(self) -> None:
-        """Count what came in."""
+        """Count the samples that have arrived."""
         for reader in self._readers:
             self._take(reader)
 
     def of(self, kind: TopicKind) -> Count:
-        """All topics of a kind together."""
+        """The sum over all topics of a kind."""
         of_kind = [c for topic, c in self.counts.items() if topic.kind == kind]
         return Count(sum(c.samples for c in of_kind), sum(c.bytes for c in of_kind))
 
@@ -62,13 +62,13 @@ class Bench:
         for cdr in reader.take():
             self.counts[topic] = self.counts[topic].plus(_size(cdr, topic.kind))
             if topic.kind == TopicKind.CONTEXT:
-                descriptor = opened(cdr)
+                descriptor = open_descriptor(cdr)
                 if isinstance(descriptor, Opened):
                     self.heard[descriptor.descriptor.agent_id] += 1
 
 
 def _size(cdr: bytes, kind: TopicKind) -> int:
-    """As `Bench.counts` counts; what is no payload counts as it came."""
+    """The bytes that `Bench.counts` counts; a sample that is not a payload counts as it is."""
     try:
         return len(unpack_bytes(cdr)) if kind in PAYLOADS else len(cdr)
     except MalformedDatagram:
@@ -76,13 +76,13 @@ def _size(cdr: bytes, kind: TopicKind) -> int:
 
 
 class FleetReports:
-    """What the drones reported, put together."""
+    """The drones' reports together."""
 
     def __init__(self) -> None:
         self.last: dict[int, Report] = {}
-        self.news: list[News] = []
+        self.news: list[SinceLastReport] = []
 
     def add(self, report: Report) -> None:
-        """The next report of its drone."""
+        """Add the next report of a drone."""
         self.last[report.drone] = report
         self.news.append(report.new)

@@ -1,4 +1,4 @@
-"""The bus: one participant's ends of the topics of `sortie.sim.export.topics`, on loopback unless told otherwise."""
+"""The bus: one participant's readers and writers of the topics in `sortie.sim.export.topics`, on loopback by default."""
 
 from __future__ import annotations
 
@@ -31,28 +31,30 @@ LOOPBACK = """\
   <Internal><SocketReceiveBufferSize max="16MiB"/></Internal>
 </Domain></CycloneDDS>
 """
-"""Cyclone's configuration where `CYCLONEDDS_URI` names none: this host alone, fragments as large as a datagram may be."""
+"""Cyclone's configuration if `CYCLONEDDS_URI` is not set: this host alone, fragments of the largest datagram size."""
 MAX_DEPTH = 64
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 
 
 class Reader:
-    """One end that hears a topic."""
+    """A reader of one topic."""
 
     def __init__(self, reader: DataReader[Any], topic: Topic) -> None:
         self._reader = reader
         self.topic = topic
 
     def take(self) -> list[bytes]:
-        """What came since the last call, oldest first, as CDR."""
-        return [s.cdr for s in self._reader.take(MAX_DEPTH) if hasattr(s, "cdr")]  # others are writers' farewells
+        """The samples since the last call, oldest first, as CDR."""
+        return [
+            s.cdr for s in self._reader.take(MAX_DEPTH) if hasattr(s, "cdr")
+        ]  # other samples only announce that a writer has left
 
 
 class Writer:
-    """One end that speaks on a topic."""
+    """A writer of one topic."""
 
     def __init__(self, writer: DataWriter[Any], topic: Topic) -> None:
-        self._writer: Any = writer  # parts of it have no types
+        self._writer: Any = writer  # it has no complete type hints
         self.topic = topic
         self._sample = dds_type(topic.kind.ros_type)
 
@@ -62,16 +64,16 @@ class Writer:
 
     @property
     def listeners(self) -> int:
-        """How many readers it has found."""
-        # not the list of them: the binding asks twice, and fails where one is found in between
+        """The number of readers that it has found."""
+        # the binding's list of them fails if a reader is found while it is read
         return int(self._writer.get_publication_matched_status().current_count)
 
 
 class Bus:
-    """One participant: a process's ends of the bus."""
+    """One participant: a process's readers and writers."""
 
     def __init__(self, domain: int) -> None:
-        """Join a DDS domain (ROS 2: `ROS_DOMAIN_ID`), by `CYCLONEDDS_URI` where it is set, else on loopback."""
+        """Join a DDS domain (ROS 2: `ROS_DOMAIN_ID`), by `CYCLONEDDS_URI` if it is set, otherwise on loopback."""
         self._domain = None if os.environ.get("CYCLONEDDS_URI") else _domain(domain)
         self._participant = DomainParticipant(domain)
         self._wake = WaitSet(self._participant)
@@ -79,7 +81,7 @@ class Bus:
         self._conditions: list[ReadCondition] = []
 
     def reader(self, topic: Topic, depth: int = 1) -> Reader:
-        """An end that keeps the last `depth` samples until they are taken, and wakes `wait`."""
+        """A reader that stores the last `depth` samples until they are read, and wakes `wait`."""
         reader = DataReader(self._participant, self._named(topic), qos=_qos(topic.kind, depth))
         condition = ReadCondition(reader, _ANY)
         self._conditions.append(condition)
@@ -87,11 +89,11 @@ class Bus:
         return Reader(reader, topic)
 
     def writer(self, topic: Topic) -> Writer:
-        """An end that speaks, keep-last-1."""
+        """A writer, keep-last-1."""
         return Writer(DataWriter(self._participant, self._named(topic), qos=_qos(topic.kind, 1)), topic)
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleep until something came in or the time is over; whether something did."""
+        """Sleep until a sample arrives or the time is over. Returns whether one arrived."""
         return self._wake.wait(max(0, round(timeout_s * 1e9))) > 0
 
     def _named(self, topic: Topic) -> DdsTopic[Any]:
@@ -101,7 +103,7 @@ class Bus:
 
 
 def _domain(number: int) -> Domain | None:
-    """The domain on loopback; None where this process is in it already."""
+    """The domain on loopback; None if this process has joined it already."""
     try:
         return Domain(number, LOOPBACK)
     except DDSException as error:
@@ -111,7 +113,7 @@ def _domain(number: int) -> Domain | None:
 
 
 def _qos(kind: TopicKind, depth: int) -> Qos:
-    """ROS 2 speaks plain CDR (XCDR1); readers and writers agree on reliability, depth is each one's own."""
+    """ROS 2 uses plain CDR (XCDR1). Readers and writers must have the same reliability; each has its own depth."""
     return Qos(
         Policy.Reliability.Reliable(max_blocking_time=0) if kind.reliable else Policy.Reliability.BestEffort,
         Policy.History.KeepLast(depth),

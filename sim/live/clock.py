@@ -1,4 +1,4 @@
-"""SimPy's clock, but the wall's: the agents of the simulator live on it as they are."""
+"""A SimPy environment on wall-clock time, so that the simulator's agents run on it unchanged."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from simpy.events import NORMAL, Event, EventPriority
 
 
 class WallClock(simpy.Environment):
-    """Time is `begin_s` when the host's monotonic clock shows `begin_monotonic_s`, and goes on with it.
+    """Time is `begin_s` when the host's monotonic clock shows `begin_monotonic_s`, and runs with that clock.
 
-    A late event finds the clock at the time it really is, and what it schedules counts from there: nothing is made up
-    for but what is planned for a moment that has passed.
+    A late event sees the real time, and what it schedules counts from there. Events for a past time run at once.
     """
 
     def __init__(self, begin_s: float, begin_monotonic_s: float) -> None:
@@ -22,7 +21,7 @@ class WallClock(simpy.Environment):
 
     @property
     def now(self) -> SimTime:
-        """Seconds; runs on while events are handled."""
+        """Seconds; it also runs while events are handled."""
         return time.monotonic() + self._offset_s
 
     def schedule(self, event: Event, priority: EventPriority = NORMAL, delay: SimTime = 0) -> None:
@@ -30,6 +29,6 @@ class WallClock(simpy.Environment):
         super().schedule(event, priority, self.now - self._now + delay)
 
     def catch_up(self) -> None:
-        """Handle everything that is due."""
+        """Handle all events that are due."""
         while self.peek() <= self.now:
             self.step()

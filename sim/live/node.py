@@ -1,8 +1,8 @@
 """One drone's nodes on the bus: context publisher, policy node and gate, around the simulator's own `Agent`.
 
-    publisher    /fleet/context                      what `sortie.fleet.agent` broadcasts
-    policy node  /fleet/context → /…/directive       staleness rules and damping as in the simulator; every directive in
-                                                     force again with every tick, as the paper's node does
+    publisher    /fleet/context                      the broadcasts of `sortie.fleet.agent`
+    policy node  /fleet/context → /…/directive       staleness rules and damping as in the simulator; it repeats every
+                                                     directive in force with every tick, as the paper's node does
     gate         /…/directive → /…/features, compact payloads of the size that `sortie.fleet.gate` gives them
 
 Policy node and gate speak through DDS alone, though they share a process.
@@ -27,19 +27,20 @@ from sortie.fleet.staleness import LinkHealth, health
 from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
+from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
-from sortie.sim.live.reports import Count, HealthChange, NewDirective, News, Report
+from sortie.sim.live.reports import Count, HealthChange, NewDirective, Report, SinceLastReport
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
 
 
-class Link:
-    """One drone's ends towards one peer."""
+class PeerTopics:
+    """One drone's readers and writers for one peer."""
 
     def __init__(self, bus: Bus, me: int, peer: int) -> None:
         self.peer = peer
@@ -50,12 +51,12 @@ class Link:
 
     @property
     def writers(self) -> list[Writer]:
-        """Ends that speak."""
+        """The writers."""
         return [self.directive, *self.payload.values()]
 
 
 class BusGate(Gate):
-    """The agent's gate, behind the bus: what it is told goes out as directives, and it obeys what comes in."""
+    """The agent's gate behind the bus: it publishes the policy's directives, and applies the directives that it receives."""
 
     def __init__(self, publish: Callable[[Directive], None]) -> None:
         super().__init__()
@@ -63,21 +64,21 @@ class BusGate(Gate):
         self._ordered: dict[int, Directive] = {}
 
     def enforce(self, directive: Directive) -> None:
-        """The policy node changed its mind about a link."""
+        """Publish the policy node's new directive for a link."""
         self._ordered[directive.destination] = directive
 
-    def repeat(self) -> None:
+    def republish(self) -> None:
         """Publish every directive in force; repeating one changes nothing at the gate."""
         for directive in self._ordered.values():
             self._publish(directive)
 
-    def obey(self, directive: Directive) -> None:
-        """A directive came in."""
+    def apply(self, directive: Directive) -> None:
+        """Enforce a directive that was received."""
         super().enforce(directive)
 
 
 class LiveNode:
-    """The nodes of one drone; it is the agent's modem and its log."""
+    """The nodes of one drone. It is the agent's modem and log."""
 
     def __init__(self, bus: Bus, drone: int, drones: int, *, seed: int, loss: float) -> None:
         """Args: `loss` is the share of others' descriptors that is dropped on arrival, 0 … 1, drawn by link."""
@@ -85,11 +86,11 @@ class LiveNode:
         self._bus, self._seed, self._loss = bus, seed, loss
         self._context = bus.writer(CONTEXT)
         self._fleet = bus.reader(CONTEXT, MAX_DEPTH)
-        self._links: dict[int, Link] = {}
+        self._links: dict[int, PeerTopics] = {}
         for peer in range(drones):
             if peer != drone:
-                self._meet(peer)
-        self.gate = BusGate(self._direct)
+                self._add_peer(peer)
+        self.gate = BusGate(self._publish_directive)
         self._draws: dict[int, np.random.Generator] = {}
         self._health: dict[int, LinkHealth] = {}
         self._published = self._heard = self._lost = 0
@@ -97,11 +98,11 @@ class LiveNode:
         self._refused: Counter[str] = Counter()
         self._sent = dict.fromkeys((TopicKind.DIRECTIVE, *PAYLOADS), Count())
         self._received = dict.fromkeys(PAYLOADS, Count())
-        self._new = News()
+        self._new = SinceLastReport()
         self._began_cpu_s = 0.0
 
     def all_found(self, drones: int) -> bool:
-        """Whether every end has met its readers: each drone's and the bench's."""
+        """Whether every writer has found its readers: each drone's and the bench's."""
         others = [w for link in self._links.values() for w in link.writers]
         return self._context.listeners > drones and all(w.listeners >= 2 for w in others)
 
@@ -114,7 +115,7 @@ class LiveNode:
         self._began_cpu_s = time.process_time()
 
     def watched(self, decide: Policy) -> Policy:
-        """The policy, timed, the health of every peer noted beside it."""
+        """The policy, with a record of its time and of the health of every peer."""
 
         def watching(view: FleetView) -> Sequence[Directive]:
             self._note_health(view)
@@ -126,23 +127,23 @@ class LiveNode:
         return watching
 
     def wait(self, timeout_s: float) -> None:
-        """Sleep until something came in or the time is over."""
+        """Sleep until a sample arrives or the time is over."""
         self._bus.wait(timeout_s)
 
     def take(self) -> None:
-        """Hand over what came in: directives first, since the gate may be about to act on them."""
+        """Handle the samples that have arrived, directives first, because the gate may need them at once."""
         for link in list(self._links.values()):
             for cdr in link.ordered.take():
-                self._obey(cdr, link.peer)
+                self._on_directive(cdr, link.peer)
             for reader in link.incoming:
                 for cdr in reader.take():
-                    self._receive(cdr, reader)
+                    self._on_payload(cdr, reader)
         for cdr in self._fleet.take():
-            self._hear(cdr)
+            self._on_descriptor(cdr)
 
     def report(self, t_s: float) -> Report:
-        """How it stands; what is new in it will not be told again."""
-        new, self._new = self._new, News()
+        """The counts, and what happened since the last report."""
+        new, self._new = self._new, SinceLastReport()
         return Report(
             self.drone, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
             dict(self._refused), self._late_s, dict(self._sent), dict(self._received), new,
@@ -164,7 +165,7 @@ class LiveNode:
         stamp_ns = round((capture.t_s + self._memory.status.clock_skew_s) * 1e9)
         header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)
         content = (header + encode_directive(directive)).ljust(payload.size_bytes, b"\0")
-        self._write(peer, TopicKind.COMPACT if payload.reliable else TopicKind.FEATURES, content)
+        self._write(peer, TopicKind.of(payload.representation), content)
 
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
         self._write(peer, TopicKind.FEATURES, bytes(size_bytes))
@@ -176,35 +177,35 @@ class LiveNode:
         self._late_s = max(self._late_s, clock_s - descriptor.stamp_ns * 1e-9)
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
-        rung = enforced.representation.name.lower()
+        rung = NAME_OF[enforced.representation]
         self._new.orders.append(NewDirective(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
 
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:
         """Trust is off here."""
 
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
-        self.gate.repeat()
+        self.gate.republish()
 
     # --- what comes in ---------------------------------------------------------------------------
 
-    def _hear(self, cdr: bytes) -> None:
-        heard = opened(cdr)
+    def _on_descriptor(self, cdr: bytes) -> None:
+        heard = open_descriptor(cdr)
         if isinstance(heard, Opened):
             sender = heard.descriptor.agent_id
             if sender == self.drone:
                 return
-            if self._loss and self._drawn(sender).random() < self._loss:
+            if self._loss and self._loss_stream(sender).random() < self._loss:
                 self._lost += 1
                 return
             if sender not in self._links:
-                self._meet(sender)
+                self._add_peer(sender)
         refused = self._memory.hear(heard, self._clock.now)
         if isinstance(refused, DropReason):
             self._refused[f"descriptor {refused}"] += 1
         else:
             self._heard += 1
 
-    def _obey(self, cdr: bytes, peer: int) -> None:
+    def _on_directive(self, cdr: bytes, peer: int) -> None:
         try:
             directive = decode_directive(cdr)
         except MalformedDatagram:
@@ -213,9 +214,9 @@ class LiveNode:
         if (directive.source, directive.destination) != (self.drone, peer):
             self._refused["directive of another link"] += 1
             return
-        self.gate.obey(directive)
+        self.gate.apply(directive)
 
-    def _receive(self, cdr: bytes, reader: Reader) -> None:
+    def _on_payload(self, cdr: bytes, reader: Reader) -> None:
         kind = reader.topic.kind
         try:
             content = unpack_bytes(cdr)
@@ -230,10 +231,10 @@ class LiveNode:
 
     # --- helpers ---------------------------------------------------------------------------------
 
-    def _meet(self, peer: int) -> None:
-        self._links[peer] = Link(self._bus, self.drone, peer)
+    def _add_peer(self, peer: int) -> None:
+        self._links[peer] = PeerTopics(self._bus, self.drone, peer)
 
-    def _direct(self, directive: Directive) -> None:
+    def _publish_directive(self, directive: Directive) -> None:
         self._sent[TopicKind.DIRECTIVE] = self._sent[TopicKind.DIRECTIVE].plus(DIRECTIVE_BYTES)
         self._links[directive.destination].directive.write(encode_directive(directive))
 
@@ -241,7 +242,7 @@ class LiveNode:
         self._sent[kind] = self._sent[kind].plus(len(content))
         self._links[peer].payload[kind].write(pack_bytes(content))
 
-    def _drawn(self, sender: int) -> np.random.Generator:
+    def _loss_stream(self, sender: int) -> np.random.Generator:
         if sender not in self._draws:
             self._draws[sender] = stream(self._seed, 0, (sender, self.drone), "live loss")
         return self._draws[sender]
@@ -256,8 +257,8 @@ class LiveNode:
                 self._new.health.append(HealthChange(now_s, self.drone, peer, found, age_s))
 
 
-def opened(cdr: bytes) -> Opened | Dropped:
-    """A descriptor, checked; DDS fills samples up to a multiple of 4 B, and one may end on 2 B."""
+def open_descriptor(cdr: bytes) -> Opened | Dropped:
+    """Check a descriptor. DDS fills samples to a multiple of 4 B, and a descriptor may end on 2 B."""
     whole = open_datagram(cdr, None)
     if isinstance(whole, Dropped) and cdr[-2:] == b"\0\0":
         shorter = open_datagram(cdr[:-2], None)

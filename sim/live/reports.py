@@ -1,4 +1,4 @@
-"""What a drone's process tells the bench, once a second, by pipe: plain values that outlive the process."""
+"""Messages from a drone's process to the bench, by pipe, once a second: plain values that outlive the process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class HealthChange(NamedTuple):
     peer: int
     health: LinkHealth
     age_s: float
-    """Of the peer's latest descriptor."""
+    """Age of the peer's latest descriptor."""
 
 
 class NewDirective(NamedTuple):
@@ -38,12 +38,12 @@ class Count(NamedTuple):
     bytes: int = 0
 
     def plus(self, size: int) -> Count:
-        """One more."""
+        """The count with one more sample."""
         return Count(self.samples + 1, self.bytes + size)
 
 
 class Notice(NamedTuple):
-    """A policy that took over, a directive that the shield replaced."""
+    """An event: a policy took over, or the shield replaced a directive."""
 
     t_s: float
     drone: int
@@ -51,7 +51,7 @@ class Notice(NamedTuple):
 
 
 @dataclass(slots=True)
-class News:
+class SinceLastReport:
     """What happened since the last report."""
 
     decide_ns: list[int] = field(default_factory=list)
@@ -65,7 +65,7 @@ class News:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One drone so far: counts since the begin, and what is new."""
+    """One drone's counts since the begin, and what happened since its last report."""
 
     drone: int
     t_s: float
@@ -73,16 +73,16 @@ class Report:
     """Processor time of all threads of the process."""
     published: int
     heard: int
-    """Descriptors of others that were believed."""
+    """Valid descriptors of other drones."""
     lost: int
-    """Descriptors of others that `--loss` took."""
+    """Descriptors of other drones that `--loss` dropped."""
     refused: dict[str, int]
-    """Descriptors, directives and payloads that were not what they claimed to be, by reason."""
+    """Invalid descriptors, directives and payloads, by reason."""
     late_s: float
-    """From a frame's begin until its descriptor was published, at most; a tenth of a frame is meant."""
+    """The longest time from the begin of a frame until its descriptor was published; planned is a tenth of a frame."""
     sent: dict[TopicKind, Count]
     received: dict[TopicKind, Count]
-    new: News
+    new: SinceLastReport
 
 
 class Ready(NamedTuple):
@@ -99,13 +99,13 @@ class Go(NamedTuple):
 
 
 class Home(NamedTuple):
-    """The process flew to its end, and this is its last word."""
+    """The process has flown to the end. This is its last message."""
 
     drone: int
 
 
 class Failed(NamedTuple):
-    """The process gave up; its error in one line."""
+    """The process failed; its error in one line."""
 
     drone: int
     what: str

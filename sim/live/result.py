@@ -59,18 +59,18 @@ class TopicRate(NamedTuple):
 
 
 class Noticed(NamedTuple):
-    """How the others noticed that a drone was gone: the first and the last of them, s after it."""
+    """How the other drones noticed a lost drone: the first and the last of them, in seconds after the loss."""
 
     drone: int
     degraded_s: tuple[float, float] | None
     detached_s: tuple[float, float] | None
     by: int
-    """How many of the others detached it."""
+    """The number of other drones that detached it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveResult:
-    """A live flight, measured."""
+    """The measurements of a live flight."""
 
     scenario: str
     policy: str
@@ -115,7 +115,7 @@ class LiveResult:
         return plain
 
 
-def summary(
+def summarise(
     scenario: Scenario,
     bench: Bench,
     fleet: FleetReports,
@@ -126,7 +126,7 @@ def summary(
     lost: Sequence[Lost],
     interrupted: bool,
 ) -> LiveResult:
-    """Put the bench's counts and the drones' reports together; `flown_s` is the wall's time in the air."""
+    """Combine the bench's counts and the drones' reports; `flown_s` is the wall-clock time in the air."""
     decide_ms = np.array([ns for new in fleet.news for ns in new.decide_ns]) / 1e6
     data_age_ms = np.array([s for new in fleet.news for s in new.data_age_s]) * 1e3
     health = sorted(c for new in fleet.news for c in new.health)
@@ -162,7 +162,7 @@ def summary(
         bench_cpu_percent=100 * bench.cpu_s / flown_s,
         each=sorted(each),
         lost=list(lost),
-        noticed=[_noticed(gone, health) for gone in lost],
+        noticed=[_time_to_notice(gone, health) for gone in lost],
         health=health,
         orders=sorted(o for new in fleet.news for o in new.orders),
         notices=sorted(n for new in fleet.news for n in new.notices),
@@ -170,7 +170,7 @@ def summary(
 
 
 def overhead_rows(result: LiveResult) -> Iterator[tuple[str, str, str]]:
-    """The paper's overhead table beside ours: what, the paper's figure, ours."""
+    """Rows of the paper's overhead table: quantity, the paper's figure, the measured figure."""
     n, hz = result.drones, result.topics[0].samples_per_s
     yield "descriptor, serialised", f"{PAPER['plane.descriptor']:.0f} B", _figure(result.descriptor_bytes, "{:.0f} B")
     yield "descriptors a second", "4 × 10", f"{hz:.1f} of {n} drones"
@@ -222,8 +222,8 @@ def _topics(bench: Bench, fleet: FleetReports, flown_s: float) -> Iterator[Topic
         )
 
 
-def _noticed(gone: Lost, health: Sequence[HealthChange]) -> Noticed:
-    """When the others' contexts of a lost drone were degraded and detached, after it was seen to be gone."""
+def _time_to_notice(gone: Lost, health: Sequence[HealthChange]) -> Noticed:
+    """When the others degraded and detached the context of a lost drone."""
     after = [c for c in health if c.peer == gone.drone and c.t_s > gone.t_s - 1.0]
     # the last change of each of the others is the one that lasts
     last: dict[int, dict[LinkHealth, float]] = {}

@@ -1,4 +1,4 @@
-"""What happened on the bus, as sentences."""
+"""The events of a live flight as sentences."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from sortie.fleet.staleness import LinkHealth
 from sortie.sim.live.result import LiveResult, Noticed
 
 
-def changes_in_words(result: LiveResult) -> list[str]:
-    """Lost processes first and how the others noticed, then what links carry, as time goes; staleness as counts."""
-    said = [f"{gone.t_s:6.1f} s  drone {gone.drone}: its process {gone.how}" for gone in result.lost]
-    said += [_noticed(n, result.drones - 1) for n in result.noticed]
+def describe_changes(result: LiveResult) -> list[str]:
+    """Lost processes and how the others noticed them, counts of staleness, then changes of what links carry, by time."""
+    lines = [f"{gone.t_s:6.1f} s  drone {gone.drone}: its process {gone.how}" for gone in result.lost]
+    lines += [_loss_text(n, result.drones - 1) for n in result.noticed]
     after_start = [c for c in result.health if c.t_s - result.begin_s > 1.0]
     counts = Counter(c.health for c in after_start)
-    said.append(
+    lines.append(
         f"contexts of peers went degraded {counts[LinkHealth.DEGRADED]} times, detached {counts[LinkHealth.DETACHED]} "
         f"times, and fresh again {counts[LinkHealth.FRESH]} times"
     )
     events = [(n.t_s, f"drone {n.drone}: {n.text}") for n in result.notices]
     carried: dict[tuple[int, int], str] = {}
     for o in result.orders:  # a disc that moves with its target is no change worth a line
-        now = _carries(o.representation, o.rate_hz)
+        now = _payload_text(o.representation, o.rate_hz)
         if carried.get((o.drone, o.peer)) != now:
             events.append((o.t_s, f"drone {o.drone} → {o.peer}: {now}, because {o.reason}"))
         carried[o.drone, o.peer] = now
-    return said + [f"{t_s:6.1f} s  {text}" for t_s, text in sorted(events)]
+    return lines + [f"{t_s:6.1f} s  {text}" for t_s, text in sorted(events)]
 
 
-def _carries(representation: str, rate_hz: float) -> str:
+def _payload_text(representation: str, rate_hz: float) -> str:
     return "nothing" if representation == "none" else f"{representation} at {rate_hz:g} Hz"
 
 
-def _noticed(noticed: Noticed, others: int) -> str:
+def _loss_text(noticed: Noticed, others: int) -> str:
     def span(s: tuple[float, float] | None) -> str:
         return "never" if s is None else f"after {s[0]:.2f}–{s[1]:.2f} s"
 

@@ -20,16 +20,16 @@ from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.context import traces
 from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
-from sortie.sim.live.result import LiveResult, Lost, summary
+from sortie.sim.live.result import LiveResult, Lost, summarise
 
 MAX_DRONES = 20
-"""As many processes as this starts on one host."""
-FIND_S = 90.0
-"""How long the processes may take to start and to find one another."""
+"""The most processes that this starts on one host."""
+CONNECT_S = 90.0
+"""The longest time for the processes to start and to find one another."""
 LEAD_S = 0.3
-"""From the word to go until the flight begins."""
-PATIENCE_S = 5.0
-"""How long a process may take to end after the flight."""
+"""From the start signal until the flight begins."""
+EXIT_S = 5.0
+"""The longest time for a process to end after the flight."""
 Progress = Callable[[str, float, float], None]
 
 
@@ -51,20 +51,20 @@ def fly_live(
     progress: Progress | None = None,
     begun: Callable[[dict[int, int]], None] | None = None,
 ) -> LiveResult:
-    """Fly a scenario's context plane over DDS in real time, a process a drone.
+    """Fly a scenario's context plane over DDS in real time, with one process per drone.
 
     Args:
-        scenario: what is flown; its policy decides on every drone.
+        scenario: the scenario; its policy decides on every drone.
         begin_s: the scenario's time at which the fleet begins.
         duration_s: how long it flies, s; None: to the scenario's end.
         loss: share of descriptors that each drone drops on arrival, 0 … 1.
         kill: a drone whose process is killed (SIGKILL), and the scenario's time when.
         domain: DDS domain, as `ROS_DOMAIN_ID`.
         progress: called with (what is done, how much of it, of how much).
-        begun: called with the process ids by drone once the fleet flies.
+        begun: called with the process ids by drone when the fleet begins to fly.
 
     Returns:
-        What was measured; after Ctrl-C of the part that flew, `interrupted`.
+        The measurements. After Ctrl-C they are of the part that was flown, and `interrupted` is true.
 
     Raises:
         RunError: options that do not fit the scenario, or processes that do not find one another.
@@ -72,9 +72,10 @@ def fly_live(
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
     _check(scenario, begin_s, end_s, loss, kill)
-    tell = progress or (lambda what, done, of: None)
+    report_progress = progress or (lambda what, done, of: None)
     found = traces(
-        scenario.model_copy(update={"duration_s": end_s}), lambda t_s: tell("flying for the context", t_s, end_s)
+        scenario.model_copy(update={"duration_s": end_s}),
+        lambda t_s: report_progress("flying for the context", t_s, end_s),
     )
     drones = scenario.fleet.drones
     bench, fleet = Bench(domain, drones), FleetReports()
@@ -84,7 +85,7 @@ def fly_live(
     try:
         for i, trace in enumerate(found):
             flown.append(_start(Orders(scenario, i, trace, begin_s, end_s, loss, domain)))
-        _meet(flown, tell)
+        _wait_until_connected(flown, report_progress)
         go = Go(time.monotonic() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9))
         for drone in flown:
             drone.pipe.send(go)
@@ -92,7 +93,7 @@ def fly_live(
         time.sleep(LEAD_S)
         if begun is not None:
             begun({i: d.process.pid or 0 for i, d in enumerate(flown)})
-        with _told_to_stop() as stop:
+        with _stop_on_interrupt() as stop:
             while not (stop.is_set() or all(d.over for d in flown)):
                 t_s = min(end_s, begin_s + time.monotonic() - go.monotonic_s)
                 if kill is not None and t_s >= kill[1]:
@@ -101,14 +102,14 @@ def fly_live(
                 bench.wait(0.05)
                 bench.take()
                 _collect(flown, fleet, lost, t_s)
-                tell("in the air", t_s - begin_s, end_s - begin_s)
+                report_progress("in the air", t_s - begin_s, end_s - begin_s)
         interrupted = stop.is_set()
         if interrupted:
-            _stop(flown)
+            _request_stop(flown)
             _collect(flown, fleet, lost, t_s)
         if not fleet.last:
             raise RunError("no drone's process lived long enough to report" + (f": {lost[0].how}" if lost else ""))
-        return summary(
+        return summarise(
             scenario,
             bench,
             fleet,
@@ -119,7 +120,7 @@ def fly_live(
             interrupted=interrupted,
         )
     finally:
-        _end(flown)
+        _clean_up(flown)
 
 
 def _check(scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None) -> None:
@@ -142,15 +143,15 @@ def _start(orders: Orders) -> _Drone:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=fly_one, args=(orders, theirs), name=f"drone {orders.drone}", daemon=True)
-    with _deaf():
+    with _ignoring_interrupts():
         process.start()
     theirs.close()  # so that our end shows when the process is gone
     return _Drone(process, ours)
 
 
 @contextmanager
-def _told_to_stop() -> Iterator[threading.Event]:
-    """Ctrl-C as something to ask for: an exception would be lost where it strikes while the bus frees a sample."""
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """Ctrl-C as an event to check. An exception would be lost if it came while the bus frees a sample."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -163,10 +164,10 @@ def _told_to_stop() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """What is started here never hears Ctrl-C, not even while it still loads: a signal ignored stays so in a new process."""
+def _ignoring_interrupts() -> Iterator[None]:
+    """Processes that are started here ignore Ctrl-C from the start, because they inherit ignored signals."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's; `fly_one` ignores it a little later
+        yield  # only the main thread may set signals; `fly_one` ignores Ctrl-C later
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -175,57 +176,57 @@ def _deaf() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _meet(flown: list[_Drone], tell: Progress) -> None:
+def _wait_until_connected(flown: list[_Drone], report_progress: Progress) -> None:
     """Wait until every process has found all others."""
-    waiting, until_s = {id(d.pipe): d for d in flown}, time.monotonic() + FIND_S
+    waiting, until_s = {id(d.pipe): d for d in flown}, time.monotonic() + CONNECT_S
     while waiting:
-        tell("starting the processes", len(flown) - len(waiting), len(flown))
+        report_progress("starting the processes", len(flown) - len(waiting), len(flown))
         for pipe in wait([d.pipe for d in waiting.values()], timeout=0.2):
-            said = _said(pipe)  # type: ignore[arg-type]
-            if isinstance(said, Ready):
+            message = _receive(pipe)  # type: ignore[arg-type]
+            if isinstance(message, Ready):
                 del waiting[id(pipe)]
-            elif said is None:
+            elif message is None:
                 raise RunError(f"{waiting[id(pipe)].process.name} ended before the flight began")
         if time.monotonic() > until_s:
             names = ", ".join(d.process.name for d in waiting.values())
             raise RunError(
-                f"{names} did not find the others within {FIND_S:g} s: is loopback allowed (CYCLONEDDS_URI)?"
+                f"{names} did not find the others within {CONNECT_S:g} s: is loopback allowed (CYCLONEDDS_URI)?"
             )
-    tell("starting the processes", len(flown), len(flown))
+    report_progress("starting the processes", len(flown), len(flown))
 
 
 def _collect(flown: list[_Drone], fleet: FleetReports, lost: list[Lost], t_s: float) -> None:
-    """Take every report that is there; a pipe that closes before its drone came home is a drone that was lost."""
+    """Read every report that has arrived. A pipe that closes before its drone has ended means a lost drone."""
     for number, drone in enumerate(flown):
         while not drone.over and drone.pipe.poll():
-            said = _said(drone.pipe)
-            if isinstance(said, Report):
-                fleet.add(said)
-            elif isinstance(said, Home):
+            message = _receive(drone.pipe)
+            if isinstance(message, Report):
+                fleet.add(message)
+            elif isinstance(message, Home):
                 drone.over = True
-            elif said is None:
+            elif message is None:
                 drone.over = True
-                drone.process.join(PATIENCE_S)
-                lost.append(Lost(number, t_s, _how(drone.process.exitcode)))
+                drone.process.join(EXIT_S)
+                lost.append(Lost(number, t_s, _describe_exit(drone.process.exitcode)))
 
 
-def _said(pipe: Connection) -> object | None:
-    """What a process says; None where it is gone.
+def _receive(pipe: Connection) -> object | None:
+    """The next message of a process; None if the process is gone.
 
     Raises:
         PolicyError: its policy failed.
     """
     try:
-        said: object = pipe.recv()
+        message: object = pipe.recv()
     except (EOFError, ConnectionResetError):
         return None
-    if isinstance(said, Failed):
-        raise PolicyError(said.what)
-    return said
+    if isinstance(message, Failed):
+        raise PolicyError(message.what)
+    return message
 
 
-def _how(exitcode: int | None) -> str:
-    """How a process ended, in words."""
+def _describe_exit(exitcode: int | None) -> str:
+    """How a process ended, as text."""
     if exitcode is None:
         return "does not answer"
     return f"was killed by {signal.Signals(-exitcode).name}" if exitcode < 0 else f"ended with exit code {exitcode}"
@@ -236,23 +237,23 @@ def _kill(process: BaseProcess) -> None:
         os.kill(process.pid, signal.SIGKILL)
 
 
-def _stop(flown: list[_Drone]) -> None:
-    """Ask everybody to come home, and give them time for a last report."""
+def _request_stop(flown: list[_Drone]) -> None:
+    """Ask all processes to end, and give them time for a last report."""
     for drone in flown:
         try:
             drone.pipe.send(None)
         except OSError:
             continue  # it is gone already
     for drone in flown:
-        drone.process.join(PATIENCE_S)
+        drone.process.join(EXIT_S)
 
 
-def _end(flown: list[_Drone]) -> None:
-    """Nobody is left behind, whatever happened."""
+def _clean_up(flown: list[_Drone]) -> None:
+    """End all processes, whatever happened."""
     for drone in flown:
-        drone.pipe.close()  # a process that still waits for us ends by itself
+        drone.pipe.close()  # a process that still waits for this one ends by itself
     for drone in flown:
-        drone.process.join(PATIENCE_S)
+        drone.process.join(EXIT_S)
         if drone.process.is_alive():
             drone.process.kill()
             drone.process.join()

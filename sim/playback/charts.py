@@ -15,6 +15,7 @@ import pyarrow as pa
 import rerun as rr
 
 from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas, Floats, line
@@ -26,7 +27,7 @@ AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")
 """Plots in which phase changes and events are marked."""
 EVENT_LANE: c.Rgba = (150, 108, 20, 255)
-RUNGS = ("nothing", "tracks", "detections", "features", "raw")
+RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
 FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
 

@@ -14,8 +14,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.picture import Picture, to_world
-from sortie.perception.geometry import CELLS
+from sortie.perception.evaluation.picture import Picture
+from sortie.perception.geometry import CELLS, to_world
 from sortie.perception.scene.render import CAMERAS
 from sortie.perception.types import Boxes
 from sortie.sim.playback.canvas import MISSION, drone_colour

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from sortie.fleet.coverage import footprint_radius_m
-from sortie.fleet.flight.formation import slots
+from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
 

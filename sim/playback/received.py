@@ -21,6 +21,7 @@ import rerun as rr
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.perception.budget import CELL_M, roi_mask
 from sortie.perception.geometry import CELLS
+from sortie.scenarios.disc import Disc
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas, Floats
 
@@ -34,7 +35,6 @@ MAX_DRONES = 12
 """Larger fleets have too many pairs to draw."""
 HEIGHT_M = 0.5
 
-Disc = tuple[float, float, float]
 Link = tuple[int, int]
 Pose = tuple[float, float, float]
 _COLUMNS = (
@@ -103,7 +103,7 @@ class ReceivedCells:
     def _note_regions(self, directives: pa.Table) -> None:
         names = ("t_s", "drone", "peer", "roi_x_m", "roi_y_m", "roi_radius_m")
         for t_s, drone, peer, x, y, radius in zip(*(directives[k].to_pylist() for k in names), strict=True):
-            self._regions[drone, peer].append((t_s, None if radius != radius else (x, y, radius)))
+            self._regions[drone, peer].append((t_s, None if radius != radius else Disc(x, y, radius)))
 
     def _note_arrivals(self, transmissions: pa.Table) -> None:
         for done, sent, captured, sender, receiver, what, fate, size, arrived in zip(

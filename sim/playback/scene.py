@@ -217,7 +217,7 @@ class Drawing:
         for i in sorted({s.drone for s in seen}):
             own = [s for s in seen if s.drone == i]
             t_s = np.array([s.t_s for s in own])
-            self._sighting_rows(i, t_s, [s.found for s in own], [s.missed for s in own], [s.false for s in own])
+            self._sighting_rows(i, t_s, [s.hits for s in own], [s.missed for s in own], [s.false for s in own])
 
     def _sighting_rows(
         self, drone: int, t_s: Floats, found: list[Boxes], missed: list[Boxes], false: list[Boxes]

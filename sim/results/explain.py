@@ -1,4 +1,4 @@
-"""Why a metric came out as it did: what the record holds that bears on it, in one line."""
+"""The facts in a record that explain a metric, in one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sortie.sim.results.record import SortieRecord
 FEW = 3
 
 
-def why(metric: str, record: SortieRecord, result: dict[str, Any]) -> str:
+def explain_metric(metric: str, record: SortieRecord, result: dict[str, Any]) -> str:
     """The facts behind a metric: fates of payloads, what was fused, energy by cause; and what happened to the fleet."""
     top = metric.partition(".")[0]
     facts = []

@@ -109,8 +109,8 @@ def matched(
     Args:
         mission: count the mission disc alone, and only fusions made while there is one.
     """
-    judged = _Fusions(record, begin_s, end_s)
-    return judged.in_mission() if mission else judged.in_full()
+    fusions = _Fusions(record, begin_s, end_s)
+    return fusions.in_mission() if mission else fusions.in_full()
 
 
 def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
@@ -124,8 +124,8 @@ Both = dict[str, dict[tuple[float, int], Matched]]
 
 def both_matched(record: SortieRecord) -> Both:
     """Every scored fusion matched in the full scene and in the mission disc."""
-    judged = _Fusions(record, 0.0, float("inf"))
-    return {"full_scene": judged.in_full(), "mission": judged.in_mission()}
+    fusions = _Fusions(record, 0.0, float("inf"))
+    return {"full_scene": fusions.in_full(), "mission": fusions.in_mission()}
 
 
 class _Fusions:
@@ -134,25 +134,25 @@ class _Fusions:
     def __init__(self, record: SortieRecord, begin_s: float, end_s: float) -> None:
         tables = record.tables
         t_s, drone = tables["fusions"]["t_s"].to_numpy(), tables["fusions"]["drone"].to_numpy()
-        asked = (begin_s <= t_s) & (t_s < end_s)
-        self._t_s = t_s[asked]
-        self._keys = list(zip(self._t_s.tolist(), drone[asked].tolist(), strict=True))
-        found, at = _boxes_of(self._keys, tables["detections"])
+        within = (begin_s <= t_s) & (t_s < end_s)
+        self._t_s = t_s[within]
+        self._keys = list(zip(self._t_s.tolist(), drone[within].tolist(), strict=True))
+        boxes, at = _boxes_of(self._keys, tables["detections"])
         self._truth, cars = _boxes_of(self._keys, tables["truths"])
-        self._judged = judge(found, at, self._truth, cars, len(self._keys))
-        self._found = found.take(self._judged.order)
+        self._matches = judge(boxes, at, self._truth, cars, len(self._keys))
+        self._boxes = boxes.take(self._matches.order)
         self._missions = tables["mission"]
 
     def in_full(self) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the full scene."""
-        return dict(zip(self._keys, self._judged.matched(), strict=True))
+        return dict(zip(self._keys, self._matches.matched(), strict=True))
 
     def in_mission(self) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the mission disc, where there is one."""
         discs = np.column_stack([self._missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
         disc = discs[np.searchsorted(self._missions["t_s"].to_numpy(), self._t_s, side="right") - 1]
-        found, cars = self._judged.image, self._judged.cars
-        inside = self._judged.matched(_within(self._found, disc[found]), _within(self._truth, disc[cars]))
+        images, cars = self._matches.image, self._matches.cars
+        inside = self._matches.matched(_within(self._boxes, disc[images]), _within(self._truth, disc[cars]))
         there = ~np.isnan(disc[:, 2])
         return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
 
@@ -164,12 +164,12 @@ def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _accuracy(both: Both, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
-    found = {}
+    accuracy = {}
     for name, fusions in both.items():
         frames = [m for (t_s, _), m in fusions.items() if begin_s <= t_s < end_s]
         ap = average_precision(frames) if frames else float("nan")
-        found[name] = None if np.isnan(ap) else ap
-    return found
+        accuracy[name] = None if np.isnan(ap) else ap
+    return accuracy
 
 
 def _boxes_of(keys: Sequence[tuple[float, int]], table: pa.Table) -> tuple[Boxes, NDArray[np.int64]]:

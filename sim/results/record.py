@@ -21,18 +21,16 @@ import pyarrow.compute as pc
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
-from sortie.policies.contract import Descriptor, Directive, Representation, TaskPhase
+from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
+from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.identity import release_of
 
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
 """Prefix of the totals that count each policy's decisions."""
-REPRESENTATIONS = {rung: rung.name.lower() for rung in Representation}
-"""Names as the tables have them."""
 HANDSHAKE = "handshake"
 """The `representation` of transmissions that carry a method's requests and answers, and no payload."""
-_PHASES = {phase: phase.name.lower() for phase in TaskPhase}
 _LINKS = {link: link.name.lower() for link in LinkHealth}
 _NO_DISC = (NAN, NAN, NAN)
 F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
@@ -195,7 +193,7 @@ def _unfold_descriptors(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     region = zip(*(disc or _NO_DISC for disc in d["region"]), strict=True)
     return [
         t_s, d["agent_id"], d["stamp_ns"], wire_bytes, d["battery_soc"], d["cpu_headroom"], d["gpu_headroom"],
-        d["peer_goodput_mbps"], [_PHASES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
+        d["peer_goodput_mbps"], [PHASE_NAMES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
         d["coverage_grid"],
     ]  # fmt: skip
 
@@ -228,9 +226,9 @@ class AgentNotes:
         roi = enforced.roi or _NO_DISC
         self._rows["directives"].append(
             (
-                t_s, enforced.source, enforced.destination, REPRESENTATIONS[enforced.representation], enforced.rho, *roi,
+                t_s, enforced.source, enforced.destination, NAME_OF[enforced.representation], enforced.rho, *roi,
                 enforced.rate_hz, enforced.deadline_s, enforced.fusion_weight, enforced.duty_percent,
-                REPRESENTATIONS[asked.representation], asked.rate_hz, _LINKS[link], reason,
+                NAME_OF[asked.representation], asked.rate_hz, _LINKS[link], reason,
                 self._deciding(enforced.source),
             )
         )  # fmt: skip

@@ -12,6 +12,7 @@ from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
 
 import pyarrow as pa
 
+from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
@@ -44,18 +45,19 @@ def page() -> str:
         "A dot leads into an object, `*` stands for each of its keys, `[]` for each entry of a list. Bounds of `expect:` in "
         "a scenario name a field in the same way: `bytes.context_sent`, `battery.1`.",
         "",
-        "| field | value | meaning |",
-        "|---|---|---|",
-        *(f"| `{path}` | {value} | {meaning} |" for path, value, meaning in fields(Outcome)),
+        *table(
+            ("field", "value", "meaning"), ((f"`{path}`", value, meaning) for path, value, meaning in fields(Outcome))
+        ),
         "",
         "## The record's tables",
         "",
         "One Parquet file a table, rows in order of time. Units stand in the names: `_m`, `_s`, `_mps`, `_j`, `_db`. "
         "Columns are numbers where nothing else is said.",
         "",
-        "| table | a row is | columns |",
-        "|---|---|---|",
-        *(f"| `{name}` | {ABOUT[name]} | {_columns(columns)} |" for name, columns in TABLES.items()),
+        *table(
+            ("table", "a row is", "columns"),
+            ((f"`{name}`", ABOUT[name], _columns(columns)) for name, columns in TABLES.items()),
+        ),
         "",
     ]
     return "\n".join(lines)

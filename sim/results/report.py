@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.reading.load import dump
+from sortie.scenarios.report_text import number, percent, size
 from sortie.sim.folders import write_text
-from sortie.sim.results.numbers import number, percent, size
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures

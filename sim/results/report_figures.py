@@ -10,6 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import average_precision
+from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import matched, transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
@@ -107,7 +108,7 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
 
     def best(carried: dict[tuple[int, int], str], drone: int) -> str:
         kinds = {level.split(" ")[0] for (sender, _), level in carried.items() if sender == drone}
-        return max(kinds | {"nothing"}, key=["nothing", "tracks", "detections", "features", "raw"].index)
+        return max(kinds | {"nothing"}, key=["nothing", *list(REPRESENTATION_OF)[1:]].index)
 
     since = dict.fromkeys(range(n), (0.0, "nothing"))
     carried: dict[tuple[int, int], str] = {}
@@ -154,9 +155,9 @@ def _edges(record: SortieRecord) -> Floats:
 
 def _accuracy(axes: Axes, record: SortieRecord) -> None:
     for mission, label, ink in ((False, "full scene", "#2f6fd0"), (True, "mission disc", MISSION)):
-        found = matched(record, mission=mission)
-        t_s = np.array([t for t, _ in found])
-        frames = list(found.values())
+        fusions = matched(record, mission=mission)
+        t_s = np.array([t for t, _ in fusions])
+        frames = list(fusions.values())
         points = []
         for end_s in _edges(record)[1:]:
             within = [frames[k] for k in np.flatnonzero((t_s >= end_s - WINDOW_S) & (t_s < end_s))]

@@ -80,8 +80,8 @@ def in_place_of(path: Path, fingerprint: str) -> str:
     """What to say of the run that another one with this fingerprint is about to replace; empty where nothing is lost."""
     try:
         old = json.loads((path / OUTCOME).read_text())
-        said = f", in place of a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
-        return "" if old["fingerprint"] == fingerprint else said
+        replaced = f", in place of a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
+        return "" if old["fingerprint"] == fingerprint else replaced
     except (OSError, ValueError, TypeError, LookupError):
         return ""  # none, or one that nobody can read
 

@@ -1,4 +1,4 @@
-"""What a sortie's log says, in words: the same sentences in the playback, in a bag and on a page of results."""
+"""Decisions and events as sentences, the same in the playback, in a bag and on a page of results."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 def decision_in_words(change: dict[str, Any]) -> str:
     """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz, because goodput 3.1 < 5 Mb/s`."""
     peers = ", ".join(str(p) for p in change["peers"])
-    why = f", because {change['reason']}" if change["reason"] else ""
-    return f"drone {change['drone']} → {peers}: {change['to']}{why}"
+    reason = f", because {change['reason']}" if change["reason"] else ""
+    return f"drone {change['drone']} → {peers}: {change['to']}{reason}"
 
 
 def event_in_words(row: dict[str, Any]) -> str:
-    """An event with whom it befell: `drone 2: links of 2 lose 37 dB`."""
+    """An event and the drone that it affects: `drone 2: links of 2 lose 37 dB`."""
     return f"{'fleet' if row['drone'] < 0 else 'drone ' + str(row['drone'])}: {row['text']}"

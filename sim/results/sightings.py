@@ -1,4 +1,4 @@
-"""What each scored fusion saw: its detections judged against the cars that were there."""
+"""Detections of each scored fusion matched to the cars that were there."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from scipy.optimize import linear_sum_assignment
 
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import Disc
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One ego's fusion: `found` are cars as detected, `false` detections without a car, `missed` cars without one.
+    """One ego's fusion: `hits` are detected cars, `false` detections without a car, `missed` cars without a detection.
 
     `full` and `mission` are the matches behind AP; `mission` is None while there is no mission disc.
     """
 
     t_s: float
     drone: int
-    found: Boxes
+    hits: Boxes
     false: Boxes
     missed: Boxes
     full: Matched
@@ -40,18 +41,18 @@ def sightings(
         disc_t_s, discs: [n] times, and [n, 3] x, y, radius of the mission disc from each on; NaN where there is none.
     """
     fusions = tables["fusions"]
-    found, truths = _boxes(tables["detections"]), _boxes(tables["truths"])
+    boxes, truths = _boxes(tables["detections"]), _boxes(tables["truths"])
     at, truth_at = 0, 0
     rows = zip(*(fusions[c].to_pylist() for c in ("t_s", "drone", "detections", "truths")), strict=True)
     for t_s, drone, count, truth_count in rows:
-        own = found.take(np.arange(at, at + count))
+        own = boxes.take(np.arange(at, at + count))
         truth = truths.take(np.arange(truth_at, truth_at + truth_count))
         at, truth_at = at + count, truth_at + truth_count
         full = match(own, truth)
         own = own.take(np.argsort(-own.score, kind="stable"))  # the order of full.hit
         hits = own.take(full.hit)
         disc = discs[np.searchsorted(disc_t_s, t_s, side="right") - 1]
-        mission = None if np.isnan(disc[2]) else match(own, truth, (float(disc[0]), float(disc[1]), float(disc[2])))
+        mission = None if np.isnan(disc[2]) else match(own, truth, Disc(*disc.tolist()))
         yield Sighting(t_s, drone, hits, own.take(~full.hit), truth.take(_uncovered(truth, hits)), full, mission)
 
 

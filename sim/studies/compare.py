@@ -76,8 +76,8 @@ class PairedFusions:
         """AP of the other minus the first's with its interval; None where there was nothing to find."""
         if not all(any(m.truths for m in arm) for arm in (self._first, self._other)):
             return None
-        found = bootstrap(self._first, self._other, self._groups)
-        return found.delta, found.low, found.high
+        gain = bootstrap(self._first, self._other, self._groups)
+        return gain.delta, gain.low, gain.high
 
 
 def compare(
@@ -119,8 +119,8 @@ def compare(
             first = record if first is None else first
             flown.append(Compared(label, outcome(record), gains, None if several else record))
     over = "sorties" if several else "instants of one sortie"
-    found = {key: pair.gain() for key, pair in pairs.items()}
-    return tuple(flown), tuple(Gain(label, f"ap50.{name}", *g, over) for (label, name), g in found.items() if g)
+    over_all = {key: pair.gain() for key, pair in pairs.items()}
+    return tuple(flown), tuple(Gain(label, f"ap50.{name}", *g, over) for (label, name), g in over_all.items() if g)
 
 
 def pair_up(

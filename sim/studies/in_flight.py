@@ -15,16 +15,16 @@ import numpy as np
 from sortie.perception.detectors import Constructor, Detector
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.scenarios.reading.load import load, load_contexts
+from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Perception, Scenario
-from sortie.scenarios.schema.conditions import Condition, Contexts
+from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import both_matched
 from sortie.sim.studies.conditions import paired_interval, scenario_of
 
 POLICIES = ("silence", "all-4", "boxes")
 TOWNS_APART = 1000
-"""Between the seeds of one context's towns: sets number their contexts' towns on from one another."""
+"""Between the seeds of one condition's towns: sets number their conditions' towns on from one another."""
 REGIONS = {"full_scene": "everywhere", "mission": "in the mission's disc"}
 
 
@@ -38,10 +38,10 @@ class BothDetectors:
 
 @dataclass(frozen=True, slots=True)
 class ConditionAp:
-    """AP@0.5 of one policy in one region of one context, by both."""
+    """AP@0.5 of one policy in one region of one condition, by both."""
 
     policy: str
-    context: str
+    condition: str
     region: str
     torch: float
     surrogate: float
@@ -56,40 +56,42 @@ def flights(
     progress: Callable[[str, int, int], None] | None = None,
     towns: int = 1,
 ) -> Iterator[ConditionAp]:
-    """Fly a scenario, or every context of a set with its first seed, under some policies.
+    """Fly a scenario, or every condition of a set with its first seed, under some policies.
 
     Args:
         towns: each is flown in so many: its own, and others of its kind, whose seeds, and the sortie's, count on from
-            its own. A context's AP is that of all their fusions together: a mission's disc holds a handful of cars, and
+            its own. A condition's AP is that of all their fusions together: a mission's disc holds a handful of cars, and
             twenty discs say little.
 
     Raises:
         ScenarioError, PolicyError: what cannot be flown, before anything is.
     """
-    contexts = load_contexts(name)
-    if contexts is None:
-        contexts = Contexts(base=name, seeds=(load(name).seed,), contexts=(Condition(name="sortie", rho=1.0),))
+    conditions = load_conditions(name)
+    if conditions is None:
+        conditions = ConditionSet(base=name, seeds=(load(name).seed,), conditions=(Condition(name="sortie", rho=1.0),))
         planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
     else:
-        planned = [[(p, scenario_of(contexts, c, p)) for p in policies] for c in contexts.contexts]
+        planned = [[(p, scenario_of(conditions, c, p)) for p in policies] for c in conditions.conditions]
     both = torch_answers(calibration, weights), _surrogate(calibration)
     count, flown = len(planned) * len(policies) * towns, 0
-    for context, todo in zip(contexts.contexts, planned, strict=True):
+    for condition, todo in zip(conditions.conditions, planned, strict=True):
         matched: dict[tuple[str, str], tuple[list[Matched], list[Matched]]] = {}
         for town, (policy, scenario) in itertools.product(range(towns), todo):
             if progress is not None:
                 progress(f"{name} by both detectors", flown, count)
             there = _in_town(scenario, town, rate_hz)
-            found = [both_matched(run_sortie(there, None, contexts.seeds[0] + town, detector_of=make)) for make in both]
+            matches = [
+                both_matched(run_sortie(there, None, conditions.seeds[0] + town, detector_of=make)) for make in both
+            ]
             flown += 1
             for region in REGIONS:
                 theirs, ours = matched.setdefault((policy, region), ([], []))
-                theirs += found[0][region].values()
-                ours += found[1][region].values()
+                theirs += matches[0][region].values()
+                ours += matches[1][region].values()
         for (policy, region), (theirs, ours) in matched.items():
             torch = average_precision(theirs)
             if not np.isnan(torch):  # there is such a region, and there are cars in it
-                yield ConditionAp(policy, context.name, region, torch, average_precision(ours))
+                yield ConditionAp(policy, condition.name, region, torch, average_precision(ours))
     if progress is not None:
         progress(f"{name} by both detectors", count, count)
 
@@ -116,9 +118,9 @@ def torch_answers(calibration: Path | None = None, weights: Path | None = None) 
     last: list[tuple[object, Detector]] = []
 
     def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-        asked = scene.made_of, config, seed, replication
-        if not last or last[0][0] != asked:
-            last[:] = [(asked, TorchDetector(scene, config, seed, weights, replication))]
+        key = scene.made_of, config, seed, replication
+        if not last or last[0][0] != key:
+            last[:] = [(key, TorchDetector(scene, config, seed, weights, replication))]
         return BothDetectors(last[0][1], ours(scene, config, seed, replication))
 
     return make
@@ -135,7 +137,7 @@ def _surrogate(calibration: Path | None) -> Constructor:
 
 @dataclass(frozen=True, slots=True)
 class ConditionMean:
-    """The mean over contexts of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, contexts
+    """The mean over conditions of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, conditions
     resampled in pairs, of the torch detector's and of the difference; NaN for a single one."""
 
     what: str
@@ -149,7 +151,7 @@ def means(levels: Sequence[ConditionAp]) -> Iterator[ConditionMean]:
     """Of every policy, then of every policy against every earlier one."""
     policies = list(dict.fromkeys(v.policy for v in levels))
     for region in REGIONS:
-        ap = {p: {v.context: v for v in levels if (v.policy, v.region) == (p, region)} for p in policies}
+        ap = {p: {v.condition: v for v in levels if (v.policy, v.region) == (p, region)} for p in policies}
         for p in policies:
             if ap[p]:
                 yield _mean(p, region, _table(ap[p].values()))

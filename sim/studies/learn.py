@@ -1,7 +1,7 @@
 """Learning to spend a budget: simulated sorties under every arm of `sortie.policies.catalogue.adaptive`, and what they teach.
 
-An offline contextual bandit. Training contexts are drawn from ranges that the held-out set
-(`scenarios/library/contexts.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that
+An offline contextual bandit. Training conditions are drawn from ranges that the held-out set
+(`scenarios/library/conditions.yaml`) keeps out of; in each, every arm is flown with the same seed and draws, so that
 arms differ by nothing but themselves. Per arm, ridge regression predicts the AP gained over the first arm from what a
 policy sees (`sortie.policies.catalogue.adaptive.features`). The result is a few numbers in a JSON file; nothing of it needs torch.
 """
@@ -41,20 +41,20 @@ TORCH_RATE_HZ = 0.5
 """How often the torch detector scores: a moment of five drones costs it most of a second."""
 RIDGE = 30.0
 """Shrinkage of the slopes towards none; the mean gain of an arm is not shrunk. Of 1, 3, 10 and 30 the best in ten-fold
-cross-validation over the training contexts."""
+cross-validation over the training conditions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """One training context: what a policy saw in it, and every arm's AP."""
+    """One training condition: what a policy saw in it, and every arm's AP."""
 
     features: tuple[float, ...]
     ap: tuple[float, ...]
-    context: str
+    condition: str
 
 
-def draw_context(seed: int, number: int) -> tuple[Scenario, float]:
-    """Training context `number` of a seed: a scenario and its budget."""
+def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
+    """Training condition `number` of a seed: a scenario and its budget."""
     rng = stream(seed, number, (), "learn.context")
     rho = float(rng.choice(BUDGETS))
     tracking = bool(rng.random() < 0.5)
@@ -78,8 +78,8 @@ def draw_context(seed: int, number: int) -> tuple[Scenario, float]:
 
 
 def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
-    """Fly every arm in a training context; `by_torch`: scored by the torch detector, at fewer moments."""
-    scenario, rho = draw_context(seed, number)
+    """Fly every arm in a training condition; `by_torch`: scored by the torch detector, at fewer moments."""
+    scenario, rho = draw_condition(seed, number)
     detector_of: DetectorMaker = make_detector
     if by_torch:
         perception = scenario.perception.model_copy(update={"sample_rate_hz": TORCH_RATE_HZ})
@@ -110,7 +110,7 @@ def fly_lessons(
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> list[Lesson]:
-    """Lessons of so many contexts; those in which AP is undefined are left out."""
+    """Lessons of so many conditions; those in which AP is undefined are left out."""
     with ProcessPoolExecutor(max_workers=workers) as pool:
         lessons = []
         for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count)):
@@ -137,8 +137,8 @@ def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
 
 
 def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[float, float, int]]:
-    """AP of an arm over the first by phase and budget: mean, its standard error, and how many contexts."""
-    found: dict[tuple[str, float], tuple[float, float, int]] = {}
+    """AP of an arm over the first by phase and budget: mean, its standard error, and how many conditions."""
+    gains: dict[tuple[str, float], tuple[float, float, int]] = {}
     for phase in ("search", "track"):
         for rho in BUDGETS:
             gained = np.array(
@@ -149,8 +149,8 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
                 ]
             )
             if len(gained):
-                found[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
-    return found
+                gains[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
+    return gains
 
 
 def thresholds(lessons: list[Lesson]) -> dict[str, float]:
@@ -178,5 +178,5 @@ def _falls_through_zero(lessons: list[Lesson]) -> float:
 def save(path: Path, lessons: list[Lesson], seed: int, *, by_torch: bool = False) -> None:
     """Write the fit, with how it was made."""
     fitted = fit(lessons)
-    about = f"sortie learn{' --by-torch' * by_torch}, {len(lessons)} contexts of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
+    about = f"sortie learn{' --by-torch' * by_torch}, {len(lessons)} conditions of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
     write_text(path, json.dumps({"about": about, **fitted}, indent=1) + "\n")

@@ -41,7 +41,7 @@ class PaperSettings:
     """One making of the report."""
 
     weights: Path
-    asked: TableSettings
+    settings: TableSettings
     frames: int | None = None
     """None: all of the test split."""
     seed: int = 0
@@ -75,20 +75,20 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     on_the_bus = {} if job.live is None else measured_live(job.live)
     instrument = CarNetInstrument.load(job.weights)
     frames = bench_frames(job.seed, job.frames, work / "bench", lambda done, of: progress("test scenes", done, of))
-    found = measure(
+    measured = measure(
         instrument,
         frames,
-        job.asked,
+        job.settings,
         store=work / "harness",
         workers=job.workers,
         progress=lambda done, of: progress("frames", done, of),
     )
     plane = {**measure_plane(lambda t_s: progress("replay", round(t_s), 120)), **on_the_bus}
     progress("verdicts", 0, 1)
-    scores = found.all_scores()
+    scores = measured.all_scores()
     table, points = rows.judge(scores, plane), rows.points(scores)
-    varied = sensitivity(found)
-    seen = picture(instrument, frames, 0, tau=job.asked.tau, views=camera_views(job.seed, 0))
+    varied = sensitivity(measured)
+    seen = picture(instrument, frames, 0, tau=job.settings.tau, views=camera_views(job.seed, 0))
     progress("verdicts", 1, 1)
     facts = {
         "command": job.command,
@@ -98,11 +98,11 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
         "scenes": len(set(frames.scene.tolist())),
         "weights": job.weights.name,
         "fingerprint": instrument.fingerprint,
-        "unsent": list(job.asked.unsent),
-        "cells_by": job.asked.cells_by,
-        "tau": job.asked.tau,
-        "by": job.asked.by,
-        "draws": job.asked.draws,
+        "unsent": list(job.settings.unsent),
+        "cells_by": job.settings.cells_by,
+        "tau": job.settings.tau,
+        "by": job.settings.by,
+        "draws": job.settings.draws,
         "cpu_s": round(_cpu_s() - cpu_s, 1),
         "wall_s": round(time.perf_counter() - wall_s, 1),
         "machine": machine(),
@@ -121,7 +121,7 @@ def frame_picture(
     frames = bench_frames(job.seed, max(1, frame + 1), work / "bench")
     views = camera_views(job.seed, frame) if frame >= 0 else None
     instrument = CarNetInstrument.load(job.weights)
-    return picture(instrument, frames, frame, ego=ego, budgets=budgets, tau=job.asked.tau, views=views)
+    return picture(instrument, frames, frame, ego=ego, budgets=budgets, tau=job.settings.tau, views=views)
 
 
 def ensure_writable(path: Path) -> None:

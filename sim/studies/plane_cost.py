@@ -146,14 +146,12 @@ def measured_live(path: Path) -> dict[str, MeasuredValue]:
         ValueError: the file cannot be read, or is none of these.
     """
     try:
-        told = json.loads(path.read_text("utf-8"))
-        note = (
-            f"{told['drones']} processes on Cyclone DDS, {told['policy']}, {told['flown_s']:.0f} s, {told['machine']}"
-        )
+        facts = json.loads(path.read_text("utf-8"))
+        note = f"{facts['drones']} processes on Cyclone DDS, {facts['policy']}, {facts['flown_s']:.0f} s, {facts['machine']}"
         core = MeasuredValue(
-            float(told["drones_cpu_percent"]), note=f"{note}; the bench took {told['bench_cpu_percent']:.0f} %"
+            float(facts["drones_cpu_percent"]), note=f"{note}; the bench took {facts['bench_cpu_percent']:.0f} %"
         )
-        data = MeasuredValue(float(told["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
+        data = MeasuredValue(float(facts["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from error
     except (KeyError, TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ import pytest
 import simpy
 
 from sortie.radio import Air
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60]], float)
 FRAMES = 1200
@@ -18,7 +18,7 @@ FRAMES = 1200
 
 def _sortie(samples: int) -> int:
     env = simpy.Environment()
-    air = Air(env, Radio(), np.broadcast_to(CROSS_M, (FRAMES, 5, 3)), seed=1, frame_s=0.1)
+    air = Air(env, AirSettings(), np.broadcast_to(CROSS_M, (FRAMES, 5, 3)), seed=1, frame_s=0.1)
     done: list[Any] = []
 
     def frames() -> simpy.events.ProcessGenerator:
@@ -50,7 +50,7 @@ def _square(n: int, frames: int) -> np.ndarray:
     return slot[None] + np.arange(frames)[:, None, None] * np.array([0.5, 0.0, 0.0])
 
 
-def _descriptors(n: int, frames: int, config: Radio) -> int:
+def _descriptors(n: int, frames: int, config: AirSettings) -> int:
     env = simpy.Environment()
     air = Air(env, config, _square(n, frames), seed=1, frame_s=0.1)
 
@@ -69,7 +69,9 @@ def _descriptors(n: int, frames: int, config: Radio) -> int:
     return air.counters.broadcasts
 
 
-@pytest.mark.parametrize("radio", [Radio(), Radio(tx_power_dbm=-12.0, path_loss_exponent=3.0)], ids=["all", "near"])
+@pytest.mark.parametrize(
+    "radio", [AirSettings(), AirSettings(tx_power_dbm=-12.0, path_loss_exponent=3.0)], ids=["all", "near"]
+)
 @pytest.mark.parametrize(("n", "frames"), [(5, 1200), (25, 1200), (100, 1200), (400, 120)])
-def test_descriptors_of_many_drones(benchmark: Any, n: int, frames: int, radio: Radio) -> None:
+def test_descriptors_of_many_drones(benchmark: Any, n: int, frames: int, radio: AirSettings) -> None:
     assert benchmark.pedantic(_descriptors, args=(n, frames, radio), rounds=3, iterations=1) == n * frames

@@ -35,10 +35,12 @@ def test_five_egos_of_four_moments(benchmark: Any, which: str) -> None:
     )
     begins = iter(np.arange(1.0, 1000.0, 5.0).tolist())
 
-    def ask(asked: Moments) -> int:
+    def detect_job(asked: Moments) -> int:
         return sum(len(detector.detect(jobs)) for jobs in asked)
 
-    assert benchmark.pedantic(ask, setup=lambda: ((moments(4, next(begins)),), {}), rounds=3, warmup_rounds=1) == 20
+    assert (
+        benchmark.pedantic(detect_job, setup=lambda: ((moments(4, next(begins)),), {}), rounds=3, warmup_rounds=1) == 20
+    )
 
 
 @pytest.mark.benchmark(group="scoring of a sortie of 120 s at 2 Hz")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.sim.campaign.plan import CampaignPlan, make_plan
 from sortie.sim.campaign.rows import CampaignRows
+from sortie.sim.campaign.store import FILE
 from sortie.sim.campaign.work import RunResult, Task, task_key
 
 CLUSTER = pytest.mark.filterwarnings(
@@ -58,6 +61,15 @@ def table_bytes(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in sorted((folder / "runs").iterdir())}
 
 
+def rows_on_disk(folder: Path) -> int:
+    """How many runs of a campaign's folder have a row."""
+    try:
+        with closing(sqlite3.connect(f"file:{folder / FILE}?mode=ro", uri=True, timeout=60)) as db:
+            return int(db.execute("SELECT count(*) FROM rows").fetchone()[0])
+    except sqlite3.OperationalError:  # not there yet
+        return 0
+
+
 class Pretended:
     """An engine whose rows follow from the task alone, without flying; it can break off after some runs."""
 
@@ -85,7 +97,7 @@ def pretend(run: int, task: str, code: str) -> RunResult:
     return RunResult(run, key, "done", "", key[:16], (value, float(asked["replication"])))
 
 
-__all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "table_bytes", "write"]
+__all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "rows_on_disk", "table_bytes", "write"]
 
 
 def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> CampaignRows:

@@ -42,7 +42,7 @@ def made_frames(scenes: Sequence[int], seed: int = 0, cars: int = 40) -> MadeFra
 
 @dataclass
 class MadeInstrument:
-    """Finds each car of the ego's square with a luck of its own, and the better the more cells it was sent.
+    """Finds each car of the ego's square with a draw of its own, and the better the more cells it was sent.
 
     Boxes are in the ego's estimated frame, with near doubles and inventions among them; `looked` counts frames.
     """
@@ -50,7 +50,7 @@ class MadeInstrument:
     fingerprint: str = "made"
     geometry: Geometry = FULL
     looked: list[int] = field(default_factory=list)
-    asked: int = 0
+    computed: int = 0
 
     def look(self, frames: FleetFrames, frame: int) -> MadeView:
         self.looked.append(frame)
@@ -68,7 +68,7 @@ class MadeView:
         return np.random.Generator(np.random.PCG64(seed)).random((5, 64, 64))
 
     def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[NDArray[np.float64]]:
-        self.instrument.asked += len(exchanges)
+        self.instrument.computed += len(exchanges)
         return [self._boxes(e, floor) for e in exchanges]
 
     def _boxes(self, e: Exchange, floor: float) -> NDArray[np.float64]:

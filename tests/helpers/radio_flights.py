@@ -10,14 +10,14 @@ import simpy
 from radio_examples import CROSS_M, still
 
 from sortie.radio import Air, Transmission
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 
 class Hover:
     """Drones that stand still; `tick` is called in every frame after the links have moved on."""
 
     def __init__(
-        self, config: Radio, positions_m: np.ndarray | None = None, *, n: int = 2, seed: int = 1, spread: float = 0.8,
+        self, config: AirSettings, positions_m: np.ndarray | None = None, *, n: int = 2, seed: int = 1, spread: float = 0.8,
         replication: int = 0,
     ) -> None:  # fmt: skip
         at = CROSS_M[:n] if positions_m is None else positions_m

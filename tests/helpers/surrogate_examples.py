@@ -7,15 +7,14 @@ from collections.abc import Callable
 from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.plan import Question, moment, scene_model
+from sortie.perception.surrogate.plan import DetectorJob, moment, scene_model
 from sortie.scenarios.schema import Perception
 
 
-def asked(
-    parameters: Parameters, scenes: int, takes: Callable[[Question], bool] | None = None, draw: int = 5
+def detector_runs(
+    parameters: Parameters, scenes: int, takes: Callable[[DetectorJob], bool] | None = None, draw: int = 5
 ) -> list[DetectorRuns]:
-    """What a surrogate would have answered where the detector is asked, of a drone alone or of the jobs that it `takes`;
-    `draw` of its luck."""
+    """Detector runs made by a surrogate: those of drones alone, or of the jobs that `takes` accepts; `draw` keys its draws."""
     out = []
     for scene in range(scenes):
         jobs = [j for j in moment(0, "fit", scene, 0) if (takes(j) if takes else not j.shares)]

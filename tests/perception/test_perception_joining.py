@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perception_examples import cross
 
-from sortie.perception.joining import NMS_IOU, OWN_SAY, Heard, Rule, Told, joined, joined_many, told
+from sortie.perception.joining import NMS_IOU, OWN_WEIGHT, EgoSources, Rule, SourceBoxes, joined, joined_many, source_of
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.metrics.overlap import iou_pairs
 from sortie.perception.network.detector import TorchDetector
@@ -27,12 +27,12 @@ def boxes(*rows: tuple[float, ...]) -> Boxes:
     return Boxes.placed(table.reshape(-1, 6), HERE)
 
 
-def say(*rows: tuple[float, ...], weight: float = 1.0) -> Told:
-    return Told(boxes(*rows), weight, HERE)
+def source(*rows: tuple[float, ...], weight: float = 1.0) -> SourceBoxes:
+    return SourceBoxes(boxes(*rows), weight, HERE)
 
 
 def test_of_boxes_that_overlap_suppression_keeps_the_best_and_whatever_stands_alone() -> None:
-    own, peer = boxes((0, 0, 0.5), (30, 0, 0.15)), say((0.3, 0, 0.8), (60, 0, 0.3))
+    own, peer = boxes((0, 0, 0.5), (30, 0, 0.15)), source((0.3, 0, 0.8), (60, 0, 0.3))
     out = joined(HERE, own, False, [peer], "nms")
     assert out.score.tolist() == pytest.approx([0.8, 0.3, 0.15])
     assert out.xy_m[0, 0] == pytest.approx(0.3)
@@ -40,7 +40,7 @@ def test_of_boxes_that_overlap_suppression_keeps_the_best_and_whatever_stands_al
 
 @pytest.mark.parametrize("rule", ["nms", "average"])
 def test_what_lies_outside_the_egos_square_is_not_its_own(rule: Rule) -> None:
-    peer = Told(boxes((101, 0, 0.5), (108, 0, 0.9)), 1.0, (50.0, 0.0, 0.0))
+    peer = SourceBoxes(boxes((101, 0, 0.5), (108, 0, 0.9)), 1.0, (50.0, 0.0, 0.0))
     assert joined(HERE, boxes(), False, [peer], rule).xy_m[:, 0].tolist() == [101.0]
     turned = (0.0, 0.0, np.pi / 4)  # its corner reaches 145 m ahead
     assert len(joined(turned, boxes(), False, [peer], rule)) == 2
@@ -50,14 +50,14 @@ def test_what_lies_outside_the_egos_square_is_not_its_own(rule: Rule) -> None:
 def test_nobody_heard_leaves_the_egos_boxes_as_they_are(rule: Rule) -> None:
     own = boxes((0, 0, 0.5), (30, 0, 0.15))
     assert joined(HERE, own, False, [], rule) is own
-    mute = joined(HERE, own, True, [say((0.3, 0, 0.8), weight=0.0)], rule)
+    mute = joined(HERE, own, True, [source((0.3, 0, 0.8), weight=0.0)], rule)
     np.testing.assert_allclose(mute.table(), own.table(), atol=1e-6)
     np.testing.assert_allclose(mute.score, own.score, rtol=1e-6)
-    assert len(joined(HERE, boxes(), False, [say()], rule)) == 0
+    assert len(joined(HERE, boxes(), False, [source()], rule)) == 0
 
 
 def test_the_average_lies_between_and_is_scored_by_all_who_looked() -> None:
-    own, peer, silent = boxes((0, 0, 0.5), (30, 0, 0.3)), say((0.6, 0.2, 0.25)), say((60, 0, 0.9))
+    own, peer, silent = boxes((0, 0, 0.5), (30, 0, 0.3)), source((0.6, 0.2, 0.25)), source((60, 0, 0.9))
     out = joined(HERE, own, False, [peer, silent], "average")
     assert out.xy_m[0].tolist() == pytest.approx([60, 0])
     assert out.score.tolist() == pytest.approx([0.9 / 3, (0.5 + 0.25) / 3, 0.3 / 3])
@@ -67,35 +67,35 @@ def test_the_average_lies_between_and_is_scored_by_all_who_looked() -> None:
 
 def test_the_egos_answer_counts_twice_where_maps_are_in_it_and_a_peers_by_its_weight() -> None:
     own = boxes((0, 0, 0.5))
-    fused = joined(HERE, own, True, [say((0.6, 0, 0.5), weight=0.5)], "average")
-    assert fused.xy_m[0, 0] == pytest.approx(0.6 * 0.5 / (OWN_SAY + 0.5))
+    fused = joined(HERE, own, True, [source((0.6, 0, 0.5), weight=0.5)], "average")
+    assert fused.xy_m[0, 0] == pytest.approx(0.6 * 0.5 / (OWN_WEIGHT + 0.5))
     assert fused.score[0] == pytest.approx(0.5)
 
 
 def test_headings_are_averaged_as_axes_and_point_where_the_best_box_does() -> None:
-    out = joined(HERE, boxes((0, 0, 0.6, np.pi - 0.1)), False, [say((0, 0, 0.3, 0.05))], "average")
+    out = joined(HERE, boxes((0, 0, 0.6, np.pi - 0.1)), False, [source((0, 0, 0.3, 0.05))], "average")
     twice = (0.6 * np.exp(-0.2j) + 0.3 * np.exp(0.1j)) / 0.9
     assert out.yaw_rad[0] == pytest.approx(np.pi + np.angle(twice) / 2, abs=1e-6)
 
 
 def test_who_could_not_see_a_place_or_left_weak_boxes_out_does_not_vote_it_down() -> None:
     own = boxes((100, 0, 0.6))
-    behind = Told(boxes(), 1.0, (-20.0, 0.0, 0.0))
+    behind = SourceBoxes(boxes(), 1.0, (-20.0, 0.0, 0.0))
     assert joined(HERE, own, False, [behind], "average").score[0] == pytest.approx(0.6)
-    aside = Told(boxes(), 1.0, HERE, roi=(0.0, 0.0, 50.0))
+    aside = SourceBoxes(boxes(), 1.0, HERE, roi=(0.0, 0.0, 50.0))
     assert joined(HERE, own, False, [aside], "average").score[0] == pytest.approx(0.6)
     assert joined(HERE, own, False, [replace(aside, roi=(60.0, 0.0, 50.0))], "average").score[0] == pytest.approx(0.3)
     many = boxes(*[(-90 + 8 * k, 40, 0.9 - 0.01 * k) for k in range(13)])
     share = Share(cross(10.0, 20.0, 0.3)[0], "tracks", 1.0, None, 1.0)
-    cut, whole = told(share, many), told(share, many.take(np.arange(12)))
-    assert (len(cut.boxes), cut.cut, whole.cut) == (12, True, False)
+    cut, whole = source_of(share, many), source_of(share, many.take(np.arange(12)))
+    assert (len(cut.boxes), cut.truncated, whole.truncated) == (12, True, False)
     at = replace(cut, pose=HERE)
     assert joined(HERE, own, False, [at], "average").score.tolist().count(pytest.approx(0.6)) == 1
 
 
-def plainly(own: Boxes, others: list[Told]) -> list[tuple[float, float, float]]:
+def plainly(own: Boxes, others: list[SourceBoxes]) -> list[tuple[float, float, float]]:
     """The average's (x, y, score), by loops; everybody sees everything."""
-    everyone = [(own, 1.0), *((t.boxes, t.say) for t in others)]
+    everyone = [(own, 1.0), *((t.boxes, t.weight) for t in others)]
     rows = [
         (float(b.score[k]) * w, float(b.score[k]), who, b.table()[k])
         for who, (b, w) in enumerate(everyone)
@@ -127,7 +127,7 @@ def test_the_average_is_what_a_plain_loop_says(seed: int, drones: int, cars: int
         rows = np.column_stack([rng.uniform(-15, 15, (cars, 2)), rng.uniform(0.1, 1, cars), rng.uniform(-3, 3, cars)])
         return suppress(boxes(*map(tuple, rows)), NMS_IOU)
 
-    own, others = some(), [Told(some(), float(rng.uniform(0.2, 1)), HERE) for _ in range(drones)]
+    own, others = some(), [SourceBoxes(some(), float(rng.uniform(0.2, 1)), HERE) for _ in range(drones)]
     out, want = joined(HERE, own, False, others, "average"), plainly(own, others)
     assert len(out) == len(want)
     if want:
@@ -144,7 +144,7 @@ def test_detectors_join_as_the_scenario_says(make: type[TorchDetector]) -> None:
     for rule in get_args(Rule):
         out, *alone = make(scene, Perception(join=rule), 1).detect(job)
         own = make(scene, Perception(join=rule), 1).detect([(fleet[0], ())])[0]
-        others = [told(s, b) for s, b in zip(shares, alone, strict=True)]
+        others = [source_of(s, b) for s, b in zip(shares, alone, strict=True)]
         want = joined(fleet[0].est_pose, own, False, others, rule)
         np.testing.assert_array_equal(out.table(), want.table())
         np.testing.assert_array_equal(out.score, want.score)
@@ -165,11 +165,13 @@ def test_many_egos_at_once_are_each_as_alone(rule: Rule) -> None:
     for k in range(12):
         pose = (400.0 * (k % 3), 0.0, 0.5 * k)
         others = [
-            Told(some(40 * (k % 4), pose[:2]), 0.25 * (j % 3), pose, (*pose[:2], 60.0) if j == 1 else None, j == 2)
+            SourceBoxes(
+                some(40 * (k % 4), pose[:2]), 0.25 * (j % 3), pose, (*pose[:2], 60.0) if j == 1 else None, j == 2
+            )
             for j in range(k % 5)
         ]
-        egos.append(Heard(pose, some(60, pose[:2]), k % 2 == 0, others))
-    egos.append(Heard((5000.0, 0.0, 0.0), some(5, (0.0, 0.0)), False, egos[3].others))
+        egos.append(EgoSources(pose, some(60, pose[:2]), k % 2 == 0, others))
+    egos.append(EgoSources((5000.0, 0.0, 0.0), some(5, (0.0, 0.0)), False, egos[3].others))
     together = joined_many(egos, rule)
     assert len(together) == len(egos)
     for many, ego in zip(together, egos, strict=True):

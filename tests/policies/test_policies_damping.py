@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sortie.policies.damping import LinkState, believed, damp
+from sortie.policies.damping import LinkState, apply_hysteresis, damp
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
@@ -138,7 +138,7 @@ def read(values: list[float], field: str = "goodput", band: float = BAND) -> lis
     known, seen = None, []
     for value in values:
         heard = HEARD._replace(**({"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}))
-        known = heard if known is None else believed(known, heard, band)
+        known = heard if known is None else apply_hysteresis(known, heard, band)
         seen.append(known.peer_goodput_mbps[0] if field == "goodput" else getattr(known, field))
     return seen
 
@@ -159,9 +159,9 @@ def test_a_link_that_hovers_about_a_threshold_crosses_it_once() -> None:
 
 def test_all_else_is_read_as_heard_and_a_roster_that_grew_anew() -> None:
     moved = HEARD._replace(stamp_ns=7, position_m=(1.0, 2.0, 3.0), task_phase=TaskPhase.TRACK)
-    assert believed(HEARD, moved, BAND) is moved
+    assert apply_hysteresis(HEARD, moved, BAND) is moved
     more = moved._replace(peer_goodput_mbps=(11.0, 0.0, 3.0), battery_soc=0.9)
-    assert believed(HEARD, more, BAND) == more._replace(battery_soc=pytest.approx(0.72))
+    assert apply_hysteresis(HEARD, more, BAND) == more._replace(battery_soc=pytest.approx(0.72))
 
 
 @given(st.lists(st.floats(0, 300), min_size=1, max_size=60), st.floats(0, 3))
@@ -182,7 +182,7 @@ def test_an_answer_is_kept_for_who_asks_the_same_alone() -> None:
     poor, fair, rich = (HEARD._replace(peer_goodput_mbps=(mbps, 0.0)) for mbps in (10.0, 20.0, 24.0))
     other = rich._replace(agent_id=2)
     asked = [(poor, rich, BAND), (fair, rich, BAND), (fair, rich, 0.1), (fair, other, 0.1), (poor, rich, BAND)]
-    read = [believed(*a).peer_goodput_mbps[0] for a in asked]
+    read = [apply_hysteresis(*a).peer_goodput_mbps[0] for a in asked]
     assert read == pytest.approx([24 / 1.25, 20.0, 24 / 1.1, 24 / 1.1, 24 / 1.25])
-    assert believed(poor, rich, BAND) is believed(poor, rich, BAND)
-    assert believed(poor, other, BAND).agent_id == 2
+    assert apply_hysteresis(poor, rich, BAND) is apply_hysteresis(poor, rich, BAND)
+    assert apply_hysteresis(poor, other, BAND).agent_id == 2

@@ -16,18 +16,18 @@ from scipy import stats
 
 from sortie.radio import Air, Status, Transmission
 from sortie.radio.rates import STANDARDS
+from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import losses
-from sortie.scenarios.schema import Radio
 
-DEFAULT = Radio()
-STILL = Radio(shadowing_sigma_db=0.0)
+DEFAULT = AirSettings()
+STILL = AirSettings(shadowing_sigma_db=0.0)
 
 
 class Flight:
     """A fleet that hovers in a cross; `tick` is called in every frame after the links have moved on."""
 
     def __init__(
-        self, config: Radio = DEFAULT, n: int = 5, *, seed: int = 1, replication: int = 0, spread: float = 0.8
+        self, config: AirSettings = DEFAULT, n: int = 5, *, seed: int = 1, replication: int = 0, spread: float = 0.8
     ) -> None:
         self.env = simpy.Environment()
         self.n = n
@@ -101,7 +101,7 @@ def test_two_percent_of_the_cells_fit_without_a_miss() -> None:
 
 
 def test_the_row_of_one_sample() -> None:
-    f = Flight(Radio(shadowing_sigma_db=0.0, tx_power_dbm=30.0))
+    f = Flight(AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=30.0))
     f.fly(0.2, lambda t: t == 0 and f.send(0, 1, 2000, kind="features"))
     (row,) = f.rows
     assert (row.number, row.sender, row.receiver, row.kind, row.payload_bytes) == (0, 0, 1, "features", 2000)
@@ -136,7 +136,7 @@ def test_losses_invert_the_binomial(u: float, count: int, q: float) -> None:
 
 
 def test_a_lossy_link_loses_best_effort_samples_and_repairs_reliable_ones() -> None:
-    edge = Radio(shadowing_sigma_db=0.0, retry_limit=0)  # every failed frame is a lost fragment
+    edge = AirSettings(shadowing_sigma_db=0.0, retry_limit=0)  # every failed frame is a lost fragment
     fates = {}
     for reliable in (False, True):
         f = Flight(edge, 2)
@@ -333,7 +333,7 @@ traffic = st.lists(
 def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
     samples: list, seed: int, retry_limit: int, loss_db: float, silenced_at: int | None
 ) -> None:
-    f = Flight(Radio(retry_limit=retry_limit, tx_power_dbm=15.0), 4, seed=seed)
+    f = Flight(AirSettings(retry_limit=retry_limit, tx_power_dbm=15.0), 4, seed=seed)
     f.extra[1, :] = loss_db
 
     def tick(t: float) -> None:
@@ -402,7 +402,7 @@ def test_a_far_receiver_misses_some_broadcasts_a_dead_one_all() -> None:
 
 def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
     def fates(n: int, seed: int = 1) -> tuple[list, list]:
-        f = Flight(Radio(retry_limit=0), n, seed=seed)
+        f = Flight(AirSettings(retry_limit=0), n, seed=seed)
 
         def tick(_: float) -> None:
             for i in range(5):

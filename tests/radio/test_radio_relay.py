@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from radio_flights import Hover, trace
 
 from sortie.radio import Status
 from sortie.radio.relay import Routes, cheapest
+from sortie.radio.settings import AirSettings
 from sortie.radio.topology import bottleneck, connectivity, link_graph, widest_path, widths
-from sortie.scenarios.schema import Radio
 
 LINE_M = np.array([[0.0, 0.0, 60.0], [150.0, 0.0, 60.0], [300.0, 0.0, 60.0]])
 """Three in a row: either end is heard badly by the other, well by the middle."""
@@ -65,9 +66,9 @@ def test_what_cannot_be_routed() -> None:
 # --- flown ---------------------------------------------------------------------------------------------
 
 
-def traced(folder: Path, **knobs) -> Radio:  # type: ignore[no-untyped-def]
+def traced(folder: Path, **knobs) -> AirSettings:  # type: ignore[no-untyped-def]
     """0 → 1 and 1 → 2 carry 100 Mb/s, 0 → 2 carries 10."""
-    return Radio(trace=trace(folder, "0,0,1,,,100", "0,1,2,,,100", "0,0,2,,,10"), **knobs)
+    return AirSettings(trace=trace(folder, "0,0,1,,,100", "0,1,2,,,100", "0,0,2,,,10"), **knobs)
 
 
 def test_a_route_over_others_pays_airtime_for_each_hop(tmp_path: Path) -> None:
@@ -88,16 +89,16 @@ def test_a_route_over_others_pays_airtime_for_each_hop(tmp_path: Path) -> None:
 
 
 def test_a_good_direct_link_is_not_left() -> None:
-    flight = Hover(Radio(relay_max_hops=4), n=5)
+    flight = Hover(AirSettings(relay_max_hops=4), n=5)
     flight.fly(5.0, lambda frame: [flight.send(i, (i + 1) % 5, 3000, kind="d") for i in range(5)])
     assert {r.hops for r in flight.rows} == {1}
 
 
 def test_far_ends_of_a_row_are_reached_over_its_middle() -> None:
-    config = Radio(shadowing_sigma_db=0.0, tx_power_dbm=7.0)
+    config = AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=7.0)
     came = {}
     for hops in (1, 2):
-        flight = Hover(config.model_copy(update={"relay_max_hops": hops}), LINE_M)
+        flight = Hover(replace(config, relay_max_hops=hops), LINE_M)
         flight.fly(10.0, lambda frame, f=flight: f.send(0, 2, 60_000))  # type: ignore[misc]
         came[hops] = sum(r.status is Status.DELIVERED for r in flight.rows) / len(flight.rows)
         assert sum(r.hops == hops for r in flight.rows) > 90  # in the first frame nothing is known before it
@@ -109,7 +110,7 @@ def test_routes_know_a_traced_loss(tmp_path: Path) -> None:
     """0 → 1 loses all at a perfect SNR, 0 → 2 half; 0 → 3, by the models out of everyone's range, nothing."""
     at_m = np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0], [0.0, 20.0, 60.0], [2e6, 0.0, 60.0]])
     links = trace(tmp_path, "0,0,1,,1,", "0,0,2,,0.5,", "0,0,3,,0,")
-    flight = Hover(Radio(trace=links, relay_max_hops=2, shadowing_sigma_db=0.0, retry_limit=20), at_m)
+    flight = Hover(AirSettings(trace=links, relay_max_hops=2, shadowing_sigma_db=0.0, retry_limit=20), at_m)
     flight.fly(3.0, lambda frame: [flight.send(0, j, 20_000) for j in (1, 2, 3)])
     mbps = flight.air.link_mbps()
     assert mbps[0, 1] == 0.0
@@ -152,7 +153,7 @@ def test_what_dies_in_a_relay_s_queue_was_served_on_its_first_hop(tmp_path: Path
 
 def test_no_row_of_a_flight_over_relays_has_airtime_and_was_never_served() -> None:
     line_m = np.array([[150.0 * i, 0.0, 60.0] for i in range(5)])
-    flight = Hover(Radio(relay_max_hops=4, tx_power_dbm=10.0), line_m)
+    flight = Hover(AirSettings(relay_max_hops=4, tx_power_dbm=10.0), line_m)
     flight.fly(5.0, lambda frame: [flight.send(i, j, 60_000) for i in range(5) for j in range(5) if i != j])
     rows = flight.rows + flight.air.finish()
     assert sum(r.hops > 1 and r.reason == "deadline_queued" for r in rows) > 50
@@ -161,7 +162,7 @@ def test_no_row_of_a_flight_over_relays_has_airtime_and_was_never_served() -> No
 
 def test_pieces_lost_on_one_hop_are_not_sent_on_the_next(tmp_path: Path) -> None:
     links = trace(tmp_path, "0,0,1,,0.3,100", "0,1,2,,0.3,100", "0,0,2,,,0")
-    flight = Hover(Radio(trace=links, retry_limit=0, relay_max_hops=2), LINE_M)
+    flight = Hover(AirSettings(trace=links, retry_limit=0, relay_max_hops=2), LINE_M)
     flight.fly(60.0, lambda frame: flight.send(0, 2, 64 * 1336, piece_bytes=1336))
     share = np.mean([r.arrived_bytes for r in flight.rows]) / (64 * 1336)
     assert share == pytest.approx(0.49, abs=0.01)

@@ -14,13 +14,13 @@ from scipy import stats
 
 from sortie.radio import Status
 from sortie.radio.mac.airtime import frame_bytes, sample_wire
-from sortie.scenarios.schema import Bursts, Radio
+from sortie.radio.settings import AirSettings, BurstSettings
 
 
-def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> Radio:  # type: ignore[no-untyped-def]
+def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> AirSettings:  # type: ignore[no-untyped-def]
     """A link from drone 0 to 1 of that goodput which loses every `loss`-th frame, and no retries."""
     name = trace(folder, f"0,0,1,,{loss},{'' if goodput_mbps is None else goodput_mbps}")
-    return Radio(trace=name, **{"retry_limit": 0, **knobs})
+    return AirSettings(trace=name, **{"retry_limit": 0, **knobs})
 
 
 TABLE = [(488, 0.614), (122, 0.885), (10, 0.990), (1, 0.999)]
@@ -96,7 +96,7 @@ def test_a_deadline_cuts_pieces_short_and_the_first_are_there(tmp_path: Path) ->
 
 def test_pieces_sent_before_the_link_went_are_there(tmp_path: Path) -> None:
     links = trace(tmp_path, "0,0,1,,,20", "0.19,0,1,,,20", "0.2,0,1,,,0")
-    flight = Hover(Radio(trace=links))
+    flight = Hover(AirSettings(trace=links))
     flight.fly(1.0, lambda frame: flight.send(0, 1, 400 * 1336, piece_bytes=1336, deadline_s=1.0) if frame == 1 else 0)
     (row,) = flight.rows
     assert (row.status, row.reason) == (Status.PARTIAL, "no_link")
@@ -126,7 +126,7 @@ def test_a_piece_costs_no_fragment_header() -> None:
 
 def test_a_piece_has_a_byte() -> None:
     with pytest.raises(ValueError, match="piece_bytes is 0, must be at least 1"):
-        Hover(Radio()).fly(0.1, lambda frame: None).send(0, 1, 10, piece_bytes=0)
+        Hover(AirSettings()).fly(0.1, lambda frame: None).send(0, 1, 10, piece_bytes=0)
 
 
 @settings(max_examples=40, deadline=None)
@@ -137,8 +137,8 @@ def test_a_piece_has_a_byte() -> None:
 def test_bytes_are_conserved_whatever_is_flown(
     pieces: int, spare: int, reliable: bool, seed: int, deadline_s: float, bad: float, power_dbm: float, hops: int
 ) -> None:
-    config = Radio(
-        bursts=Bursts(good_to_bad=0.3, loss_bad=bad, step_s=0.1), tx_power_dbm=power_dbm, relay_max_hops=hops
+    config = AirSettings(
+        bursts=BurstSettings(good_to_bad=0.3, loss_bad=bad, step_s=0.1), tx_power_dbm=power_dbm, relay_max_hops=hops
     )
     flight = Hover(config, n=3, seed=seed)
     size = max(1, pieces * 1336 - spare)
@@ -162,7 +162,7 @@ def test_bytes_are_conserved_whatever_is_flown(
 
 
 def test_equal_flights_lose_equal_pieces() -> None:
-    config = Radio(bursts=Bursts(good_to_bad=0.3, step_s=0.1, loss_bad=0.8))
+    config = AirSettings(bursts=BurstSettings(good_to_bad=0.3, step_s=0.1, loss_bad=0.8))
 
     def missing(n: int) -> list[tuple[int, ...]]:
         flight = Hover(config, n=n)

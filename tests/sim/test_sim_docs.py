@@ -118,9 +118,12 @@ def test_a_command_that_is_none_is_found(words: list[str]) -> None:
     assert fault(words) is not None
 
 
-def test_the_readme_s_policy_is_one() -> None:
+def test_the_readme_s_example_flies_and_its_policy_is_one(capsys: pytest.CaptureFixture[str]) -> None:
     """It decides for every peer, within the contract."""
-    (code,) = re.findall(r"```python\n(# my_policy.py.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    (example,) = [e for e in examples(ROOT / "README.md") if e.language == "python"]
     names: dict[str, Any] = {"__name__": "readme"}
-    exec(compile(code, "README.md", "exec"), names)  # noqa: S102 - our own page
+    exec(compile(example.text, "README.md", "exec"), names)  # noqa: S102 - our own page
+    accuracy, sent = map(float, capsys.readouterr().out.split())
+    assert 0.0 < accuracy < 1.0
+    assert sent > 1e6
     assert {check.name: check.what for check in conform(names["decide"], count=50) if not check.holds} == {}

@@ -31,7 +31,7 @@ from sortie.fleet.logs.identify import (
     stated_pack,
     voltage_error,
 )
-from sortie.scenarios.schema import Airframe, Battery
+from sortie.scenarios.schema import Airframe, Battery, Polarisation
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = Path(os.environ.get("SORTIE_FLIGHT_LOG", ROOT.parent / "shared/flightlogs/log171.bin"))
@@ -93,7 +93,7 @@ def voltage_figures(log: FlightLog) -> dict[str, Any]:
         "stated_whole": voltage_error(log, stated, 0.0, END_S),
         "stated_flight": voltage_error(log, stated, TAKEOFF_S, END_S),
         "fitted_mohm": fitted.cell_resistance_mohm,
-        "fitted_polarisation_mohm": fitted.polarisation_mohm,
+        "fitted_polarisation_mohm": fitted.polarisation.resistance_mohm,
         "fitted_first": voltage_error(log, fitted, 0.0, SPLIT_S),
         "fitted_rest": voltage_error(log, fitted, SPLIT_S, END_S),
         "fitted_rest_by_time_constant_s": {
@@ -212,7 +212,7 @@ def effects() -> list[tuple[str, float]]:
         ("default pack and airframe", endurance_min(Battery())),
         ("0.5 kg of payload", endurance_min(Battery(), Airframe(payload_kg=0.5))),
         ("at 2,000 m (1.01 kg/m³)", endurance_min(Battery(), Airframe(air_density_kgpm3=1.01))),
-        ("polarisation 5 mΩ a cell, 20 s", endurance_min(Battery(polarisation_mohm=5))),
+        ("polarisation 5 mΩ a cell, 20 s", endurance_min(Battery(polarisation=Polarisation(resistance_mohm=5)))),
         ("cut-off at 3.3 V a cell", endurance_min(Battery(**cut))),
         ("the same at 25 °C, self-heating on", endurance_min(Battery(ambient_c=25, **cut))),
         ("the same at 0 °C", endurance_min(Battery(ambient_c=0, **cut))),

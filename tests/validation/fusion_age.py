@@ -18,11 +18,11 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
 from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import Matched, match, suppress
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.bev import lift
 from sortie.perception.network.decode import decode
-from sortie.perception.network.detector import ground_truth
 from sortie.perception.network.fusion.base import takes_part
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
@@ -91,7 +91,7 @@ def measure(
         for frame in range(frames):
             fleet = draw_captures(bench.seed, split, index, frame, bench.difficulty)
             for key, boxes in _frame(net, renderer, fleet, ages_s, speed_mps).items():
-                truths = (ground_truth(scene, e.t_s, e.position_m[:2], net.config.half_extent_m, e.true_yaw_rad) for e in fleet)  # fmt: skip
+                truths = (ground_truth(scene.cars_at(e.t_s).table(), e.true_pose, net.config.half_extent_m).single() for e in fleet)  # fmt: skip
                 units.setdefault(key, []).extend(match(b, t) for b, t in zip(boxes, truths, strict=True))
             scene_of += [index] * DRONES
             if progress is not None:

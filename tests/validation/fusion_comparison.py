@@ -16,7 +16,7 @@ from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.selection import link_bytes
-from sortie.perception.joining import NMS_IOU, Pose, Rule, Told, joined, sendable
+from sortie.perception.joining import NMS_IOU, Pose, Rule, SourceBoxes, joined, sendable
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.decode import decode
@@ -82,7 +82,7 @@ class LateView:
         out = []
         for e in exchanges:
             own, pose = self._found[e.ego], self._poses[e.ego]
-            theirs = [Told(sendable(self._found[p]), 1.0, self._poses[p]) for p in e.peers]
+            theirs = [SourceBoxes(sendable(self._found[p]), 1.0, self._poses[p]) for p in e.peers]
             boxes = joined(pose, own.take(own.score >= floor), False, theirs, self._rule)
             x, y, yaw = pose
             c, s = np.cos(yaw), np.sin(yaw)

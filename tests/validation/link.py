@@ -30,7 +30,7 @@ from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S, contention, satu
 from sortie.radio.mac.rate_control import INTERVAL_S, Minstrel
 from sortie.radio.rates import STANDARDS, per, rate_table
 from sortie.radio.sample import Service
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs/validation"
@@ -85,7 +85,7 @@ def outage(frames: int) -> Rows:
     rows = []
     for k_db in (6.0, 12.0):
         k = 10 ** (k_db / 10)
-        channel = Channel(Radio(rician_k_db=k_db), np.broadcast_to(CROSS_M, (frames, 5, 3)), 1, 0, 0.1)
+        channel = Channel(AirSettings(rician_k_db=k_db), np.broadcast_to(CROSS_M, (frames, 5, 3)), 1, 0, 0.1)
         gains = []
         for _ in range(frames):
             channel.advance()
@@ -109,7 +109,7 @@ def outage(frames: int) -> Rows:
 
 def shadowing(frames: int, fields: int) -> Rows:
     """Autocorrelation in time (each pair its own) and in space (Gudmundson, one end moves)."""
-    channel = Channel(Radio(), np.broadcast_to(CROSS_M, (frames, 5, 3)), 3, 0, 0.1)
+    channel = Channel(AirSettings(), np.broadcast_to(CROSS_M, (frames, 5, 3)), 3, 0, 0.1)
     seen = []
     for _ in range(frames):
         channel.advance()
@@ -281,7 +281,9 @@ def rate_control(seconds: float) -> Rows:
     return rows
 
 
-def _fly(config: Radio, seconds: float, tick: Callable[[Air, int], None], loss_db: Callable[[float], float]) -> Air:
+def _fly(
+    config: AirSettings, seconds: float, tick: Callable[[Air, int], None], loss_db: Callable[[float], float]
+) -> Air:
     """Two drones at 20 m; `tick` once a frame, after the links have moved on."""
     env = simpy.Environment()
     frames = round(seconds * 10)
@@ -303,8 +305,8 @@ def goodput(seconds: float) -> Rows:
     rows = []
     for payload in (150, 13_120, 163_840):
         for name, config, loss in (
-            ("still", Radio(shadowing_sigma_db=0.0), lambda t: 12.0),
-            ("shadowing 3.5 dB", Radio(), lambda t: 12.0),
+            ("still", AirSettings(shadowing_sigma_db=0.0), lambda t: 12.0),
+            ("shadowing 3.5 dB", AirSettings(), lambda t: 12.0),
         ):
             service, read, true = Service(config, 1, 0), [], []
 
@@ -345,7 +347,7 @@ def goodput_step() -> Rows:
     for payload in (150, 13_120, 163_840):
         read: list[float] = []
         _fly(
-            Radio(shadowing_sigma_db=0.0), 30.0,
+            AirSettings(shadowing_sigma_db=0.0), 30.0,
             lambda air, k, p=payload, read=read: (  # type: ignore[misc]
                 read.append(air.goodput_mbps(0)[0]),
                 air.send(0, 1, p, kind="f", reliable=False, deadline_s=0.09, on_done=lambda row: None),
@@ -380,7 +382,7 @@ def moving_fleet(n: int, frames: int, spacing_m: float = 20.0) -> np.ndarray:
     return slot[None] + np.stack([5.0 * t + swing, 2.0 * swing, 0.5 * swing], axis=-1)
 
 
-def broadcast_all(n: int, seconds: float, config: Radio) -> tuple[Air, float, int]:
+def broadcast_all(n: int, seconds: float, config: AirSettings) -> tuple[Air, float, int]:
     """Every drone a 208 B descriptor at 10 Hz; the air, CPU seconds, and events of the clock."""
     frames = round(seconds * 10)
     positions = moving_fleet(n, frames)
@@ -405,13 +407,13 @@ def broadcast_all(n: int, seconds: float, config: Radio) -> tuple[Air, float, in
     return air, time.process_time() - begin_s, next(env._eid)
 
 
-WEAK = Radio(tx_power_dbm=-12.0, path_loss_exponent=3.0)
+WEAK = AirSettings(tx_power_dbm=-12.0, path_loss_exponent=3.0)
 
 
 def scale(seconds: float, sizes: tuple[int, ...]) -> Rows:
     """CPU time, best of three, of 120 s or what was asked for."""
     rows = []
-    for name, config in (("default radio", Radio()), (f"earshot {earshot_m(WEAK):.0f} m", WEAK)):
+    for name, config in (("default radio", AirSettings()), (f"earshot {earshot_m(WEAK):.0f} m", WEAK)):
         for n in sizes:
             runs = [broadcast_all(n, seconds, config) for _ in range(3 if n <= 100 else 1)]
             air, _, events = runs[0]
@@ -458,7 +460,7 @@ def figures(folder: Path) -> None:
     a.invert_yaxis()
     fades = np.geomspace(1e-3, 2, 200)
     for k_db, colour in ((6.0, "C0"), (12.0, "C1")):
-        channel = Channel(Radio(rician_k_db=k_db), np.broadcast_to(CROSS_M, (3000, 5, 3)), 1, 0, 0.1)
+        channel = Channel(AirSettings(rician_k_db=k_db), np.broadcast_to(CROSS_M, (3000, 5, 3)), 1, 0, 0.1)
         gains = []
         for _ in range(3000):
             channel.advance()

@@ -21,19 +21,17 @@ SCENARIO = "track_target"
 POLICIES = ("deputies", "who2com")
 FORMS: dict[str, tuple[str, ...]] = {
     "the paper's": (),
-    "grid 8 × 8": ("context.grid_cells=8",),
-    "grid 4 × 4": ("context.grid_cells=4",),
-    "no grid": ("context.grid_cells=0",),
-    "1 bit a cell": ("context.grid_bits=1",),
-    "16 bits a number": ("context.number_bits=16",),
-    "12 bits a number": ("context.number_bits=12",),
-    "8 bits a number": ("context.number_bits=8",),
+    "grid 8 × 8": ("context.form=grid_8",),
+    "grid 4 × 4": ("context.form=grid_4",),
+    "no grid": ("context.form=no_grid",),
+    "1 bit a cell": ("context.form=cells_1_bit",),
+    "16 bits a number": ("context.form=numbers_16_bit",),
+    "12 bits a number": ("context.form=numbers_12_bit",),
+    "8 bits a number": ("context.form=numbers_8_bit",),
     "5 Hz": ("context.publish_every=2",),
     "2 Hz": ("context.publish_every=5",),
     "1 Hz": ("context.publish_every=10",),
-    "8 × 8, 1 bit, 16 bits, 2 Hz": (
-        "context.grid_cells=8", "context.grid_bits=1", "context.number_bits=16", "context.publish_every=5",
-    ),
+    "8 × 8, 1 bit, 16 bits, 2 Hz": ("context.form=small", "context.publish_every=5"),
 }  # fmt: skip
 """By name, and what it sets."""
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from radio_flights import Hover, trace
 from scipy import stats
 
-from sortie.scenarios.schema import Bursts, Radio
+from sortie.radio.settings import AirSettings, BurstSettings
 
 PERIOD_S = 0.1
 
@@ -57,7 +57,7 @@ def test_a_link_that_is_always_lost_has_no_age() -> None:
 # --- in the simulation ---------------------------------------------------------------------------------
 
 
-def flown_ages(config: Radio, duration_s: float, *, seed: int = 1) -> dict[int, np.ndarray]:
+def flown_ages(config: AirSettings, duration_s: float, *, seed: int = 1) -> dict[int, np.ndarray]:
     """[arrivals, 2] of drone 0's descriptors at each of the others: when sent, when heard."""
     flight = Hover(config, n=5, seed=seed, spread=0.0)
     flight.fly(duration_s, lambda frame: flight.publish(0))
@@ -86,7 +86,7 @@ def within(values: list[float], expected: float) -> bool:
 @pytest.mark.parametrize("loss", [0.1, 0.4])
 def test_independent_loss_in_the_air_has_its_age(loss: float, tmp_path: Path) -> None:
     rows = [f"0,0,{i},,{loss}," for i in range(1, 5)]
-    config = Radio(trace=trace(tmp_path, *rows))
+    config = AirSettings(trace=trace(tmp_path, *rows))
     found = [mean_age(r) for seed in (1, 2, 3) for r in flown_ages(config, 600.0, seed=seed).values()]
     delay_s = np.mean([(r[:, 1] - r[:, 0]).mean() for r in flown_ages(config, 60.0).values()])
     assert delay_s < 1e-3  # a frame of 0.5 ms and its backoff
@@ -97,8 +97,8 @@ def test_independent_loss_in_the_air_has_its_age(loss: float, tmp_path: Path) ->
 
 
 def test_bursts_in_the_air_have_their_age() -> None:
-    bursts = Bursts(good_to_bad=0.05, bad_to_good=0.28, step_s=PERIOD_S)
-    config = Radio(bursts=bursts, shadowing_sigma_db=0.0)
+    bursts = BurstSettings(good_to_bad=0.05, bad_to_good=0.28, step_s=PERIOD_S)
+    config = AirSettings(bursts=bursts, shadowing_sigma_db=0.0)
     found = [mean_age(r) for seed in (1, 2, 3) for r in flown_ages(config, 900.0, seed=seed).values()]
     chain = Chain(0.05, 0.28, 0.0, 1.0)
     means, peaks, above = (list(v) for v in zip(*found, strict=True))

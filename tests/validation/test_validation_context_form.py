@@ -21,7 +21,7 @@ def bytes_of(*overrides: str) -> int:
 def test_a_smaller_form_sends_the_bytes_that_it_should() -> None:
     """180 B and 28 B of authentication; 17 B, 18 numbers of 16 bits, 64 bits of grid, the same 28 B."""
     assert bytes_of() == 5 * 60 * (180 + 28)
-    small = ("context.number_bits=16", "context.grid_cells=8", "context.grid_bits=1")
+    small = ("context.form=small",)
     assert bytes_of(*small) == 5 * 60 * (17 + 18 * 2 + 8 + 28)
     assert bytes_of("context.publish_every=5") == 5 * 12 * (180 + 28)
 

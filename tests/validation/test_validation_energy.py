@@ -14,6 +14,7 @@ import pytest
 
 from sortie.fleet.logs.flightlog import FlightLog, read_log
 from sortie.fleet.logs.identify import hovering, identify_pack, stated_pack, voltage_error
+from sortie.scenarios.schema import Airframe
 
 needs_log = pytest.mark.skipif(not energy.LOG.is_file(), reason=f"{energy.LOG} is not here")
 
@@ -103,3 +104,10 @@ def test_the_readmes_figures_are_the_scripts() -> None:
 def test_what_the_effects_are_worth_is_as_written_down() -> None:
     written = json.loads((energy.OUT / "energy.json").read_text("utf-8"))["endurance_min"]
     assert dict(energy.effects()) == pytest.approx(written, abs=0.05)
+
+
+def test_the_solo_preset_is_the_vehicle_of_the_recorded_flight() -> None:
+    preset, stated = Airframe.model_validate("solo"), energy.airframe(energy.MASS_KG)
+    for name in ("mass_kg", "disc_area_m2", "figure_of_merit", "tip_speed_mps"):
+        assert getattr(preset, name) == pytest.approx(getattr(stated, name), rel=1e-3)
+    assert preset.power_model == stated.power_model

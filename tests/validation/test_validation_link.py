@@ -10,7 +10,7 @@ from sortie.radio.mac.airtime import BLOCK_ACK_S, Exchanges
 from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S
 from sortie.radio.mac.jobs import AirJob, GroupFrame
 from sortie.radio.mac.medium import Medium
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 
 def test_the_analytic_model_is_ns3s_within_one_percent() -> None:
@@ -52,4 +52,4 @@ def test_a_hundred_drones_cost_one_event_a_broadcast() -> None:
     wide, _, _ = link.broadcast_all(225, 0.5, link.WEAK)
     assert near < 60
     assert len(wide.channel.links.sender) / 225 == pytest.approx(near, rel=0.25)  # neighbours, not drones, squared
-    assert len(link.broadcast_all(50, 0.2, Radio())[0].channel.links.sender) == 50 * 49
+    assert len(link.broadcast_all(50, 0.2, AirSettings())[0].channel.links.sender) == 50 * 49

@@ -22,8 +22,9 @@ import simpy
 from age import Chain, mean_age_s, share_older
 
 from sortie.radio import Air, Status
+from sortie.radio.settings import AirSettings
 from sortie.scenarios.reading.load import loads
-from sortie.scenarios.schema import Radio, Scenario
+from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
@@ -59,7 +60,7 @@ def arrivals(k: int, samples: int, q: float, seed: int = 1) -> float:
         links.write_text(f"t_s,sender,receiver,loss,goodput_mbps\n0,0,1,{q},400\n")
         env, rows = simpy.Environment(), []
         at = np.broadcast_to(np.array([[0.0, 0, 60], [20, 0, 60]]), (samples, 2, 3))
-        air = Air(env, Radio(trace=str(links), retry_limit=0), at, seed=seed, frame_s=0.1)
+        air = Air(env, AirSettings(trace=str(links), retry_limit=0), at, seed=seed, frame_s=0.1)
 
     def send() -> Any:
         for _ in range(samples):

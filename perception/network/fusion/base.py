@@ -20,7 +20,7 @@ class Fusion(nn.Module):
     `forward(agents, takes_part, weight)` fuses n egos at once:
 
     - agents [n, 1 + k, c, h, w]: maps on the ego's grid, the ego's own first, zero where nothing was sent;
-    - takes_part [n, 1 + k, h, w] bool: which agent has a say in which cell, the ego in all of them;
+    - takes_part [n, 1 + k, h, w] bool: which agent counts in which cell, the ego in all of them;
     - weight [n, 1 + k]: each link's fusion weight from its directive, 0 … 1, the ego's 1;
 
     and returns [n, c, h, w]. Where no peer takes part the ego's features come back as they are; a peer of weight 0
@@ -31,22 +31,22 @@ class Fusion(nn.Module):
     about: ClassVar[str]
     """One line for lists."""
     shares: ClassVar[Shares] = "features"
-    """What its peers send: none and late fusion leave the ego's features alone."""
+    """What its peers send; `none` and late fusion leave the ego's features alone."""
     reach_cells: ClassVar[int] = 0
     """How far a peer's cell acts on the fused map: 0 where each cell is fused by itself."""
 
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
         raise NotImplementedError
 
-    def fuse(self, own: Tensor, said: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
+    def fuse(self, own: Tensor, features: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
         """One ego's fused map [1, c, h, w].
 
         Args:
             own: [c, h, w]; takes_part: [1 + k, h, w] and weight: [1 + k], as for `forward`.
-            said: gives what peers said on cells of the ego's grid, [p] row by row → [k, p, c].
+            features: gives the peers' features on cells of the ego's grid, [p] row by row → [k, p, c].
         """
         channels, height, width = own.shape
-        peers = said(torch.arange(height * width)).view(-1, height, width, channels).permute(0, 3, 1, 2)
+        peers = features(torch.arange(height * width)).view(-1, height, width, channels).permute(0, 3, 1, 2)
         out: Tensor = self(torch.cat([own[None], peers])[None], takes_part[None], weight[None])
         return out
 
@@ -60,7 +60,7 @@ class Fusion(nn.Module):
 
 
 class PerCell(Fusion):
-    """A method that fuses each cell by itself: it sees only the cells where a peer has a say, under a budget few."""
+    """A method that fuses each cell by itself: it computes only the cells where a peer takes part, under a budget few."""
 
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
         n, many, channels, height, width = agents.shape
@@ -72,40 +72,40 @@ class PerCell(Fusion):
         sample, cell = at // cells, at % cells
         row = sample * (many * cells) + cell + torch.arange(many, device=at.device)[:, None] * cells
         table = agents.permute(0, 1, 3, 4, 2).reshape(-1, channels)  # no copy where maps are channels-last
-        said = table.index_select(0, row.flatten()).view(many, len(at), channels)
-        mixed = self.mix(said, part.index_select(1, at), weight.T.index_select(1, sample))
+        features = table.index_select(0, row.flatten()).view(many, len(at), channels)
+        mixed = self.mix(features, part.index_select(1, at), weight.T.index_select(1, sample))
         own = agents[:, 0].permute(0, 2, 3, 1).reshape(-1, channels)
         return own.index_copy(0, at, mixed).view(n, height, width, channels).permute(0, 3, 1, 2)
 
-    def fuse(self, own: Tensor, said: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
+    def fuse(self, own: Tensor, features: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
         part = takes_part.flatten(1)
         at = part[1:].any(dim=0).nonzero().squeeze(1)
         rows = own.permute(1, 2, 0).reshape(-1, len(own))
-        agents = torch.cat([rows[None, at], said(at)])
+        agents = torch.cat([rows[None, at], features(at)])
         mixed = self.mix(agents, part.index_select(1, at), weight[:, None].expand(-1, len(at)))
         return rows.index_copy(0, at, mixed).view(1, *own.shape[1:], -1).permute(0, 3, 1, 2)
 
-    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+    def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         """[agents, p, c] with who takes part and link weights, [agents, p] each → [p, c]; the ego is the first agent."""
         raise NotImplementedError
 
 
-def weighted_sum(share: Tensor, said: Tensor) -> Tensor:
+def weighted_sum(share: Tensor, features: Tensor) -> Tensor:
     """Σ over agents of share [agents, p] · said [agents, p, c]; one agent at a time, which needs no copy of all."""
-    out = share[0, :, None] * said[0]
-    for one, row in zip(share[1:], said[1:], strict=True):
+    out = share[0, :, None] * features[0]
+    for one, row in zip(share[1:], features[1:], strict=True):
         out = torch.addcmul(out, one[:, None], row)
     return out
 
 
 def takes_part(sent: Tensor, inside: Tensor, weight: Tensor, unsent: UnsentCells) -> Tensor:
-    """Who has a say where, [n, 1 + k, h, w] bool, from what arrived of k peers.
+    """Which agent takes part in which cell, [n, 1 + k, h, w] bool, from the cells that arrived of k peers.
 
     Args:
         sent: [n, k, h, w], True where the peer's cell arrived.
         inside: [n, k, h, w], True where the peer's grid covers the cell.
         weight: [n, k], each link's fusion weight; 0 leaves the peer out.
-        unsent: "masked": a cell that was not sent has no say; "zero": it takes part as zeros, as far as the peer's
+        unsent: "masked": a cell that was not sent is left out; "zero": it takes part as zeros, as far as the peer's
             grid reaches (the paper's instrument, and DiscoNet's as released).
     """
     peers = (inside if unsent == "zero" else sent) & (weight > 0)[:, :, None, None]

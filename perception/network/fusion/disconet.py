@@ -28,17 +28,17 @@ class EdgeWeights(nn.Module):
         self.norms = nn.ModuleList(nn.BatchNorm1d(b) for b in widths[1:])
         self.last = nn.Linear(widths[-1], 1)
 
-    def forward(self, said: Tensor) -> Tensor:
+    def forward(self, features: Tensor) -> Tensor:
         """[agents, p, 80], the ego first → [agents, p]."""
         first, norm = self.layers[0], self.norms[0]
         # the ego's half of the first layer is the same beside every agent
-        ego = F.linear(said[0], first.weight[:, :CHANNELS])  # type: ignore[index]
-        x = F.linear(said, first.weight[:, CHANNELS:], first.bias)  # type: ignore[index,arg-type]
+        ego = F.linear(features[0], first.weight[:, :CHANNELS])  # type: ignore[index]
+        x = F.linear(features, first.weight[:, CHANNELS:], first.bias)  # type: ignore[index,arg-type]
         x += ego
         x = F.relu(norm(x.flatten(0, 1)), inplace=True)
         for layer, norm in zip(list(self.layers)[1:], list(self.norms)[1:], strict=True):
             x = F.relu(norm(layer(x)), inplace=True)
-        logit: Tensor = F.relu(self.last(x)).view(said.shape[:2])
+        logit: Tensor = F.relu(self.last(x)).view(features.shape[:2])
         return logit
 
 
@@ -52,9 +52,9 @@ class DiscoNet(PerCell):
         super().__init__()
         self.edge = EdgeWeights()
 
-    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
-        logit = (self.edge(said) + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf)
-        return weighted_sum(logit.softmax(dim=0), said)
+    def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        logit = (self.edge(features) + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf)
+        return weighted_sum(logit.softmax(dim=0), features)
 
     def fold(self) -> None:
         edge: Any = self.edge

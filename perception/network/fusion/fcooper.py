@@ -18,7 +18,7 @@ class FCooper(PerCell):
     name = "fcooper"
     about = "element-wise maximum over the agents present (F-Cooper)"
 
-    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+    def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         share = (weight * part)[1:, :, None]
-        rise = (share * F.relu(said[1:] - said[0])).amax(dim=0)
-        return said[0] + rise
+        rise = (share * F.relu(features[1:] - features[0])).amax(dim=0)
+        return features[0] + rise

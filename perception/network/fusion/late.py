@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sortie.perception.joining import SURE
+from sortie.perception.joining import LATE_MIN_SCORE
 from sortie.perception.network.fusion.none import Alone
 from sortie.perception.network.fusion.traffic import LinkBytes, boxes_of
 
@@ -11,7 +11,7 @@ class Late(Alone):
     """Features are left alone; `joining` does the work. It has no parameters."""
 
     name = "late"
-    about = f"boxes above {SURE}, joined as perception.join says"
+    about = f"boxes above {LATE_MIN_SCORE}, joined as perception.join says"
     shares = "boxes"
 
     @classmethod

@@ -1,4 +1,4 @@
-"""What each method puts on the air, to the byte. Free of torch.
+"""The bytes that each fusion method sends. Free of torch.
 
 A link is one sender and one receiver in one frame. Counted is content: features (80 channels × 2 B a cell), which
 cells they are, boxes, and what a method asks for first. Descriptors, headers and fragments are the radio's.
@@ -23,16 +23,16 @@ class LinkBytes:
     index: int = 0
     """Which cells they are: 12 bits a cell or a 512 B bitmap, the smaller; nothing when all are sent."""
     handshake: int = 0
-    """What goes the other way first."""
+    """Sent by the receiver beforehand."""
 
     @property
     def total(self) -> int:
-        """All of it."""
+        """Payload, index and handshake together."""
         return self.payload + self.index + self.handshake
 
 
 def features_of(cells: int, requests: int = 0) -> LinkBytes:
-    """`cells` of a map, asked for by so many request maps.
+    """Bytes of `cells` of a map, preceded by `requests` request maps.
 
     Raises:
         ValueError: more cells than a map has, or fewer than none.

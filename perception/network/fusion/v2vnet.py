@@ -50,10 +50,10 @@ class V2VNet(Fusion):
         share = (weight[:, 1:, None, None] * takes_part[:, 1:])[:, :, None]
         trust = share.amax(dim=1)
         share = share / share.sum(dim=1, keepdim=True).clamp_min(1e-12)
-        heard = self.from_peer(agents[:, 1:].flatten(0, 1)).unflatten(0, (n, many - 1))
+        from_peers = self.from_peer(agents[:, 1:].flatten(0, 1)).unflatten(0, (n, many - 1))
         state = own
         for _ in range(ROUNDS):
-            message = (share * F.relu(heard + self.from_ego(state)[:, None])).sum(dim=1)
+            message = (share * F.relu(from_peers + self.from_ego(state)[:, None])).sum(dim=1)
             update, reset = self.gates(torch.cat([state, message], dim=1)).sigmoid().chunk(2, dim=1)
             proposed = self.candidate(torch.cat([reset * state, message], dim=1))
             state = state + update * (proposed - state)

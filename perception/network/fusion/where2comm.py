@@ -40,15 +40,15 @@ class Where2comm(PerCell):
         nn.init.zeros_(self.narrow.weight)  # begin as plain attention
         nn.init.zeros_(self.narrow.bias)
 
-    def mix(self, said: Tensor, part: Tensor, weight: Tensor) -> Tensor:
-        agents, p, channels = said.shape
-        query = self.query(said[0]).view(p, HEADS, -1)
-        key = self.key(said).view(agents, p, HEADS, -1)
+    def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        agents, p, channels = features.shape
+        query = self.query(features[0]).view(p, HEADS, -1)
+        key = self.key(features).view(agents, p, HEADS, -1)
         logit = (query * key).sum(dim=-1) / math.sqrt(channels // HEADS)
-        prior = F.logsigmoid(self.confidence(said)[..., 0]) + weight.clamp_min(1e-12).log()
+        prior = F.logsigmoid(self.confidence(features)[..., 0]) + weight.clamp_min(1e-12).log()
         logit = (logit + prior[..., None]).masked_fill(~part[..., None], -math.inf)
         share = logit.softmax(dim=0)
-        heads = [weighted_sum(share[..., h], value) for h, value in enumerate(said.chunk(HEADS, dim=-1))]
+        heads = [weighted_sum(share[..., h], value) for h, value in enumerate(features.chunk(HEADS, dim=-1))]
         mixed = torch.cat(heads, dim=-1)
         trust = (weight * part)[1:].amax(dim=0)[:, None]
         out: Tensor = mixed + trust * self.narrow(F.relu(self.widen(mixed)))
@@ -74,6 +74,6 @@ def confidence_map(heat: Tensor) -> Tensor:
     return F.conv2d(best, (kernel / kernel.sum())[None, None], padding=2)[:, 0]
 
 
-def asked_for(sender: Tensor, receiver: Tensor) -> Tensor:
+def requested_rank(sender: Tensor, receiver: Tensor) -> Tensor:
     """What ranks a sender's cells from the second round on: C_i ⊙ R_j with R = 1 − C, both on the sender's grid."""
     return sender * (1.0 - receiver)

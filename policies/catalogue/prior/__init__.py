@@ -1,8 +1,8 @@
 """Prior sharing methods as policies: each is one file here and one line in `METHODS`.
 
-A method reads the context that the paper's table says it reads and no more (`sortie.policies.verification.axes` watches it), and takes
-everything else as full sharing has it. What it learned in a network stands in for by its rule, which its file tells;
-fusions of their own are `perception.fusion`.
+A method reads only the context that the paper's table names (`sortie.policies.verification.axes` checks it). For
+everything else it does what full sharing does. Where the method has a learned network, a rule replaces it; the method's
+file describes the rule. Fusions of their own are values of `perception.fusion`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ def _none(params: Mapping[str, object]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A prior method: its policy, the fusion it was published with, and what its links cost before any payload."""
+    """A prior method: its policy, the fusion it was published with, and the bytes of its handshake."""
 
     title: str
-    """As the paper's table has it."""
+    """Its name in the paper's table."""
     policy: Callable[..., Sequence[Directive]]
     fusion: str | None = None
-    """A value of `perception.fusion`; None where it takes whatever fusion there is."""
+    """A value of `perception.fusion`; None if it has no fusion of its own."""
     handshake_bytes: Callable[[Mapping[str, object]], int] = _none
     """Bytes that each drone sends to each peer and frame before payloads, given the policy's parameters."""
 
@@ -48,4 +48,4 @@ METHODS: dict[str, Method] = {
     "hydracollab": Method("HydraCollab", hydracollab),
     "fixed-compression": Method("Fixed compression", fixed_compression),
 }
-"""By the name under which a scenario flies it."""
+"""The methods by their names in scenarios."""

@@ -1,4 +1,4 @@
-"""DiscoNet (Li et al., NeurIPS 2021): everything to everyone; its edge network weighs agents cell by cell."""
+"""DiscoNet (Li et al., NeurIPS 2021): full maps to every peer; its edge network weights agents cell by cell."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """HydraCollab-style: scene confidence switches a link between intermediate and late fusion.
 
-Only its abstract is public: where both ends are confident, features; where one is, detections. Here confidence is
-what the coverage grids say is seen well, its agreement over a link is held against a threshold, and the region is
-what the chosen rung is about: what both see, or what only the sender does.
+Only its abstract is public: features where both ends are confident, detections where one is. Here a drone is confident
+of the cells that it reports as seen well. A threshold decides whether both ends agree. The region is what both see, for
+features, or what only the sender sees, for detections.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import Directive, FleetView, Representation
 
 AGREEMENT = 0.3
-"""Shared over joint cells; two footprints of 42 m agree this far at about 40 m."""
+"""Cells of both over cells of either. Two footprints of 42 m reach this at a distance of about 40 m."""
 
 
 def hydracollab(view: FleetView, *, rho: float = 1.0, threshold: float = AGREEMENT) -> list[Directive]:

@@ -1,8 +1,8 @@
-"""SyncNet (Lei et al., ECCV 2022): how late a peer's features come decides how much they count.
+"""SyncNet (Lei et al., ECCV 2022): the delay of a peer's features decides their weight.
 
-It predicts a late peer's present features by a recurrent network. Here its cheap stand-in: late maps are moved by
-the known ego motion (`perception.motion_compensation`), and their weight falls with the delay that the link's goodput
-lets expect. Only weights are decided: who sends what to whom is as in full sharing.
+The method predicts a late peer's present features by a recurrent network. Here late maps are moved by the known ego
+motion instead (`perception.motion_compensation`). Their weight falls with the delay that follows from the link's goodput.
+Only weights are decided. Everything else is as in full sharing.
 """
 
 from __future__ import annotations
@@ -10,25 +10,23 @@ from __future__ import annotations
 from math import exp
 
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import Directive, FleetView
+from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView
 
-MAP_MEGABITS = 4096 * 80 * 2 * 8e-6
-"""A full map."""
 TRUSTED_FOR_S = 0.5
-"""A delay that takes a map's weight to 1/e."""
+"""The delay at which a map's weight is 1/e."""
 STEPS = 4
-"""Weights come in quarters and are at least one, so that goodput's noise is no new directive and no map is wasted."""
+"""Weights are multiples of a quarter, so that noise of the goodput changes no directive. They are at least a quarter."""
 
 
 def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED_FOR_S) -> list[Directive]:
-    """SyncNet: full maps to every peer, weighed by the delay that the link's goodput lets expect."""
+    """SyncNet: full maps to every peer, weighted by the delay that follows from the link's goodput."""
     me = view.me
     if me is None:
         return []
     directives = []
     for peer in view.peers:
         goodput_mbps = me.goodput_to(peer)
-        delay_s = rho * MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
+        delay_s = rho * FEATURE_MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
         weight = max(1, round(STEPS * exp(-delay_s / trusted_for_s))) / STEPS
         why = f"SyncNet: {delay_s:.1g} s late"
         directives.append(full_sharing(view.ego, peer, rho, why)._replace(fusion_weight=weight))

@@ -1,4 +1,4 @@
-"""V2VNet (Wang et al., ECCV 2020): everything to everyone; what it decides, it decides in its fusion network."""
+"""V2VNet (Wang et al., ECCV 2020): full maps to every peer; it only decides in its fusion network."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""When2com (Liu et al., CVPR 2020): attention says whether to communicate and with whom.
+"""When2com (Liu et al., CVPR 2020): attention decides whether to communicate and with whom.
 
-A query of 32 floats goes to every peer, each answers with its score; links whose attention, self included, stays
-above a threshold are kept, and where the drone itself dominates nobody sends. Learned keys and queries are stood in
-for by coverage grids (`matching`); the handshake's bytes are the method's.
+A query of 32 floats goes to every peer, and each answers with its score. Links with an attention above a threshold are
+kept. The attention includes the drone itself; if it dominates, nobody sends. Coverage grids replace learned keys and
+queries (`matching`). The handshake has the method's bytes.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from sortie.policies.catalogue.prior.matching import scores_for
 from sortie.policies.contract import Directive, FleetView, nothing
 
 KEPT_ABOVE = 0.2
-"""The attention above which a link is kept when the method is tested."""
+"""A link with more attention than this is kept; the method's value in tests."""
 SHARPNESS = 4.0
-"""Of the softmax over scores of 0 … 1; a drone answers itself with 0."""
+"""The factor of the scores (0 … 1) in the softmax. A drone's score for itself is 0."""
 MATCH_BYTES = 32 * 4 + 4
-"""What each drone sends to each peer first: its own query of 32 floats, and the score of the peer's."""
+"""Bytes that each drone sends to each peer first: its own query of 32 floats, and its score for the peer's query."""
 
 
 def when2com(

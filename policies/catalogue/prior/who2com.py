@@ -1,26 +1,24 @@
-"""Who2com (Liu et al., ICRA 2020): every drone is served by exactly one other, the one that answers it best.
+"""Who2com (Liu et al., ICRA 2020): every drone is served by exactly one other, the one that adds most to it.
 
-The handshake is When2com's (a request, a score from each, a choice); the softmax leaves the drone itself out, so that
-somebody always sends.
+The handshake is When2com's (a request, a score from each, a choice). The choice leaves the drone itself out, so one
+drone always sends.
 """
 
 from __future__ import annotations
 
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
-from sortie.policies.contract import Directive, FleetView, nothing
-
-_IDS = 256
+from sortie.policies.contract import AGENT_IDS, Directive, FleetView, nothing
 
 
 def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
-    """Who2com: full maps to the peers for whom the ego is the best of all drones; ties go round by id."""
+    """Who2com: full maps to the peers for which the ego is the best of all drones; ties are broken by id."""
     if view.me is None:
         return []
     directives = []
     for peer in view.peers:
         scores = scores_for(view, peer)
-        best = max(scores, key=lambda i: (scores[i], -((i - peer) % _IDS)))
+        best = max(scores, key=lambda i: (scores[i], -((i - peer) % AGENT_IDS)))
         if best == view.ego:
             directives.append(full_sharing(view.ego, peer, rho, f"Who2com: best for {peer}, {scores[best]:.2f}"))
         else:

@@ -20,7 +20,7 @@ from sortie.fleet.energy.cell import (
     terminal_voltage_v,
 )
 from sortie.fleet.energy.recorded import BatteryTrace
-from sortie.scenarios.schema import Battery, DroneOverride
+from sortie.scenarios.schema import Battery, DroneOverride, Polarisation
 
 HOVER_W = 168.48
 ELECTRIC_W = HOVER_W / 0.8 + 8 + 25 + 2.4  # of steady()
@@ -37,7 +37,7 @@ def steady(batteries: FleetBatteries, seconds: float, rotor_w: float = HOVER_W, 
 
 def test_polarisation_builds_up_with_its_time_constant() -> None:
     plain = FleetBatteries(Battery(), (), 1)
-    slow = FleetBatteries(Battery(polarisation_mohm=5, polarisation_time_s=10), (), 1)
+    slow = FleetBatteries(Battery(polarisation=Polarisation(resistance_mohm=5, time_s=10)), (), 1)
     for b in (plain, slow):
         steady(b, 10.0, dt_s=0.01)
     lag_v = 4 * float(open_circuit_cell_v(slow.soc[0])) - slow.voltage_v[0] - slow.current_a[0] * 0.052
@@ -195,8 +195,7 @@ packs = st.builds(
     cells=st.integers(1, 8),
     initial_soc=st.floats(0.01, 1),
     cell_resistance_mohm=st.floats(0, 60),
-    polarisation_mohm=st.floats(0, 40),
-    polarisation_time_s=st.floats(0.1, 100),
+    polarisation=st.builds(Polarisation, resistance_mohm=st.floats(0, 40), time_s=st.floats(0.1, 100)),
     ambient_c=st.none() | st.floats(-30, 50),
     cycles=st.floats(0, 500),
     cutoff_cell_v=st.floats(0, 3.6),
@@ -241,7 +240,7 @@ def test_the_ledger_holds_with_every_effect_on(
 
 def test_a_packs_voltage_under_its_own_current_is_the_fleets() -> None:
     """The current that the fleet's model drew, put through the one that counts charge, gives its voltage back."""
-    config = Battery(capacity_wh=60, polarisation_mohm=6, polarisation_time_s=15, cycles=100)
+    config = Battery(capacity_wh=60, polarisation=Polarisation(resistance_mohm=6, time_s=15), cycles=100)
     b = FleetBatteries(config, (), 1)
     rng = np.random.default_rng(1)
     current, volts = [], []

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.formation import slots
 from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, MotionError, Trajectories, attitude, body_rates, fly
+from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Fleet, Formation, Route
-from sortie.scenarios.schema import Trajectories as MotionConfig
+from sortie.scenarios.schema import Motion as MotionConfig
 
 CALM = MotionConfig(
     wind_mps=(0, 0), gust_sigma_mps=0, pose_jitter_m=0, pose_error_m=0, heading_error_deg=0

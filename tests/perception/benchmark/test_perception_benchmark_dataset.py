@@ -19,7 +19,7 @@ from places import ROOT
 from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, load_frames, make_scene_file, make_split
 from sortie.perception.benchmark.difficulty import Difficulty
-from sortie.perception.benchmark.manifest import BenchmarkError, complaints, content_hash
+from sortie.perception.benchmark.manifest import BenchmarkError, content_hash, problems
 from sortie.perception.benchmark.scenes import draw_captures, scene_id
 from sortie.perception.geometry import SMALL
 
@@ -90,7 +90,7 @@ def test_the_manifest_says_everything(made: Path) -> None:
     entry = data["splits"]["tau"][files(made)[1].name]
     assert (entry["index"], entry["frames"], entry["sha256"]) == (1, 1, content_hash(files(made)[1]))
     assert entry["scene"]["seed"] == scene_id(3, "tau", 1)
-    assert complaints(made) == []
+    assert problems(made) == []
 
 
 def test_what_is_there_is_not_made_again(copy: Path) -> None:
@@ -108,7 +108,7 @@ def test_a_cut_off_run_goes_on(copy: Path) -> None:
     make_split(BENCH, "tau", copy.parent, scenes=2, workers=1)
     assert [content_hash(p) for p in (first, second)] == hashes
     assert first.stat().st_mtime_ns == kept
-    assert complaints(copy) == []
+    assert problems(copy) == []
     assert len(load_frames([first, second])) == 2
 
 
@@ -127,7 +127,7 @@ def test_a_killed_run_goes_on_to_the_same_files(tmp_path: Path, made: Path) -> N
     os.killpg(run.pid, signal.SIGKILL)
     run.wait()
     make_split(BENCH, "tau", tmp_path, scenes=2, workers=1)
-    assert complaints(folder) == []
+    assert problems(folder) == []
     assert [content_hash(p) for p in files(folder) if ".part" not in p.suffixes] == [
         content_hash(p) for p in files(made)
     ]
@@ -139,7 +139,7 @@ def test_a_tampered_file_is_named(copy: Path) -> None:
         arrays = dict(file)
     arrays["cars"][0, 0, 0] += 1e-9
     np.savez(path, **arrays)
-    assert complaints(copy) == [f"tau/{path.name}: holds other data than the manifest says"]
+    assert problems(copy) == [f"tau/{path.name}: holds other data than the manifest says"]
 
 
 def test_missing_broken_and_strange_files_are_named(copy: Path) -> None:
@@ -147,7 +147,7 @@ def test_missing_broken_and_strange_files_are_named(copy: Path) -> None:
     first.write_bytes(first.read_bytes()[:1000])
     stranger = second.with_name("scene_5_1.npz")
     second.rename(stranger)
-    found = complaints(copy)
+    found = problems(copy)
     assert found[0] == "tau/scene_5_1.npz: not in the manifest"
     assert found[1].startswith(f"tau/{first.name}: cannot be read: ")
     assert found[2:] == [f"tau/{second.name}: missing"]
@@ -161,7 +161,7 @@ def edit(folder: Path, **changes: object) -> None:
 
 
 def test_a_manifest_that_does_not_fit_is_refused(copy: Path, tmp_path: Path) -> None:
-    told = manifest.read(copy)["benchmark"]
+    stored = manifest.read(copy)["benchmark"]
     path = copy / manifest.MANIFEST
 
     def message() -> str:
@@ -169,9 +169,9 @@ def test_a_manifest_that_does_not_fit_is_refused(copy: Path, tmp_path: Path) -> 
             Benchmark.at(copy)
         return str(caught.value).removeprefix(f"{path}: ")
 
-    edit(copy, benchmark={**told, "seed": 4})
+    edit(copy, benchmark={**stored, "seed": 4})
     assert message() == f"key is {BENCH.key()}, must be {Benchmark(4).key()}: its parameters were changed"
-    edit(copy, benchmark={**told, "difficulty": {**told["difficulty"], "fog": 1}})
+    edit(copy, benchmark={**stored, "difficulty": {**stored["difficulty"], "fog": 1}})
     assert message() == "cannot be understood: difficulty has ['fog'] too many or too few"
     edit(copy, benchmark={"seed": 3})
     assert message() == "cannot be understood: 'difficulty'"

@@ -168,11 +168,11 @@ def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluati
         cut.at(0.2)
 
 
-def test_what_differs_in_nothing_is_asked_once(frames: MadeFrames, whole: Evaluation) -> None:
+def test_equal_conditions_are_computed_once(frames: MadeFrames, whole: Evaluation) -> None:
     instrument = MadeInstrument()
     twins = (*THREE, Sharing(0.1, "best-4"), Sharing(0.1, "worst-4"), Sharing(1.0, cells_by="norm"), SINGLE)
     found = evaluate(instrument, frames, twins)
-    assert instrument.asked == 4 * 25
+    assert instrument.computed == 4 * 25
     assert found.conditions == twins[:-1]
     assert found.ap(Sharing(1.0, cells_by="norm")) == whole.ap(FULL_SHARING)
     assert found.cells[Sharing(0.1, "worst-4")].tolist() == [1638] * 25
@@ -229,7 +229,7 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: E
 
     more = MadeInstrument()
     wider = evaluate(more, frames, (*THREE, Sharing(0.02)), regions=EVERYWHERE, store=tmp_path)
-    assert more.asked == 25, "only the new condition"
+    assert more.computed == 25, "only the new condition"
     assert wider.ap(BEST) == whole.ap(BEST)
     again = MadeInstrument()
     alike(evaluate(again, some(frames, [2, 3, 4]), THREE, regions=EVERYWHERE, store=tmp_path), whole, drop=2)

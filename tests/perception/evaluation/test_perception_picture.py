@@ -10,8 +10,8 @@ from paper_examples import MadeFrames, MadeInstrument, made_frames
 
 from sortie.perception.evaluation import figure_frame, figures
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.picture import picture, sharers, to_world
-from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.evaluation.picture import picture, sharers
+from sortie.perception.geometry import CELLS, FULL, to_world
 
 
 @pytest.fixture

@@ -143,17 +143,6 @@ def test_one_instrument_alone_makes_a_table_too(table: list[ClaimRow]) -> None:
     assert f"| {report.ours(of(table, 'flip.0.05', 'masked'))} |" in report.short(masked, FACTS, "x")
 
 
-def test_the_readmes_section_replaces_what_was_between_the_markers(table: list[ClaimRow]) -> None:
-    section = report.short(table, FACTS, "docs/paper/README.md")
-    before = f"# Title\n\n{report.BEGIN}\nold\n{report.END}\n\nmore\n"
-    after = report.put_into(before, section)
-    assert after == f"# Title\n\n{section}\n\nmore\n"
-    assert report.put_into(after, section) == after
-    for broken in ("no markers", f"{report.END}{report.BEGIN}", before + before):
-        with pytest.raises(ValueError, match="once each, in this order"):
-            report.put_into(broken, section)
-
-
 def test_figures_are_drawn_and_equal_ones_are_equal_files(table: list[ClaimRow], tmp_path: Path) -> None:
     points = rows.points({"zero": Made({}, papers_world)})
     assert len(points) == 2 * 23

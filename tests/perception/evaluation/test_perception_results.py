@@ -88,15 +88,15 @@ def test_the_table_and_its_sensitivity_from_made_frames(found: TableResults) -> 
     assert next(r for r in table if r.id == "bytes.full").verdict == "reproduced"
     varied = sensitivity(found)
     assert len(varied) == 2 * (len(BY_TAU) * len(TAUS) + len(BY_DISC) * len(DISCS))
-    asked = {(v.id, v.instrument): v for v in varied if v.setting in ("0.1", "around the target")}
+    varied_rows = {(v.id, v.instrument): v for v in varied if v.setting in ("0.1", "around the target")}
     for row in table:
-        if (row.id, row.instrument) in asked:
-            v = asked[row.id, row.instrument]
+        if (row.id, row.instrument) in varied_rows:
+            v = varied_rows[row.id, row.instrument]
             assert (v.value, v.low, v.high, v.verdict) == (row.value, row.low, row.high, row.verdict)
     text = report.report(table, FACTS, (), varied)
     assert "**score threshold τ**, masked fusion:" in text
     assert "| claim | 0.01 | 0.1 | 0.2 | 0.3 | 0.5 |" in text
-    other = next(v for v in varied if v.verdict != asked[v.id, v.instrument].verdict)
+    other = next(v for v in varied if v.verdict != varied_rows[v.id, v.instrument].verdict)
     (line,) = [
         one
         for one in text.partition("What the verdicts hang on")[2].splitlines()
@@ -113,7 +113,7 @@ def test_the_table_and_its_sensitivity_from_made_frames(found: TableResults) -> 
         ({"draws": 0}, "draws is 0, must be at least 1"),
     ],
 )
-def test_what_cannot_be_asked_is_named(field: dict[str, object], message: str) -> None:
+def test_a_setting_out_of_bounds_is_named(field: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TableSettings(**field)  # type: ignore[arg-type]
 

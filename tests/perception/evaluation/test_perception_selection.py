@@ -90,7 +90,7 @@ def test_a_condition_that_does_not_fit_the_fleet(peers: str) -> None:
     ("rho", "cells"), [(1, 16384), (0.25, 4096), (0.1, 1638), (0.05, 819), (0.02, 327), (0.01, 163), (0, 0)]
 )
 def test_the_papers_budgets_in_cells(rho: float, cells: int) -> None:
-    assert selection.total_cells(rho, 4) == cells
+    assert budget.cells_in(rho, 4) == cells
 
 
 overlaps = st.lists(st.one_of(st.just(0.0), st.floats(1e-6, 1)), min_size=1, max_size=5)

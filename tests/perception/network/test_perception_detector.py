@@ -11,9 +11,10 @@ from perception_examples import capture, cross
 from places import HELPERS
 
 from sortie.perception.detectors import make_detector
-from sortie.perception.joining import told
+from sortie.perception.ground_truth import ground_truth
+from sortie.perception.joining import source_of
 from sortie.perception.metrics.ap import match
-from sortie.perception.network.detector import TorchDetector, ground_truth
+from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene import render
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -67,6 +68,7 @@ PROGRAM = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
 from perception_examples import cross
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
@@ -132,7 +134,7 @@ def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
     assert len(joined) >= len(single)
     assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
-    tracks = told(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
+    tracks = source_of(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
     assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
 
@@ -238,14 +240,14 @@ def test_a_sortie_far_from_the_origin_sees_the_same_way(fleet: list[Capture]) ->
     there = SceneModel(Scene(), None, (3150, -4050, 3250, -3950))
     captures = cross(3210.0, -3980.0, 0.3)
     found = TorchDetector(there, Perception(), seed=1).detect([(captures[0], [share(c) for c in captures[1:]])])[0]
-    truth = ground_truth(there, 5.0, (3210.0, -3980.0), yaw_rad=0.3)
+    truth = ground_truth(there.cars_at(5.0).table(), (3210.0, -3980.0, 0.3))
     assert match(found.take(found.score > 0.5), truth).hit.mean() > 0.5
 
 
 def test_ground_truth_is_every_car_in_the_turned_square(scene: SceneModel) -> None:
     cars = scene.cars_at(5.0)
     for yaw in (0.0, 0.6):
-        truth = ground_truth(scene, 5.0, (10.0, 20.0), 60.0, yaw)
+        truth = ground_truth(scene.cars_at(5.0).table(), (10.0, 20.0, yaw), 60.0)
         count = 0
         for x, y in zip(cars.x_m, cars.y_m, strict=True):
             forward = np.cos(yaw) * (x - 10) + np.sin(yaw) * (y - 20)

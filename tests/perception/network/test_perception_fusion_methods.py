@@ -14,7 +14,7 @@ from sortie.perception.network.fusion.base import Fusion, takes_part
 from sortie.perception.network.fusion.registry import DEFAULT, FUSIONS
 from sortie.perception.network.fusion.traffic import LinkBytes
 from sortie.perception.network.fusion.v2vnet import V2VNet
-from sortie.perception.network.fusion.where2comm import HEADS, Where2comm, asked_for, confidence_map
+from sortie.perception.network.fusion.where2comm import HEADS, Where2comm, confidence_map, requested_rank
 
 SIDE = 12
 LEARNED = ("disconet", "v2vnet", "where2comm")
@@ -205,8 +205,8 @@ def test_confidence_is_smoothed_and_requests_ask_for_what_is_unknown() -> None:
     assert float(c[0, 20, 30]) == pytest.approx(0.5 / sum(math.exp(-(i * i) / 2) for i in range(-2, 3)) ** 2, abs=1e-6)
     assert float(c[0, 20, 30] / c[0, 20, 31]) == pytest.approx(math.exp(0.5), abs=1e-4)
     sure, unsure = torch.tensor([0.9]), torch.tensor([0.1])
-    assert float(asked_for(sure, unsure)) == pytest.approx(0.81)
-    assert float(asked_for(sure, torch.ones(1))) == 0.0
+    assert float(requested_rank(sure, unsure)) == pytest.approx(0.81)
+    assert float(requested_rank(sure, torch.ones(1))) == 0.0
 
 
 @pytest.mark.parametrize("name", FUSING)

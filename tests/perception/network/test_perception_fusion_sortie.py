@@ -7,7 +7,7 @@ import pytest
 from fusion_age import earlier, measure
 from perception_examples import capture, cross
 
-from sortie.perception.joining import SURE, sendable
+from sortie.perception.joining import LATE_MIN_SCORE, sendable
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -54,7 +54,7 @@ def test_none_is_a_drone_alone_and_late_joins_the_same_boxes_from_maps_as_from_b
 
 
 def test_late_fusion_sends_what_is_sure() -> None:
-    rows = np.array([(x, 0, 4.5, 1.85, 0.0, score) for x, score in ((0, 0.8), (60, 0.3), (90, SURE))])
+    rows = np.array([(x, 0, 4.5, 1.85, 0.0, score) for x, score in ((0, 0.8), (60, 0.3), (90, LATE_MIN_SCORE))])
     assert sendable(Boxes.placed(rows, (0.0, 0.0, 0.0))).score.tolist() == pytest.approx([0.8, 0.3])
 
 

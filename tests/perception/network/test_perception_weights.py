@@ -5,10 +5,11 @@ import pytest
 
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.scenes import draw_captures, draw_scene
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.metrics.bootstrap import compare
 from sortie.perception.network.checkpoint import read_facts
-from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, ground_truth
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.study.plan import read_plan
 from sortie.perception.study.run import SHIPPED
@@ -33,7 +34,7 @@ def test_cooperation_beats_a_single_drone_on_held_out_towns() -> None:
             together = detector.detect(jobs)
             alone = detector.detect([(ego, []) for ego, _ in jobs])
             for (ego, _), one, all_five in zip(jobs, alone, together, strict=True):
-                truth = ground_truth(scene, ego.t_s, ego.position_m[:2], yaw_rad=ego.true_yaw_rad)
+                truth = ground_truth(scene.cars_at(ego.t_s).table(), ego.true_pose)
                 single.append(match(one, truth))
                 full.append(match(all_five, truth))
                 towns.append(seed)

@@ -97,7 +97,7 @@ def put(at: Any, value: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (dict(t_s=None), "t_s is missing, a recording must hold format, cell_m, t_s, pose, boxes, boxes_offset, truth, truth_offset"),
         (dict(speed=np.zeros(2)), "speed is unknown, beside what it must hold a recording may hold scene, est_pose, features, confidence"),
@@ -125,8 +125,8 @@ def put(at: Any, value: Any) -> Any:
         (dict(confidence=np.zeros((2, 2, 64, 64), int)), "confidence is int64, must be floating"),
     ],
 )  # fmt: skip
-def test_a_broken_recording_is_told(changes: dict[str, Any], told: str, path: Path) -> None:
-    with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {told}')}$"):
+def test_a_broken_recording_is_told(changes: dict[str, Any], message: str, path: Path) -> None:
+    with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {message}')}$"):
         open_recording(spoiled(path, **changes))
 
 
@@ -148,7 +148,7 @@ def test_large_arrays_are_checked_when_they_are_read(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda p: None, "no such recording, must be an npz file or a Zarr folder"),
         (lambda p: p.write_bytes(b"PK\x03\x04 torn"), "cannot be read as npz"),
@@ -157,9 +157,9 @@ def test_large_arrays_are_checked_when_they_are_read(path: Path) -> None:
         (lambda p: np.savez(p, t_s=np.array([None])), "cannot be read as npz"),  # would need a pickle
     ],
 )
-def test_no_recording_is_told(make: Any, told: str, tmp_path: Path) -> None:
+def test_no_recording_is_told(make: Any, message: str, tmp_path: Path) -> None:
     make(tmp_path / "r.npz")
-    with pytest.raises(RecordingError, match=rf"r\.npz: {told}"):
+    with pytest.raises(RecordingError, match=rf"r\.npz: {message}"):
         open_recording(tmp_path / "r.npz")
 
 
@@ -181,8 +181,8 @@ def test_writing_zarr_is_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_what_would_be_refused_when_it_is_read_is_not_written(name: str, tmp_path: Path) -> None:
     """1e5 is infinite in float16, as which features and confidences are kept."""
     for values in (np.full((2, 3, 64, 64), 1e5), np.full((2, 3, 64, 64), np.nan)):
-        told = f"{tmp_path / name}: features of frame 1 are not finite as float16, must be within ±65504"
-        with pytest.raises(RecordingError, match=f"^{re.escape(told)}$"):
+        message = f"{tmp_path / name}: features of frame 1 are not finite as float16, must be within ±65504"
+        with pytest.raises(RecordingError, match=f"^{re.escape(message)}$"):
             small(tmp_path / name, features=[np.full((2, 3, 64, 64), 65504.0), values])
     with pytest.raises(RecordingError, match=r"confidence are not finite as float16, must be within ±65504"):
         small(tmp_path / name, confidence=np.full((2, 2, 64, 64), -1e5))
@@ -192,13 +192,13 @@ def test_what_would_be_refused_when_it_is_read_is_not_written(name: str, tmp_pat
 def test_rows_of_another_width_or_of_another_drone_are_not_written(tmp_path: Path) -> None:
     """Six rows of seven numbers are as many numbers as seven of six; one drone's boxes and three are as many as two and two."""
     box, cars = np.array([(8, 0, 4.5, 1.9, 0.1, 0.9)]), np.ones((5, 6))
-    for changes, told in (
+    for changes, message in (
         (dict(boxes=[[box, np.full((6, 7), 0.5)], [box, box]]), "boxes of frame 0 have shape [6, 7], must be [any, 6]"),
         (dict(boxes=[[box, box], [box, box[0]]]), "boxes of frame 1 have shape [6], must be [any, 6]"),
         (dict(truth=[cars[:, :5], cars]), "truth of frame 1 have shape [5, 6], must be [any, 5]"),
         (dict(boxes=[[box], [box, box, box]]), "boxes of frame 0 are of 1 drones, must be of 2"),
     ):
-        with pytest.raises(RecordingError, match=f"^{re.escape(f'{tmp_path}/x.npz: {told}')}$"):
+        with pytest.raises(RecordingError, match=f"^{re.escape(f'{tmp_path}/x.npz: {message}')}$"):
             small(tmp_path / "x.npz", features=None, **changes)
     assert not list(tmp_path.iterdir())
     small(tmp_path / "x.npz", features=None, boxes=[[box, []], [[], box]])

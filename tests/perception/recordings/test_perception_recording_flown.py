@@ -123,7 +123,7 @@ def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("wrong", r"the fusion gave shape \[3, 5\], must be finite boxes \[m, 6\]"),
         ("raises", "the fusion failed, ValueError: no such layer"),
@@ -131,9 +131,9 @@ def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Pa
         ("missing", "no function 'missing' in it"),
     ],
 )
-def test_a_fusion_that_fails_is_told(name: str, told: str, tmp_path: Path, fusion: str) -> None:
+def test_a_fusion_that_fails_is_told(name: str, message: str, tmp_path: Path, fusion: str) -> None:
     rec = open_recording(small(tmp_path / "r.npz"))
-    with pytest.raises(RecordingError, match=told):
+    with pytest.raises(RecordingError, match=message):
         RecordedInstrument(rec, fusion.replace("peaks", name)).look(frames_of(rec), 0).detect(
             [Exchange(0, (1,), cells((1, 1)))], 0
         )
@@ -196,12 +196,12 @@ def test_the_nearest_frame_is_taken_within_a_step(tmp_path: Path) -> None:
     assert [detector._frame(looks(t)[0]) for t in (0.0, 0.04, 0.06, 0.19)] == [0, 0, 1, 1]
     with pytest.raises(
         RecordingError,
-        match=r"flown\.npz: drone 0 is asked for at 0\.3 s, must be within 0\.1 s of a frame \(0 … 0\.1 s\)",
+        match=r"flown\.npz: drone 0 is needed at 0\.3 s, must be within 0\.1 s of a frame \(0 … 0\.1 s\)",
     ):
         detector.detect([(looks(0.3)[0], [])])
-    with pytest.raises(RecordingError, match=r"truth is asked for at 9 s, must be within 0\.1 s"):
+    with pytest.raises(RecordingError, match=r"truth is needed at 9 s, must be within 0\.1 s"):
         detector.truth(9.0, looks()[0])
-    with pytest.raises(RecordingError, match="drone 2 is asked for, must be one of 0 … 1"):
+    with pytest.raises(RecordingError, match="drone 2 is not in it, must be one of 0 … 1"):
         detector.count_boxes(capture(drone=2, t_s=0.0), None)
     with pytest.raises(
         RecordingError, match=r"drone 0 at 0 s flies 40\.0 m from where it was recorded, must be within 5 m"
@@ -210,7 +210,7 @@ def test_the_nearest_frame_is_taken_within_a_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "settings", "told"),
+    ("changes", "settings", "message"),
     [
         ({}, {}, r"features are 3 × 64 × 64 of 3\.2 m, must be 80 × 64 × 64 of 3\.2 m, as a sortie's radio carries them"),
         (dict(features=None, cell_m=1.6), {}, r"features are 80 × 64 × 64 of 1\.6 m, must be"),
@@ -218,10 +218,10 @@ def test_the_nearest_frame_is_taken_within_a_step(tmp_path: Path) -> None:
         (dict(features=None), dict(recorded_fusion="FUSION"), "features are missing, must be there for perception.recorded_fusion"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_flown_is_told(changes: Any, settings: Any, told: str, tmp_path: Path, fusion: str) -> None:
+def test_what_cannot_be_flown_is_told(changes: Any, settings: Any, message: str, tmp_path: Path, fusion: str) -> None:
     path = small(tmp_path / "r.npz", **changes)
     settings = dict.fromkeys(settings, fusion)
-    with pytest.raises(RecordingError, match=told):
+    with pytest.raises(RecordingError, match=message):
         RecordedDetector(Perception(detector="recorded", recording=str(path), **settings))
 
 

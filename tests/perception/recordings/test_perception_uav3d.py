@@ -228,7 +228,7 @@ def spoil_table(root: Path, name: str, change: Any) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda d: d.pop("infos"), "uav3d_infos_val.pkl: infos is missing, must be a list in a dict of infos and metadata"),
         (lambda d: d["infos"][1].pop("gt_boxes"), "uav3d_infos_val.pkl: infos[1].gt_boxes is missing"),
@@ -242,16 +242,16 @@ def spoil_table(root: Path, name: str, change: Any) -> Path:
         (lambda d: d.update(metadata=Path), "uav3d_infos_val.pkl: global pathlib"),
     ],
 )  # fmt: skip
-def test_a_broken_pickle_is_told(change: Any, told: str, tmp_path: Path) -> None:
+def test_a_broken_pickle_is_told(change: Any, message: str, tmp_path: Path) -> None:
     root = spoil_info(make(tmp_path, 1), change)
     with pytest.raises(Uav3dError) as error:
         convert(root, "val", tmp_path / "out.npz")
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert not (tmp_path / "out.npz").exists()
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "change", "message"),
     [
         ("sample", lambda r: r[0].pop("scene_token"), "sample.json[0].scene_token is missing"),
         ("sample", lambda r: r[0].update(scene_token="x"), "sample.json[0] points to scene 'x', must be in scene.json"),
@@ -260,11 +260,11 @@ def test_a_broken_pickle_is_told(change: Any, told: str, tmp_path: Path) -> None
         ("calibrated_sensor", lambda r: r.clear(), "must be in calibrated_sensor.json"),
     ],
 )  # fmt: skip
-def test_a_broken_table_is_told(name: str, change: Any, told: str, tmp_path: Path) -> None:
+def test_a_broken_table_is_told(name: str, change: Any, message: str, tmp_path: Path) -> None:
     root = spoil_table(make(tmp_path, 1), name, change)
     with pytest.raises(Uav3dError) as error:
         convert(root, "val", tmp_path / "out.npz")
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_missing_files_are_told(data: Path, tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ F8 = np.dtype("f8")
 
 
 @pytest.mark.parametrize(
-    ("what", "told"),
+    ("what", "message"),
     [
         (Call(os.system, "touch owned"), f"global {os.name}.system is refused"),
         (Call(eval, "open('owned', 'w')"), "global (builtins|__builtin__).eval is refused"),
@@ -107,17 +107,17 @@ F8 = np.dtype("f8")
     ],
 )  # fmt: skip
 def test_a_program_is_refused_and_does_not_run(
-    what: Any, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: Any, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for protocol in (2, 3, 4, 5):
-        with pytest.raises(UnpickleError, match=told):
+        with pytest.raises(UnpickleError, match=message):
             loads_data(pickle.dumps([what], protocol))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "message"),
     [
         (b"", "cannot be unpickled, EOFError"),
         (b"not a pickle", "cannot be unpickled, UnpicklingError"),
@@ -131,10 +131,10 @@ def test_a_program_is_refused_and_does_not_run(
     ],
 )
 def test_broken_and_hand_written_pickles_are_refused(
-    data: bytes, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UnpickleError, match=told):
+    with pytest.raises(UnpickleError, match=message):
         loads_data(data)
     assert not list(tmp_path.iterdir())
 

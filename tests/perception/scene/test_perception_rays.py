@@ -8,10 +8,10 @@ from perception_examples import capture
 from scipy.ndimage import map_coordinates
 
 from sortie.perception.compiled import compiled
-from sortie.perception.geometry import FULL
+from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
 from sortie.perception.network.bev import ground_points, lift
 from sortie.perception.scene.rays import COARSE, FAR, FAR_REACH, HAZE, REACH, see
-from sortie.perception.scene.render import AXES, HALF_H, HALF_V, HEIGHT_PX, VIEWS_SHAPE, WIDTH_PX, tilt
+from sortie.perception.scene.render import AXES, VIEWS_SHAPE, tilt
 
 SIDE = 640
 RES_M = 0.32

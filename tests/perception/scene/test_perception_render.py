@@ -5,10 +5,10 @@ import pytest
 from perception_examples import EMPTY, capture, cross, only_target
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.geometry import FULL
+from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
 from sortie.perception.geometry import IMAGE_PX as BEV_PX
 from sortie.perception.network.bev import lift
-from sortie.perception.scene.render import AXES, CAMERAS, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX, Renderer, rotation, tilt
+from sortie.perception.scene.render import AXES, CAMERAS, Renderer, rotation, tilt
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene

@@ -17,7 +17,7 @@ from sortie.perception.surrogate.collect import DetectorRuns, captures_of, colle
 from sortie.perception.surrogate.features import square
 from sortie.perception.surrogate.judge import IN_DISC, judge
 from sortie.perception.surrogate.model import SHIPPED, load
-from sortie.perception.surrogate.plan import AREA_M, LANE_M, MANNERS, Question, draw_target, moment, scene_model
+from sortie.perception.surrogate.plan import AREA_M, LANE_M, MANNERS, DetectorJob, draw_target, moment, scene_model
 from sortie.perception.types import Boxes, Capture
 
 STREET = MANNERS.index("street")
@@ -85,7 +85,7 @@ def test_an_older_capture_is_of_the_same_flight(index: int) -> None:
         t_s = max(c.t_s for c in captures)
         now = {c.drone: c for c in captures if c.t_s == t_s}
         for old in (c for c in captures if c.t_s < t_s):
-            new = now[old.drone]  # for the fit every drone is asked
+            new = now[old.drone]  # for the fit every drone is an ego
             assert old.orientation_xyzw == new.orientation_xyzw
             np.testing.assert_allclose(
                 np.subtract(old.est_position_m, old.position_m),
@@ -97,15 +97,15 @@ def test_an_older_capture_is_of_the_same_flight(index: int) -> None:
     assert looked > 20
 
 
-class Told:
-    """A detector that says what it is asked: a box at every drone that takes part."""
+class FakeProbe:
+    """A detector that gives a box at every drone that takes part."""
 
-    asked = 0
+    calls = 0
 
     def __init__(self, *_: object) -> None: ...
 
-    def ask(self, job: Question) -> Boxes:
-        Told.asked += 1
+    def detect_job(self, job: DetectorJob) -> Boxes:
+        FakeProbe.calls += 1
         drones = [job.ego, *(s.capture for s in job.shares)]
         rows = np.array([(*d.position_m[:2], 4.5, 1.9, 0.0, 1 / (1 + k)) for k, d in enumerate(drones)])
         return Boxes.placed(rows, (0.0, 0.0, 0.0))
@@ -114,20 +114,20 @@ class Told:
         return np.full((2, 64, 64), capture.drone, np.float32)
 
 
-def test_a_calibration_that_its_card_would_replace_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+def test_a_calibration_that_its_card_would_replace_is_refused_before_anything_is_run(tmp_path: Path) -> None:
     out = tmp_path / "mine.md"
     with pytest.raises(ValueError, match=f"^{re.escape(f'out is {out}, must not end in .md, as its card does')}$"):
         calibrate(out, work=tmp_path, scenes=2, held_out=2)
 
 
-def test_answers_are_kept_and_not_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "Probe", Told)
+def test_runs_are_kept_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "Probe", FakeProbe)
     for split in ("fit", "held-out"):
         for index in range(len(MANNERS)):
             path = collect(tmp_path, 0, split, 3, index, None, "key")
-            jobs, before = moment(0, split, 3, index), Told.asked
+            jobs, before = moment(0, split, 3, index), FakeProbe.calls
             assert collect(tmp_path, 0, split, 3, index, None, "key") == path
-            assert Told.asked == before
+            assert FakeProbe.calls == before
             kept = read(path, split)
             assert kept.jobs == jobs
             assert [len(b) for b in kept.boxes] == [1 + len(j.shares) for j in jobs]
@@ -141,23 +141,23 @@ def test_answers_to_another_question_are_not_taken_for_these(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plan changes: the target drives elsewhere, the town is another, other fleets are asked."""
-    monkeypatch.setattr(collecting, "Probe", Told)
+    monkeypatch.setattr(collecting, "Probe", FakeProbe)
     before = collect(tmp_path, 0, "fit", 3, STREET, None, "key")
     changed = getattr(collecting, name)
     monkeypatch.setattr(collecting, name, lambda seed, split, scene, *index: changed(seed, split, scene + 1, *index))
-    asked = Told.asked
+    calls = FakeProbe.calls
     assert collect(tmp_path, 0, "fit", 3, STREET, None, "key") != before
-    assert Told.asked > asked
+    assert FakeProbe.calls > calls
 
 
-def test_answers_to_another_plan_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "Probe", Told)
+def test_runs_of_another_plan_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "Probe", FakeProbe)
     path = collect(tmp_path, 0, "held-out", 0, STREET, None, "key")
     monkeypatch.setattr(collecting, "moment", lambda *at: moment(*at)[:-1])
     with pytest.raises(ValueError) as error:
         read(path, "held-out")
     count = len(moment(0, "held-out", 0, STREET))
-    assert str(error.value) == f"{path}: holds {count} answers, the plan has {count - 1} jobs; remove it"
+    assert str(error.value) == f"{path}: holds {count} results, the plan has {count - 1} jobs; remove it"
 
 
 def test_the_disc_is_judged_beside_the_scene() -> None:
@@ -184,10 +184,8 @@ def test_the_disc_is_judged_beside_the_scene() -> None:
     assert all(o.torch == 0.0 and not o.significant for o in verdict.orders)
 
 
-def truth_of(scene: int, jobs: Sequence[Question]) -> list[Boxes]:
-    from sortie.perception.geometry import FULL
-    from sortie.perception.network.detector import ground_truth
+def truth_of(scene: int, jobs: Sequence[DetectorJob]) -> list[Boxes]:
+    from sortie.perception.ground_truth import ground_truth
 
     model = scene_model(0, "held-out", scene)
-    half = FULL.half_extent_m
-    return [ground_truth(model, j.ego.t_s, j.ego.position_m[:2], half, j.ego.true_yaw_rad) for j in jobs]
+    return [ground_truth(model.cars_at(j.ego.t_s).table(), j.ego.true_pose) for j in jobs]

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surrogate_examples import asked
+from surrogate_examples import detector_runs
 
-from sortie.perception.surrogate.correlation import hang_together
+from sortie.perception.surrogate.correlation import fit_correlation
 from sortie.perception.surrogate.model import SHIPPED, Parameters, load
 
 BASE = np.array([0.2, 0.25, 0.2, 0.0], np.float32)
@@ -20,18 +20,18 @@ def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> No
     parameters = replace(load(SHIPPED), alike=BASE)
     factors = []
     for times in (0.0, 3.5):
-        told: list[tuple[int, int]] = []
-        found = hang_together(
+        steps: list[tuple[int, int]] = []
+        found = fit_correlation(
             parameters,
-            asked(replace(parameters, alike=times * BASE), 40),
+            detector_runs(replace(parameters, alike=times * BASE), 40),
             0,
             0.1,
-            lambda *at, told=told: told.append(at),
+            lambda *at, steps=steps: steps.append(at),
         )
         factors.append(float(found.alike[0] / BASE[0]))
         np.testing.assert_allclose(found.alike[:3], np.minimum(factors[-1] * BASE, 0.95)[:3], rtol=1e-5)
-        assert told[0][0] == 0
-        assert told[-1][0] == told[-1][1]
+        assert steps[0][0] == 0
+        assert steps[-1][0] == steps[-1][1]
     assert 1.0 <= factors[0] < factors[1] - 0.5
     assert factors[1] <= 3.5
 
@@ -39,8 +39,8 @@ def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> No
 @pytest.mark.parametrize(("part", "low", "high"), [(0.0, 0.0, 0.1), (0.5, 0.25, 0.5)])
 def test_the_part_of_the_cars_that_lie_off_for_all_is_found_again(part: float, low: float, high: float) -> None:
     parameters = replace(load(SHIPPED), alike=BASE)
-    theirs = asked(replace(parameters, alike=np.append(BASE[:3], np.float32(part))), 20)
-    found = hang_together(parameters, theirs, 0, 0.1, lambda done, of: None)
+    theirs = detector_runs(replace(parameters, alike=np.append(BASE[:3], np.float32(part))), 20)
+    found = fit_correlation(parameters, theirs, 0, 0.1, lambda done, of: None)
     assert low <= float(found.alike[3]) <= high
 
 
@@ -58,6 +58,6 @@ def test_between_two_factors_the_gain_is_straight(
         return wanted if own else 0.055 - 0.02 * (float(of.alike[0] / BASE[0]) - 0.5)
 
     monkeypatch.setattr("sortie.perception.surrogate.correlation._gain", gain)
-    found = hang_together(parameters, [], 0, 0.1, lambda done, of: None)
+    found = fit_correlation(parameters, [], 0, 0.1, lambda done, of: None)
     assert float(found.alike[0] / BASE[0]) == pytest.approx(factor, rel=1e-4)
     assert float(found.alike[3]) == pytest.approx(0.25, rel=1e-4)

@@ -11,11 +11,11 @@ from perception_examples import EMPTY, capture, cross
 
 from sortie.perception.detectors import DetectsMany
 from sortie.perception.geometry import in_square
+from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import match
-from sortie.perception.network.detector import ground_truth
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
-from sortie.perception.surrogate.draws import Luck
+from sortie.perception.surrogate.draws import DrawSource
 from sortie.perception.surrogate.exchange import (
     ALARM_COVARIATES,
     FUSED_COVARIATES,
@@ -26,7 +26,7 @@ from sortie.perception.surrogate.exchange import (
 )
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.hashing import uniform
-from sortie.perception.surrogate.rows import claim
+from sortie.perception.surrogate.rows import assign_boxes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene, Target
 
@@ -67,10 +67,10 @@ def test_it_has_the_detectors_interface_and_says_which_fit_it_is_of(detector: Su
 
 
 def test_many_moments_at_once_are_one_after_the_other(detector: SurrogateDetector, scene: SceneModel) -> None:
-    asked = moments(0.1)
-    one_by_one = [boxes for moment in asked for boxes in detector.detect(moment)]
-    same(list(detector.detect_many(asked)), one_by_one)
-    same(one_by_one, [b for m in asked for b in SurrogateDetector(scene, Perception(), seed=3).detect(m)])
+    jobs_of_moments = moments(0.1)
+    one_by_one = [boxes for moment in jobs_of_moments for boxes in detector.detect(moment)]
+    same(list(detector.detect_many(jobs_of_moments)), one_by_one)
+    same(one_by_one, [b for m in jobs_of_moments for b in SurrogateDetector(scene, Perception(), seed=3).detect(m)])
 
 
 def test_boxes_come_best_first_and_above_the_threshold(scene: SceneModel) -> None:
@@ -81,7 +81,7 @@ def test_boxes_come_best_first_and_above_the_threshold(scene: SceneModel) -> Non
         assert (boxes.score >= np.float32(0.6)).all()
 
 
-def test_another_seed_or_replication_is_other_luck(scene: SceneModel, detector: SurrogateDetector) -> None:
+def test_another_seed_or_replication_gives_other_draws(scene: SceneModel, detector: SurrogateDetector) -> None:
     job = moments(0.1)[0]
     mine = detector.detect(job)[0].score
     for other in (
@@ -99,13 +99,13 @@ def test_nothing_sent_is_alone(detector: SurrogateDetector, scene: SceneModel) -
     same([b for m in moments(1.0) for b in mute.detect(m)], alone)
 
 
-def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
+def test_draws_do_not_depend_on_what_was_sent_nor_on_who_else_flies(
     detector: SurrogateDetector, scene: SceneModel
 ) -> None:
-    eyes, luck = Eyes(scene), Luck(3, 0, 7, Eyes(scene).traffic.count, detector.parameters.alike)
+    eyes, draws = Eyes(scene), DrawSource(3, 0, 7, Eyes(scene).traffic.count, detector.parameters.alike)
     fleet = cross(10.0, 20.0, 0.3)
     every, two = eyes.look(CaptureColumns.of(fleet)), eyes.look(CaptureColumns.of(fleet[1:3]))
-    a, b = luck.of(fleet, every), luck.of(fleet[1:3], two)
+    a, b = draws.of(fleet, every), draws.of(fleet[1:3], two)
     mine = np.isin(every.capture, (1, 2))
     for name in ("look", "rank", "find", "residual"):
         np.testing.assert_array_equal(getattr(a, name)[mine], getattr(b, name))
@@ -113,12 +113,12 @@ def test_luck_does_not_depend_on_what_was_sent_nor_on_who_else_flies(
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
-def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, part: float) -> None:
+def test_that_share_of_the_cars_has_one_draw_for_all_drones(scene: SceneModel, part: float) -> None:
     eyes = Eyes(scene)
-    luck = Luck(3, 0, 7, eyes.traffic.count, np.full(4, part, np.float32))
+    draws = DrawSource(3, 0, 7, eyes.traffic.count, np.full(4, part, np.float32))
     fleet = [c for t in TIMES for c in cross(10.0, 20.0, 0.3, t_s=float(t))]
     looks = eyes.look(CaptureColumns.of(fleet))
-    drawn = luck.of(fleet, looks)
+    drawn = draws.of(fleet, looks)
     cars = [looks.car == c for c in np.unique(looks.car) if (looks.car == c).sum() > 5]
     for values in (drawn.look, drawn.find[:, 0], drawn.residual):
         alike = np.mean([np.ptp(values[of]) == 0.0 for of in cars])
@@ -129,10 +129,12 @@ def test_that_part_of_the_cars_has_one_luck_whoever_looks(scene: SceneModel, par
 def test_which_cars_are_hard_is_the_towns_and_the_rest_the_sorties(scene: SceneModel) -> None:
     eyes, fleet = Eyes(scene), cross(10.0, 20.0, 0.3)
     looks, half = eyes.look(CaptureColumns.of(fleet)), np.full(4, 0.5, np.float32)
-    a, b, other = (Luck(*key, eyes.traffic.count, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8)))
+    a, b, other = (
+        DrawSource(*key, eyes.traffic.count, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8))
+    )
     own = a.look == b.look
     assert own.mean() == pytest.approx(0.5, abs=0.15)
-    np.testing.assert_array_equal(a.thrown, b.thrown)
+    np.testing.assert_array_equal(a.offset_draw, b.offset_draw)
     assert (a.look == other.look).mean() < 0.05
 
 
@@ -147,13 +149,15 @@ def test_uniform_draws_are_uniform_and_unlike_across_purposes() -> None:
 
 
 def test_sharing_finds_more_cars_and_more_cells_find_no_fewer(detector: SurrogateDetector) -> None:
-    """On the average of 60 egos; a tenth of a car is luck's."""
+    """On the average of 60 egos; a tenth of a car is chance."""
 
     def hits(rho: float) -> float:
-        asked = moments(rho)
-        egos = [e for m in asked for e, _ in m]
+        jobs_of_moments = moments(rho)
+        egos = [e for m in jobs_of_moments for e, _ in m]
         truths = detector.truth_many([e.t_s for e in egos], egos)
-        return float(np.mean([match(b, t).hit.sum() for b, t in zip(detector.detect_many(asked), truths, strict=True)]))
+        return float(
+            np.mean([match(b, t).hit.sum() for b, t in zip(detector.detect_many(jobs_of_moments), truths, strict=True)])
+        )
 
     found = [hits(rho) for rho in (0.0, 0.02, 0.1, 1.0)]
     assert found[-1] > found[0] + 0.5
@@ -210,7 +214,7 @@ def test_boxes_stand_by_the_estimated_pose(scene: SceneModel) -> None:
 
 def test_truth_is_the_detectors(scene: SceneModel, detector: SurrogateDetector) -> None:
     ego = capture(10.0, 20.0, yaw=0.4, pitch=0.05, t_s=7.3)
-    mine, theirs = detector.truth(7.4, ego), ground_truth(scene, 7.4, (10.0, 20.0), 102.4, ego.true_yaw_rad)
+    mine, theirs = detector.truth(7.4, ego), ground_truth(scene.cars_at(7.4).table(), (10.0, 20.0, ego.true_yaw_rad))
     assert len(mine) == len(theirs) > 10
     order = [np.lexsort(b.xy_m.T) for b in (mine, theirs)]
     np.testing.assert_allclose(mine.xy_m[order[0]], theirs.xy_m[order[1]], atol=1e-3)
@@ -290,7 +294,7 @@ def test_boxes_of_a_car_lie_off_to_the_same_side_of_it_whoever_looks(
         sides: dict[int, list[np.ndarray]] = {}
         for k, boxes in enumerate(some.detect([(c, ()) for c in fleet])):
             mine = np.flatnonzero(looks.capture == k)
-            score, off, _ = claim(fleet[k], boxes, looks, mine, eyes)
+            score, off, _ = assign_boxes(fleet[k], boxes, looks, mine, eyes)
             turn = looks.yaw_rad[mine] - fleet[k].true_yaw_rad
             along = np.cos(turn) * off[:, 0] + np.sin(turn) * off[:, 1]
             left = np.cos(turn) * off[:, 1] - np.sin(turn) * off[:, 0]
@@ -310,8 +314,8 @@ def test_false_alarms_are_those_of_drones_along_a_street_or_askew(
     """By their lengths, planted; a drone's own and those of things in the town alike."""
     pool = detector.parameters.alarm_pool.copy()
     pool[0, ..., 2], pool[1, ..., 2] = 3.0, 9.0
-    mirages = np.array([part, 0.5, 0.5, 0.1], np.float32)
-    planted = dataclasses.replace(detector.parameters, alarm_pool=pool, mirages=mirages)
+    shared_false_positives = np.array([part, 0.5, 0.5, 0.1], np.float32)
+    planted = dataclasses.replace(detector.parameters, alarm_pool=pool, shared_false_positives=shared_false_positives)
     some = SurrogateDetector.of(SceneModel(EMPTY, None, BOUNDS), Perception(), planted, 0)
     fleet = cross(10.0, 20.0, heading)
     lengths = np.concatenate([b.size_m[:, 0] for b in some.detect([(c, ()) for c in fleet])])
@@ -330,14 +334,14 @@ def test_what_false_alarms_hang_on_is_what_was_asked_for_and_how_far_cars_have_d
     fleet = CaptureColumns.of(captures)
     exchange = FeatureShares.of(jobs, {c: i for i, c in enumerate(captures)})
     x = alarm_covariates(exchange, Eyes(scene).look(fleet), fleet, np.zeros(2, bool), scene.config)
-    told = dict(zip(ALARM_COVARIATES, x.T.tolist(), strict=True))
+    by_name = dict(zip(ALARM_COVARIATES, x.T.tolist(), strict=True))
     disc = np.pi * 10**2 / 4096
-    assert told["sharing"] == [0.75, 0.0]
-    assert told["aimed"] == pytest.approx([(1 + 1 + disc) / 3, 1.0])
-    assert told["received"] == pytest.approx([(1 + 0.5 + disc) / 4, 0.0], abs=1e-4)
-    assert told["moving"] == pytest.approx([0.1, 0.1])
-    assert told["late"] == pytest.approx([1.0, 0.0])
-    assert told["gone"] == pytest.approx([0.1, 0.0])
+    assert by_name["sharing"] == [0.75, 0.0]
+    assert by_name["aimed"] == pytest.approx([(1 + 1 + disc) / 3, 1.0])
+    assert by_name["received"] == pytest.approx([(1 + 0.5 + disc) / 4, 0.0], abs=1e-4)
+    assert by_name["moving"] == pytest.approx([0.1, 0.1])
+    assert by_name["late"] == pytest.approx([1.0, 0.0])
+    assert by_name["gone"] == pytest.approx([0.1, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -359,9 +363,9 @@ def test_senders_are_counted_by_head_and_by_weight(weights: tuple[float, ...], m
     sent = np.array([[k != 1 for k, w in enumerate(weights) if w > 0]])
     sure = np.zeros(len(looks.car), np.float32)
     x = covariates(pairs, exchange, looks, sure, sent, np.full(sent.shape, 0.1, np.float32), np.zeros(1, bool))
-    told = dict(zip(FUSED_COVARIATES, x[0].tolist(), strict=True))
-    assert told["many"] == pytest.approx(many)
-    assert told["senders"] == pytest.approx(sum(weights) - weights[1])
+    by_name = dict(zip(FUSED_COVARIATES, x[0].tolist(), strict=True))
+    assert by_name["many"] == pytest.approx(many)
+    assert by_name["senders"] == pytest.approx(sum(weights) - weights[1])
 
 
 @pytest.mark.parametrize("age_s", [0.5, 2.0, 60.0])

@@ -100,7 +100,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, parameters: Parameters) -> None
     save(tmp_path / "again.safetensors", parameters)
     again = load(tmp_path / "again.safetensors")
     assert again.card == parameters.card
-    for name in ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "mirages", "boxes"):
+    for name in ("alike", "residuals", "alarm_edges", "alarm_range", "alarm_pool", "shared_false_positives", "boxes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(parameters, name))
     x = RNG.normal(size=(7, len(LOOK_COVARIATES))).astype(np.float32)
     np.testing.assert_array_equal(again.nets["look"](x), parameters.nets["look"](x))
@@ -151,24 +151,24 @@ def test_sums_of_the_shipped_nets_stay_where_they_are_exact(name: str, parameter
         reach = reach + np.abs(bias)
 
 
-def test_better_luck_and_surer_drones_rank_higher(parameters: Parameters) -> None:
+def test_higher_draws_and_surer_drones_rank_higher(parameters: Parameters) -> None:
     x = np.zeros((50, len(RANK_COVARIATES)), np.float32)
     x[:, 0] = np.linspace(-4, 3, 50)
     fraction = parameters.rank(x, np.zeros(50, np.float32))
     assert fraction[0] > 10 * fraction[-1]
     assert (fraction <= 1).all()
     assert (fraction > 0).all()
-    luck = parameters.rank(x[:1].repeat(3, 0), np.array([-1, 0, 1], np.float32))
-    assert (np.diff(luck) > 0).all()
+    draw = parameters.rank(x[:1].repeat(3, 0), np.array([-1, 0, 1], np.float32))
+    assert (np.diff(draw) > 0).all()
 
 
 def test_surer_drones_find_more(parameters: Parameters) -> None:
     x = lonely(2000, range=0.5)
-    luck = RNG.random((2000, 2)).astype(np.float32)
+    draw = RNG.random((2000, 2)).astype(np.float32)
     found = []
     for own in (-2.0, 0.0, 1.5):
         x[:, 0] = own
-        found.append(float((parameters.find(x, luck) > 0.5).mean()))
+        found.append(float((parameters.find(x, draw) > 0.5).mean()))
     assert found[0] < found[1] < found[2]
 
 
@@ -187,13 +187,15 @@ def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
         sure = np.full(len(looks.car), own, np.float32)
         x = covariates(pairs, alone, looks, sure, none.astype(bool), none, np.zeros(n, bool))
         x = np.concatenate([x, np.full((n, 1), score, np.float32)], axis=1)
-        spread.append(float(np.abs(parameters.place(x, RNG.random(n).astype(np.float32), thrown(n))[0][:, :2]).mean()))
+        spread.append(
+            float(np.abs(parameters.place(x, RNG.random(n).astype(np.float32), offset_draw(n))[0][:, :2]).mean())
+        )
     assert n > 100
     assert spread[0] > 1.3 * spread[1]
 
 
 def test_confidence_is_drawn_from_the_two_normals_that_it_is_said_to_be(parameters: Parameters) -> None:
-    """Even luck, [0, 1], against the mixture's own mean and variance; and better luck is never less sure."""
+    """Even draws, [0, 1], against the mixture's own mean and variance; and a higher draw is never less sure."""
     x = np.zeros((20_000, NETS["look"][0]), np.float32)
     drawn = parameters.confidence(x, ((np.arange(20_000) + 0.5) / 20_000).astype(np.float32))
     high, up, down, wide, narrow = (float(v) for v in parameters.nets["look"](x[:1])[0])
@@ -204,10 +206,10 @@ def test_confidence_is_drawn_from_the_two_normals_that_it_is_said_to_be(paramete
     assert drawn.var() == pytest.approx(variance, rel=0.02)
 
 
-def test_best_luck_places_best_among_what_was_predicted_as_vaguely(parameters: Parameters) -> None:
+def test_the_best_draw_places_best_among_what_was_predicted_as_vaguely(parameters: Parameters) -> None:
     x = scored(lonely(4000, range=0.7), 0.5)
     alone = replace(parameters, alike=np.append(parameters.alike[:3], np.float32(0)))
-    off, _ = alone.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32), thrown(4000))
+    off, _ = alone.place(x, np.linspace(0, 0.999, 4000, dtype=np.float32), offset_draw(4000))
     fits = _iou(off.astype(np.float64))
     assert fits[:1000].mean() + 0.2 < fits[-1000:].mean()
     rows = parameters.residuals.reshape(KINDS, -1, BAND, 6)
@@ -218,17 +220,17 @@ def test_best_luck_places_best_among_what_was_predicted_as_vaguely(parameters: P
 def test_boxes_of_part_of_the_cars_lie_off_to_the_same_side_for_all_and_as_far_as_before(
     parameters: Parameters,
 ) -> None:
-    """Two drones that look at the same cars, each with a luck of its own; what lies ahead and turned left for one lies
+    """Two drones that look at the same cars, each with draws of its own; what lies ahead and turned left for one lies
     behind and turned right for the other."""
     n = 20_000
     x = scored(lonely(n, range=0.7), 0.5)
-    ours = thrown(n)
+    ours = offset_draw(n)
     theirs = ours * np.array([1, -1, 1, -1], np.float32)
-    luck = RNG.random((2, n), np.float32)
+    draw = RNG.random((2, n), np.float32)
     far = []
     for part in (0.0, 0.4, 1.0):
         some = replace(parameters, alike=np.append(parameters.alike[:3], np.float32(part)))
-        a, b = (some.place(x, u, t)[0] - _mean(parameters, x) for u, t in zip(luck, (ours, theirs), strict=True))
+        a, b = (some.place(x, u, t)[0] - _mean(parameters, x) for u, t in zip(draw, (ours, theirs), strict=True))
         same = [(np.sign(a[:, k]) == side * np.sign(b[:, k])).mean() for k, side in enumerate((-1, 1, -1))]
         np.testing.assert_allclose(same, 0.5 + part / 2, atol=0.06)
         far.append(np.abs(a))
@@ -253,13 +255,13 @@ def _mean(parameters: Parameters, x: np.ndarray) -> np.ndarray:
     return parameters.nets["place"](x)[:, :5]
 
 
-def thrown(n: int) -> np.ndarray:
-    """As `Drawn.thrown`."""
+def offset_draw(n: int) -> np.ndarray:
+    """As `Drawn.offset_draw`."""
     return np.column_stack([RNG.random(n), RNG.choice([-1.0, 1.0], (n, 3))]).astype(np.float32)
 
 
 def test_what_pairs_have_in_common_is_found_again() -> None:
-    """Cars whose luck is their own in 0, 40 and 80 of 100, seen by five drones at other chances."""
+    """Cars that have their own draw in 0, 40 and 80 of 100, seen by five drones at other chances."""
     rng = np.random.default_rng(0)
     car = np.repeat(np.arange(40_000), 5)
     chance = rng.uniform(0.2, 0.9, len(car))
@@ -368,5 +370,5 @@ def test_residuals_are_those_of_drones_alone_or_fleets_and_of_square_cars_or_oth
     x[2:, PLACE_COVARIATES.index("senders")] = 1.5
     x[2:, PLACE_COVARIATES.index("part")] = (0.01, 0.01, 0.5, 0.5, 1.0, 1.0)
     x[1::2, PLACE_COVARIATES.index("own_square")] = 0.9
-    off, _ = planted.place(x, np.full(KINDS, 0.4, np.float32), thrown(KINDS))
+    off, _ = planted.place(x, np.full(KINDS, 0.4, np.float32), offset_draw(KINDS))
     assert off[:, 0].tolist() == list(range(KINDS))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perception_examples import capture, cross
-from surrogate_examples import asked
+from surrogate_examples import detector_runs
 
-from sortie.perception.surrogate.correlation import seen_by_several
+from sortie.perception.surrogate.correlation import fit_shared_false_positives
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import scene_model
-from sortie.perception.surrogate.shared_false_positives import Mirages, in_common
+from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives, estimate_shared
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception
 
@@ -24,7 +24,7 @@ def fleet(*at: tuple[float, float]) -> CaptureColumns:
 def test_as_many_things_lie_in_a_square_as_are_expected_there() -> None:
     counts = []
     for town in range(60):
-        things = Mirages(town).about(fleet((0, 0)), 30.0)
+        things = SharedFalsePositives(town).about(fleet((0, 0)), 30.0)
         assert (things.rarity < 30.0).all()
         counts.append([int((things.there[0] & (things.rarity < most)).sum()) for most in (10.0, 30.0)])
     mean, variance = np.mean(counts, axis=0), np.var(counts, axis=0)
@@ -32,15 +32,15 @@ def test_as_many_things_lie_in_a_square_as_are_expected_there() -> None:
     np.testing.assert_allclose(variance, [10, 30], rtol=0.5)  # Poisson: as thrown
 
 
-def test_things_stand_where_they_stand_whoever_else_is_asked_about() -> None:
-    town = Mirages(7)
+def test_things_stand_where_they_stand_whichever_drones_look() -> None:
+    town = SharedFalsePositives(7)
     alone, both = town.about(fleet((300, -200)), 20.0), town.about(fleet((-500, 0), (300, -200)), 20.0)
     seen = both.there[1]
     here = np.lexsort(alone.xy_m[alone.there[0]].T)
     there = np.lexsort(both.xy_m[seen].T)
     np.testing.assert_array_equal(alone.xy_m[alone.there[0]][here], both.xy_m[seen][there])
-    np.testing.assert_array_equal(alone.word[alone.there[0]][here], both.word[seen][there])
-    assert not np.array_equal(Mirages(8).about(fleet((300, -200)), 20.0).xy_m, alone.xy_m)
+    np.testing.assert_array_equal(alone.key[alone.there[0]][here], both.key[seen][there])
+    assert not np.array_equal(SharedFalsePositives(8).about(fleet((300, -200)), 20.0).xy_m, alone.xy_m)
 
 
 @pytest.mark.parametrize(("part", "chance"), [(0.5, 0.3), (0.9, 0.7), (1.0, 0.25)])
@@ -48,19 +48,19 @@ def test_what_alarms_have_in_common_is_found_from_how_many_have_them(part: float
     rng = np.random.default_rng(1)
     shared = rng.random(200_000) < part
     seen = np.where(shared, rng.binomial(4, chance, size=len(shared)), 0)
-    assert in_common(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
+    assert estimate_shared(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
 
 
 def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> None:
-    assert in_common([0, 0, 0], 4) == (0.0, 1.0)
-    assert in_common([], 4) == (0.0, 1.0)
-    assert in_common([4, 4], 4) == (1.0, 1.0)
+    assert estimate_shared([0, 0, 0], 4) == (0.0, 1.0)
+    assert estimate_shared([], 4) == (0.0, 1.0)
+    assert estimate_shared([4, 4], 4) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
 def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
-    planted = replace(load(SHIPPED), mirages=np.array([part, chance, 0.4, 0.1], np.float32))
-    found = seen_by_several(asked(planted, 40), planted.floor, 0)
+    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
+    found = fit_shared_false_positives(detector_runs(planted, 40), planted.floor, 0)
     # how often another has it too: some stand so near a car that was missed that they are taken for it
     assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
     if part:
@@ -72,7 +72,7 @@ def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float
 def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
     base, towns, seen = load(SHIPPED), range(30), dict[float, float]()
     for part in (0.0, 0.9):
-        planted = replace(base, mirages=np.array([part, 0.5, 0.5, 0.1], np.float32))
+        planted = replace(base, shared_false_positives=np.array([part, 0.5, 0.5, 0.1], np.float32))
         count = 0
         for town in towns:
             model = scene_model(0, "fit", town)

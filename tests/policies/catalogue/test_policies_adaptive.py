@@ -37,7 +37,7 @@ def test_arms_by_hand() -> None:
 
 def test_no_more_is_sent_than_the_air_carries() -> None:
     """Half a drone's goodput for all its links, rounded down in steps of √2; by hand, a map is 5.24 Mb."""
-    assert pytest.approx(5.24288) == a.MAP_MB
+    assert pytest.approx(5.24288) == a.FEATURE_MAP_MEGABITS
     me = fleet_of(5, goodput=52.4288).descriptors[0]
     assert a.carried(me, (1, 2, 3, 4)) == pytest.approx(0.125)  # 26.2 of 4 × 52.4 Mb/s, exactly a step
     assert a.carried(me, (1, 2)) == pytest.approx(0.25)
@@ -48,7 +48,7 @@ def test_no_more_is_sent_than_the_air_carries() -> None:
     assert a.carried(some, (1, 2, 3, 4)) == pytest.approx(0.25), "by the links that were measured"
     tight = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.4, "")
     assert rungs(tight) == [FEATURES] * 4
-    assert sum(d.rho for d in tight) * a.MAP_MB * 10 <= 0.5 * 5.0
+    assert sum(d.rho for d in tight) * a.FEATURE_MAP_MEGABITS * 10 <= 0.5 * 5.0
     roomy = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.005, "")
     assert sum(d.rho for d in roomy) == pytest.approx(4 * 0.005), "a budget below it is spent whole"
 

@@ -12,11 +12,20 @@ from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.catalogue.freshness import freshness
 from sortie.policies.catalogue.prior import METHODS
 from sortie.policies.catalogue.prior.hydracollab import hydracollab
-from sortie.policies.catalogue.prior.syncnet import MAP_MEGABITS, syncnet
+from sortie.policies.catalogue.prior.syncnet import syncnet
 from sortie.policies.catalogue.prior.when2com import when2com
 from sortie.policies.catalogue.prior.where2comm import where2comm
 from sortie.policies.catalogue.prior.who2com import who2com
-from sortie.policies.contract import COVERAGE_CELL_M, Coverage, Descriptor, Directive, Disc, FleetView, Representation
+from sortie.policies.contract import (
+    COVERAGE_CELL_M,
+    FEATURE_MAP_MEGABITS,
+    Coverage,
+    Descriptor,
+    Directive,
+    Disc,
+    FleetView,
+    Representation,
+)
 from sortie.policies.registry import POLICIES, handshake_bytes, own_fusion
 from sortie.policies.verification.axes import FIELDS, Axis, decisions_of, method_table, observe
 from sortie.policies.verification.views import draw_views
@@ -114,7 +123,7 @@ def test_the_disc_holds_its_cells() -> None:
     x_m, y_m, radius_m = disc_around(cells)
     corners = [(c + i, r + j) for r, c in cells for i in (0, 1) for j in (0, 1)]
     assert all(math.hypot(c * COVERAGE_CELL_M - x_m, r * COVERAGE_CELL_M - y_m) <= radius_m + 1e-9 for c, r in corners)
-    with pytest.raises(ValueError, match="cells is empty, must hold at least one"):
+    with pytest.raises(ValueError, match="cells is empty, must have at least one"):
         disc_around(frozenset())
 
 
@@ -179,7 +188,7 @@ def test_syncnet_weighs_by_the_delay_that_goodput_lets_expect() -> None:
         return syncnet(fleet_of(2, goodput=goodput_mbps))[0].fusion_weight
 
     assert weight(1e6) == 1.0
-    half = MAP_MEGABITS / (0.5 * math.log(2))  # exp(−t/0.5 s) is a half there
+    half = FEATURE_MAP_MEGABITS / (0.5 * math.log(2))  # exp(−t/0.5 s) is a half there
     assert weight(half) == 0.5
     assert weight(0.0) == 0.25
     assert [weight(g) for g in (1, 5, 10, 20, 50, 100)] == sorted(weight(g) for g in (1, 5, 10, 20, 50, 100))

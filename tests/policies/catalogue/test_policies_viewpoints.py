@@ -35,9 +35,9 @@ def tracking(view: FleetView, region: Disc) -> FleetView:
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (Reposition(500.0, 0.0), r"reposition of drone 0: 500\.0 m from where it is, must be at most 200 m"),
-        (Reposition(math.nan, 0.0), r"reposition of drone 0: nan m from where it is, must be at most 200 m"),
-        (Reposition(0.0, math.inf), r"reposition of drone 0: inf m from where it is, must be at most 200 m"),
+        (Reposition(500.0, 0.0), r"reposition of drone 0: 500\.0 m from the drone, must be at most 200 m"),
+        (Reposition(math.nan, 0.0), r"reposition of drone 0: nan m from the drone, must be at most 200 m"),
+        (Reposition(0.0, math.inf), r"reposition of drone 0: inf m from the drone, must be at most 200 m"),
         ((3.0, 4.0), "a viewpoint returns Reposition or None, got tuple"),
         (Reposition("a", 0.0, "x"), "reposition of drone 0: x_m is 'a', must be a number"),  # type: ignore[arg-type]
         (Reposition(0.0, None), "reposition of drone 0: y_m is None, must be a number"),  # type: ignore[arg-type]
@@ -58,7 +58,7 @@ def test_a_wish_out_of_bounds_is_named(asked: object, message: str) -> None:
 def test_nobody_asks_for_a_drone_that_the_view_does_not_hold() -> None:
     empty = fleet_of(1)._replace(descriptors={}, age_s={})
     check_reposition(None, empty)
-    with pytest.raises(PolicyError, match="in a view without it, must be None"):
+    with pytest.raises(PolicyError, match="the view has no descriptor of it, must be None"):
         check_reposition(Reposition(0.0, 0.0), empty)
 
 
@@ -148,7 +148,7 @@ def changes_its_input(view: FleetView) -> Reposition | None:
     [
         (remembers, "its viewpoint: two calls with the same view differ"),
         (reads_the_order, "its viewpoint: drones in another order get another place"),
-        (reads_the_clock, "its viewpoint reaches for time, which is not in its view"),
+        (reads_the_clock, "its viewpoint uses time, which is not in its view"),
         (changes_its_input, "its viewpoint changed its input"),
         (lambda view: Reposition(1e4, 0.0) if view.me else None, "reposition of drone"),
         (lambda view: view.nothing, "its viewpoint raises AttributeError"),

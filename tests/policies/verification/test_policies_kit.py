@@ -17,7 +17,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.verification import conformance
 from sortie.policies.verification.conformance import RULES, Check, conform, failing
-from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, smaller, to_json
+from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, shrink, to_json
 
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
 calls = itertools.count()
@@ -131,17 +131,17 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (depends_on_order, "order of drones irrelevant", "get other directives"),
     (rises_with_age, "age-monotone", "rate_hz rises"),
     (rises_for_another, "age-monotone", "representation rises from 2 to 3"),
-    (overspends, "budget kept", "rho=0.02: its links sum to 0.03 maps, 0.02 of full sharing is 0.02"),
-    (remembers, "same in, same out", "two calls with the same view differ"),
-    (lottery, "same in, same out", "two calls with the same view differ"),
+    (overspends, "budget kept", "rho=0.02: its links add up to 0.03 maps, 0.02 of full sharing is 0.02"),
+    (remembers, "deterministic", "two calls with the same view differ"),
+    (lottery, "deterministic", "two calls with the same view differ"),
     (too_fast, "bounds kept", "rate_hz is 31.0, must be in [0, 30]"),
     (not_a_number, "bounds kept", "rho is nan, must be in [0, 1]"),
-    (forgets_a_link, "one directive a link", "must be for each of"),
-    (silent, "says why", "no reason given for"),
+    (forgets_a_link, "one directive per link", "must be for each of"),
+    (silent, "gives reasons", "no reason given for"),
     (needs_a_peer, "one drone and empty views", "raises ValueError"),
     (needs_youth, "stale views", "every descriptor 20 periods old: RuntimeError: nobody there"),
-    (gives_a_generator, "answers", "returns generator, must be a sequence of directives"),
-    (gives_nothing, "answers", "returns NoneType, must be a sequence of directives"),
+    (gives_a_generator, "returns directives", "returns generator, must be a sequence of directives"),
+    (gives_nothing, "returns directives", "returns NoneType, must be a sequence of directives"),
     (gives_text, "bounds kept", "a policy returns Directive, got str"),
     (rate_as_text, "bounds kept", "rate_hz is '10', must be in [0, 30], a number"),
     (rung_as_text, "bounds kept", "representation is 'features', must be in [0, 4], a Representation"),
@@ -188,7 +188,7 @@ def test_a_policy_that_always_raises_holds_no_rule() -> None:
     checks = conform(broken, count=5)
     assert [c.name for c in checks if c.holds] == ["input unchanged"]
     assert checks[0].what == "raises KeyError: 'battery'"
-    assert checks[1].what == "could be judged on no view: see answers, bounds kept"
+    assert checks[1].what == "no view could be checked: see returns directives, bounds kept"
 
 
 def test_views_of_the_users_choice() -> None:
@@ -239,7 +239,7 @@ def test_an_empty_view_survives_json() -> None:
         (("drones", 0, "coverage_grid"), "00", "drones[0].coverage_grid has 1 bytes, must have 64"),
         (("drones", 0, "coverage_grid"), "zz", "drones[0].coverage_grid must be hexadecimal"),
         (("drones", 0, "position_m"), [1, 2], "drones[0].position_m is [1, 2], must be a list of 3 numbers"),
-        (("drones", 1, "agent_id"), 0, "drones[1].agent_id is 0 for the second time"),
+        (("drones", 1, "agent_id"), 0, "drones[1].agent_id is 0, which another drone has already"),
         (("drones", 0, "age_s"), -1, "drones[0].age_s is -1, must be in [0, inf]"),
         (("drones", 0), 3, "drones[0] must be an object"),
         (("drones",), 3, "a view is an object with ego, period_s and a list of drones"),
@@ -261,7 +261,7 @@ def test_smaller_keeps_failing_and_drops_what_does_not_matter() -> None:
         return 3 in view.descriptors and view.descriptors[3].battery_soc < 0.3
 
     view = next(v for v in draw_views(5, 1000) if fails(v) and v.ego != 3 and len(v.descriptors) > 6)
-    small = smaller(view, fails)
+    small = shrink(view, fails)
     assert fails(small)
     assert set(small.descriptors) == {3, view.ego}
     assert small.descriptors[view.ego].battery_soc == 1.0

@@ -12,7 +12,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
 from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, complaint_on, property_of, prove
+from sortie.policies.verification.proof import ProofVerdict, check_property, property_of, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import from_json, to_json
 
@@ -66,7 +66,7 @@ def test_a_policy_that_drops_below_detections_is_found_out() -> None:
     assert verdict.counterexample is not None
     assert 0.4 < verdict.counterexample.descriptors[verdict.counterexample.ego].battery_soc < 0.4000001
     again = from_json(to_json(verdict.counterexample))
-    assert complaint_on(property_of(parse(HUMANE)[0]), drops_below_detections, again) == verdict.what
+    assert check_property(property_of(parse(HUMANE)[0]), drops_below_detections, again) == verdict.what
     assert last(worked, HUMANE).outcome == "proved"
 
 
@@ -125,7 +125,7 @@ def test_a_directive_of_other_types_is_refuted_and_named_by_every_property(
 def test_what_cannot_be_searched_says_so() -> None:
     verdict = prove(random_k, max_drones=3)[0]
     assert verdict.outcome == "not proved"
-    assert verdict.what == "reads stamp_ns, which has no boundaries to search; 1000 drawn views keep it"
+    assert verdict.what == "reads stamp_ns, which cannot be searched; 1000 drawn views keep it"
     assert last(random_k, "representation == none").outcome == "refuted", "by a drawn view"
 
 
@@ -198,12 +198,12 @@ def reads_the_highest_flag(view: FleetView) -> list[Directive]:
 @pytest.mark.parametrize(
     ("policy", "why"),
     [
-        (reads_text, "looks into the text of battery_soc of drone 0, which is for reasons alone"),
-        (reads_the_start_of_text, "looks into the text of battery_soc of drone 0, which is for reasons alone"),
-        (asks_for_the_type, "asks for a type(…), which is another one in the search"),
-        (partial(asks_for_the_type), "asks for a type(…), which is another one in the search"),
-        (Asks(), "asks for a type(…), which is another one in the search"),
-        (asks_for_the_type_in_a_helper, "asks for a type(…), which is another one in the search"),
+        (reads_text, "uses the text of battery_soc of drone 0 for more than a reason"),
+        (reads_the_start_of_text, "uses the text of battery_soc of drone 0 for more than a reason"),
+        (asks_for_the_type, "uses type(…), which gives another type in the search"),
+        (partial(asks_for_the_type), "uses type(…), which gives another type in the search"),
+        (Asks(), "uses type(…), which gives another type in the search"),
+        (asks_for_the_type_in_a_helper, "uses type(…), which gives another type in the search"),
     ],
 )
 def test_a_policy_that_sees_through_its_numbers_is_not_proved(policy: Decide, why: str) -> None:
@@ -233,8 +233,8 @@ def test_a_number_in_a_reason_is_no_obstacle() -> None:
 @pytest.mark.parametrize(
     ("policy", "why"),
     [
-        (reads_overlap, "reads position_m otherwise than through peers_by_overlap"),
-        (reads_grid, "reads coverage_grid, which has no boundaries to search"),
+        (reads_overlap, "reads position_m without peers_by_overlap"),
+        (reads_grid, "reads coverage_grid, which cannot be searched"),
         (best_goodput, "compares or combines two inputs, goodput of drone 0 to slot"),
     ],
 )

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies_examples import fleet_of
 
+import sortie
 from sortie.fleet.gate import Gate
 from sortie.fleet.messages.auth import Dropped, Inbox, Sealer, open_datagram
 from sortie.fleet.messages.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
@@ -284,6 +285,15 @@ def imports_the_fleet(view: FleetView) -> list[Directive]:
     return share(view, float(HEADER_BYTES % 7))
 
 
+def uses_the_api(view: FleetView) -> list[Directive]:
+    return [sortie.Directive(view.ego, p, sortie.Representation.NONE, reason="nothing") for p in view.peers]
+
+
+def flies_a_sortie(view: FleetView) -> list[Directive]:
+    sortie.fly("track_target", {"duration_s": 1})
+    return []
+
+
 def hides_it(view: FleetView) -> list[Directive]:
     try:
         return looks_at_the_clock(view)
@@ -309,15 +319,16 @@ def holds_the_fleet(gate: Gate) -> Policy:
         (throws_numpys_dice, "numpy.random"),
         (imports_the_fleet, "sortie.fleet.gate"),
         (hides_it, "time"),
+        (flies_a_sortie, "sortie.sim.engine.sortie"),
         (holds_the_fleet(Gate()), "sortie.fleet.gate.gate"),
         (functools.partial(looks_at_the_clock), "time"),
     ],
     ids=lambda p: getattr(p, "__name__", ""),
 )
 def test_a_policy_that_reaches_elsewhere_is_caught(policy: Policy, what: str) -> None:
-    with pytest.raises(Reached, match=rf"^reaches for {what}, which is not in its view$"):
+    with pytest.raises(Reached, match=rf"^uses {what}, which is not in its view$"):
         confined(policy)(FLEET)
-    assert RULES["reads only its view"](policy, FLEET) == f"reaches for {what}, which is not in its view"
+    assert RULES["reads only its view"](policy, FLEET) == f"uses {what}, which is not in its view"
 
 
 def remembers(view: FleetView) -> list[Directive]:
@@ -326,7 +337,7 @@ def remembers(view: FleetView) -> list[Directive]:
 
 
 def test_memory_between_calls_is_caught() -> None:
-    assert RULES["same in, same out"](remembers, FLEET) is not None
+    assert RULES["deterministic"](remembers, FLEET) is not None
 
 
 # --- 5: damping and idempotence ------------------------------------------------------------------
@@ -378,3 +389,7 @@ def test_a_replayed_descriptor_is_refused() -> None:
     inbox = Inbox()
     assert isinstance(inbox.accept(open_datagram(datagram, KEYS)), Descriptor)
     assert inbox.accept(open_datagram(datagram, KEYS)) == "replayed"
+
+
+def test_a_policy_may_use_the_types_of_the_public_api() -> None:
+    assert confined(uses_the_api)(FLEET) == uses_the_api(FLEET)

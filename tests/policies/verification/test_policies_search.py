@@ -95,7 +95,7 @@ def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Calla
     ],
 )
 def test_whoever_looks_into_the_text_of_a_number_is_refused(look: Callable[[object], object]) -> None:
-    with pytest.raises(Refused, match="looks into the text of charge, which is for reasons alone"):
+    with pytest.raises(Refused, match="uses the text of charge for more than a reason"):
         list(explore(lambda p: look(p.number("charge", 0.0, 1.0))))
 
 

@@ -115,7 +115,9 @@ def test_rules_that_contradict_each_other_leave_the_decision_and_say_so() -> Non
 
 @pytest.mark.parametrize("function", ["sum_links(rate_hz) <= 5", "count_links(rate_hz > 1) <= 2", "every_link(roi)"])
 def test_sums_and_counts_are_refused_where_the_shield_is_made(function: str) -> None:
-    with pytest.raises(InvariantError, match=r"a shield cannot keep \w+_links?\(…\), only prove it"):
+    with pytest.raises(
+        InvariantError, match=r"a shield cannot keep \w+_links?\(…\); `sortie verify` can only prove it"
+    ):
         shield(worked, parse(function))
 
 

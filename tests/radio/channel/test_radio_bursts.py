@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -12,12 +13,12 @@ from radio_flights import Hover
 
 from sortie.radio import Status
 from sortie.radio.channel.bursts import PairStates, bad_share, mean_loss, walk
-from sortie.scenarios.schema import Bursts, Radio
+from sortie.radio.settings import AirSettings, BurstSettings
 
-FLOWN = Bursts(good_to_bad=0.05, bad_to_good=0.28, step_s=0.1)
+FLOWN = BurstSettings(good_to_bad=0.05, bad_to_good=0.28, step_s=0.1)
 
 
-def states(config: Bursts, frames: int, n: int = 3, *, seed: int = 1, frame_s: float = 0.1) -> np.ndarray:
+def states(config: BurstSettings, frames: int, n: int = 3, *, seed: int = 1, frame_s: float = 0.1) -> np.ndarray:
     """[frames, n, n]: which pairs are bad."""
     pairs = PairStates(config, n, seed, 0, frame_s)
     out = []
@@ -49,9 +50,9 @@ def test_one_more_drone_changes_no_pair() -> None:
 
 
 def test_a_step_may_last_many_frames_or_less_than_one() -> None:
-    slow = states(FLOWN.model_copy(update={"step_s": 1.0}), 1000)
+    slow = states(replace(FLOWN, step_s=1.0), 1000)
     assert (slow.reshape(100, 10, 3, 3) == slow[::10, None]).all()
-    fast = states(FLOWN.model_copy(update={"step_s": 0.05}), 1000)
+    fast = states(replace(FLOWN, step_s=0.05), 1000)
     every = states(FLOWN, 1999, frame_s=0.1)  # the same chain, seen at every step
     assert (fast[:990] == every[0:1980:2]).all()
 
@@ -65,18 +66,23 @@ def test_a_walk_obeys_its_luck(p: float, r: float, u: list[float]) -> None:
 
 
 def test_the_mean_of_what_is_lost() -> None:
-    assert mean_loss(Bursts(good_to_bad=0.05, bad_to_good=0.2, loss_good=0.1, loss_bad=0.6)) == pytest.approx(0.2)
+    assert mean_loss(BurstSettings(good_to_bad=0.05, bad_to_good=0.2, loss_good=0.1, loss_bad=0.6)) == pytest.approx(
+        0.2
+    )
 
 
 def test_a_bad_pair_hears_no_descriptor_and_gets_no_sample() -> None:
-    flight = Hover(Radio(bursts=Bursts(good_to_bad=0.1, bad_to_good=0.2, step_s=0.1), shadowing_sigma_db=0.0), spread=0)
+    flight = Hover(
+        AirSettings(bursts=BurstSettings(good_to_bad=0.1, bad_to_good=0.2, step_s=0.1), shadowing_sigma_db=0.0),
+        spread=0,
+    )
 
     def tick(frame: int) -> None:
         flight.publish(0)
         flight.send(0, 1, 5000, kind=f"{frame}")
 
     flight.fly(200.0, tick)
-    bad = states(Bursts(good_to_bad=0.1, bad_to_good=0.2, step_s=0.1), 2000, 2)[:, 0, 1]
+    bad = states(BurstSettings(good_to_bad=0.1, bad_to_good=0.2, step_s=0.1), 2000, 2)[:, 0, 1]
     heard = np.array([bool(ids) for _, _, ids in flight.heard])
     came = np.array([r.status is Status.DELIVERED for r in flight.rows])
     assert (heard == ~bad[: len(heard)]).all()
@@ -86,7 +92,7 @@ def test_a_bad_pair_hears_no_descriptor_and_gets_no_sample() -> None:
 
 def test_retries_pay_for_a_loss_at_each_try() -> None:
     def airtime_s(loss: float) -> float:
-        config = Radio(bursts=Bursts(loss_good=loss), shadowing_sigma_db=0.0)
+        config = AirSettings(bursts=BurstSettings(loss_good=loss), shadowing_sigma_db=0.0)
         flight = Hover(config).fly(0.1)
         flight.send(0, 1, 100_000)
         flight.env.run(until=1.0)

@@ -19,7 +19,7 @@ from sortie.radio.rates import (
     rate_table,
     rescale,
 )
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 
 def step(channel: Channel, *args: object) -> np.ndarray:
@@ -52,7 +52,7 @@ def test_noise_floor(bandwidth_mhz: int, dbm: float) -> None:
 
 
 def test_snr_without_shadowing_is_the_link_budget() -> None:
-    channel = Channel(Radio(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
+    channel = Channel(AirSettings(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
     snr = step(channel)
     assert snr[0, 1] == pytest.approx(20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - noise_dbm(80, 7.0))
     assert np.isnan(np.diag(snr)).all()
@@ -62,7 +62,7 @@ def test_snr_without_shadowing_is_the_link_budget() -> None:
 
 
 def test_a_jammer_adds_its_received_power_to_the_noise() -> None:
-    channel = Channel(Radio(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
+    channel = Channel(AirSettings(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
     clear = step(channel)
     where = (20.0, 50.0, 60.0)
     received = [20.0 - float(log_distance_loss_db(d, 5.2, 2.1)) for d in (np.hypot(20, 50), 50.0)]
@@ -73,7 +73,7 @@ def test_a_jammer_adds_its_received_power_to_the_noise() -> None:
 
 
 def _shadowing(frames: int) -> np.ndarray:
-    channel = Channel(Radio(), still(CROSS_M), 3, 0, 0.1)
+    channel = Channel(AirSettings(), still(CROSS_M), 3, 0, 0.1)
     rows = []
     for _ in range(frames):
         channel.advance()
@@ -82,7 +82,7 @@ def _shadowing(frames: int) -> np.ndarray:
 
 
 def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> None:
-    channel = Channel(Radio(), still(CROSS_M), 3, 0, 0.1)
+    channel = Channel(AirSettings(), still(CROSS_M), 3, 0, 0.1)
     channel.advance()
     channel.advance()
     np.testing.assert_array_equal(channel.shadow_db, channel.shadow_db.T)
@@ -93,7 +93,7 @@ def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> N
 
 
 def test_fading_is_rician_in_mean_and_outage() -> None:
-    channel = Channel(Radio(rician_k_db=8.0), still(CROSS_M), 3, 0, 0.1)
+    channel = Channel(AirSettings(rician_k_db=8.0), still(CROSS_M), 3, 0, 0.1)
     gains = []
     for _ in range(4000):
         channel.advance()
@@ -109,18 +109,18 @@ def test_fading_is_rician_in_mean_and_outage() -> None:
 
 
 def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None:
-    five, six = Channel(Radio(), still(CROSS_M[:5]), 9, 2, 0.1), Channel(Radio(), still(CROSS_M), 9, 2, 0.1)
+    five, six = Channel(AirSettings(), still(CROSS_M[:5]), 9, 2, 0.1), Channel(AirSettings(), still(CROSS_M), 9, 2, 0.1)
     for _ in range(1100):  # past the first block of draws
         a, b = step(five), step(six)
         np.testing.assert_array_equal(a, b[:5, :5])
         np.testing.assert_array_equal(five.fade_db, six.fade_db[:5, :5])
         np.testing.assert_array_equal(five.group_reach_bytes, six.group_reach_bytes[:5, :5])
-    other = Channel(Radio(), still(CROSS_M[:5]), 9, 3, 0.1)
+    other = Channel(AirSettings(), still(CROSS_M[:5]), 9, 3, 0.1)
     assert not np.array_equal(step(other), a, equal_nan=True)
 
 
 def test_group_frames_arrive_as_often_as_their_per_says() -> None:
-    config = Radio(shadowing_sigma_db=0.0, rician_k_db=40.0)
+    config = AirSettings(shadowing_sigma_db=0.0, rician_k_db=40.0)
     channel = Channel(config, still(CROSS_M[:2]), 1, 0, 0.1)
     loss_db = 20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) + 0.94 - 0.1
     extra = np.full((2, 2), loss_db)  # leaves 0.1 dB above s50 in the primary 20 MHz
@@ -139,7 +139,7 @@ def test_group_frames_arrive_as_often_as_their_per_says() -> None:
 
 
 def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:
-    clear, disturbed = (Channel(Radio(), still(CROSS_M), 4, 0, 0.1) for _ in range(2))
+    clear, disturbed = (Channel(AirSettings(), still(CROSS_M), 4, 0, 0.1) for _ in range(2))
     for frame in range(30):
         expected = step(clear)
         if frame % 3 == 1:
@@ -154,7 +154,7 @@ def test_a_flight_of_many_blocks_is_one_flight() -> None:
     """Blocks hold fewer frames the more drones there are; a drone far off changes nothing but their length."""
     path = np.cumsum(np.full((2100, 2, 3), 0.01), axis=0) + CROSS_M[:2]
     crowd = np.concatenate([path, np.full((2100, 22, 3), 5000.0)], axis=1)
-    two, many = Channel(Radio(), path, 1, 0, 0.1), Channel(Radio(), crowd, 1, 0, 0.1)
+    two, many = Channel(AirSettings(), path, 1, 0, 0.1), Channel(AirSettings(), crowd, 1, 0, 0.1)
     for _ in range(2100):
         np.testing.assert_array_equal(step(two), step(many)[:2, :2])
 
@@ -163,7 +163,7 @@ def test_a_flight_of_many_blocks_is_one_flight() -> None:
 @pytest.mark.parametrize("antenna", ["isotropic", "dipole"])
 def test_a_flight_that_goes_another_way_is_as_if_it_had_been_planned(distance_m: float | None, antenna: str) -> None:
     """From the next frame on; what is drawn stays, within a block and across its end."""
-    config = Radio.model_validate({"shadowing_distance_m": distance_m, "antenna": antenna})
+    config = AirSettings(**{"shadowing_distance_m": distance_m, "antenna": antenna})
     planned = still(CROSS_M, 1300)
     other = planned.copy()
     other[700:, 2] += np.linspace(0, 40, 600)[:, None] * np.array([0.6, 0.8, 0.1])
@@ -182,14 +182,14 @@ def test_a_flight_that_goes_another_way_is_as_if_it_had_been_planned(distance_m:
 
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(frames, drones, 3\)"):
-        Channel(Radio(), np.zeros((3, 3)), 1, 0, 0.1)
+        Channel(AirSettings(), np.zeros((3, 3)), 1, 0, 0.1)
     with pytest.raises(ValueError, match=r"positions_m has shape \(9, 0, 3\), must be \(frames, drones, 3\)"):
-        Channel(Radio(), np.zeros((9, 0, 3)), 1, 0, 0.1)
+        Channel(AirSettings(), np.zeros((9, 0, 3)), 1, 0, 0.1)
     with pytest.raises(ValueError, match="positions_m holds a value that is not finite"):
-        Channel(Radio(), np.full((9, 2, 3), np.nan), 1, 0, 0.1)
+        Channel(AirSettings(), np.full((9, 2, 3), np.nan), 1, 0, 0.1)
     with pytest.raises(ValueError, match=r"frame_s is 0\.0, must be > 0"):
-        Channel(Radio(), np.zeros((9, 1, 3)), 1, 0, 0.0)
-    channel = Channel(Radio(), np.zeros((1, 2, 3)), 1, 0, 0.1)
+        Channel(AirSettings(), np.zeros((9, 1, 3)), 1, 0, 0.0)
+    channel = Channel(AirSettings(), np.zeros((1, 2, 3)), 1, 0, 0.1)
     with pytest.raises(ValueError, match=r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"):
         channel.advance(np.zeros((3, 3)))
     with pytest.raises(IndexError, match="the flight has 1 frames"):

@@ -16,7 +16,7 @@ from sortie.radio.channel.large_fleet import EPOCH
 from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, path_loss_db, range_m, two_ray_loss_db
 from sortie.radio.channel.shadowing import ShadowField, gauss_markov
 from sortie.radio.channel.snr import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 # --- two rays ------------------------------------------------------------------------------------------
 
@@ -68,7 +68,7 @@ def test_the_reflection_is_the_sum_of_two_phasors() -> None:
 
 @given(st.sampled_from(["log_distance", "free_space", "two_ray"]), st.floats(60.0, 160.0))
 def test_beyond_the_range_no_model_loses_less(model: str, loss_db: float) -> None:
-    config = Radio(path_loss=model)
+    config = AirSettings(path_loss=model)
     far = range_m(config, loss_db) * np.geomspace(1.0, 30.0, 200)
     assert (path_loss_db(config, far, np.full(200, 7.0), np.full(200, 3.0)) >= loss_db - 1e-9).all()
 
@@ -90,7 +90,7 @@ def test_an_airframe_that_banks_turns_its_antenna_away() -> None:
     up[:, :, 2] = 1.0
     up[1, 0] = [np.sin(np.radians(30)), 0.0, np.cos(np.radians(30))]  # rolls toward the east, where the other is
     up[2, 0] = [0.0, np.sin(np.radians(30)), np.cos(np.radians(30))]  # pitches across: still broadside
-    config = Radio(shadowing_sigma_db=0.0, antenna="dipole")
+    config = AirSettings(shadowing_sigma_db=0.0, antenna="dipole")
     channel = Channel(config, still(CROSS_M[:2], 3), 1, 0, 0.1, up)
     snr = []
     for _ in range(3):
@@ -108,7 +108,7 @@ def test_an_airframe_that_banks_turns_its_antenna_away() -> None:
 def test_a_dipole_hardly_hears_a_jammer_below_it() -> None:
     heard = {}
     for antenna in ("isotropic", "dipole"):
-        channel = Channel(Radio(shadowing_sigma_db=0.0, antenna=antenna), still(CROSS_M[:2]), 1, 0, 0.1)
+        channel = Channel(AirSettings(shadowing_sigma_db=0.0, antenna=antenna), still(CROSS_M[:2]), 1, 0, 0.1)
         channel.advance()
         clear = channel.snr_db[1, 0]
         channel.advance(None, [((0.0, 0.0, 0.0), 50.0)])
@@ -158,7 +158,7 @@ def test_shadowing_is_normal_symmetric_and_shared_between_neighbours() -> None:
 
 
 def test_the_channel_takes_its_shadowing_from_the_field() -> None:
-    config = Radio(shadowing_distance_m=30.0)
+    config = AirSettings(shadowing_distance_m=30.0)
     five, six = Channel(config, still(CROSS_M[:5]), 9, 2, 0.1), Channel(config, still(CROSS_M), 9, 2, 0.1)
     for _ in range(3):
         five.advance()
@@ -171,7 +171,7 @@ def test_the_channel_takes_its_shadowing_from_the_field() -> None:
 
 # --- large fleets ----------------------------------------------------------------------------------------
 
-NEAR = Radio(tx_power_dbm=0.0, path_loss_exponent=3.0)
+NEAR = AirSettings(tx_power_dbm=0.0, path_loss_exponent=3.0)
 
 
 def _wide_fleet(n: int, frames: int = 70) -> np.ndarray:
@@ -232,7 +232,7 @@ def test_nothing_out_of_earshot_would_have_been_heard() -> None:
 def test_links_by_counter_have_the_distributions_of_those_by_stream() -> None:
     n = SQUARE + 16
     place = np.random.default_rng(1).random((n, 3)) * 30.0
-    channel = Channel(Radio(rician_k_db=6.0), still(place, 640), 4, 0, 0.1)
+    channel = Channel(AirSettings(rician_k_db=6.0), still(place, 640), 4, 0, 0.1)
     fades, shadows = [], []
     for _ in range(640):
         channel.advance()
@@ -284,6 +284,6 @@ def test_every_pair_in_range_is_listed_both_ways() -> None:
 
 def test_broken_attitudes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"up has shape \(4, 2, 2\), must be \(4, 2, 3\), as positions_m"):
-        Channel(Radio(), np.zeros((4, 2, 3)), 1, 0, 0.1, np.zeros((4, 2, 2)))
+        Channel(AirSettings(), np.zeros((4, 2, 3)), 1, 0, 0.1, np.zeros((4, 2, 2)))
     with pytest.raises(ValueError, match="up holds a value that is not finite"):
-        Channel(Radio(), np.zeros((4, 2, 3)), 1, 0, 0.1, np.full((4, 2, 3), np.inf))
+        Channel(AirSettings(), np.zeros((4, 2, 3)), 1, 0, 0.1, np.full((4, 2, 3), np.inf))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from radio_flights import Hover, trace
 
 from sortie.radio import Status
 from sortie.radio.channel.traces import read_links
-from sortie.scenarios.schema import Bursts, Radio
+from sortie.radio.settings import AirSettings, BurstSettings
 from sortie.scenarios.traces import TraceError
 
 
@@ -71,7 +72,7 @@ def test_a_trace_has_ends_and_a_quality(tmp_path: Path) -> None:
 
 
 def test_a_traced_snr_replaces_the_models_and_events_act_on_it(tmp_path: Path) -> None:
-    flight = Hover(Radio(trace=trace(tmp_path, "0,0,1,12,,", "10,0,1,22,,")), n=3)
+    flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,12,,", "10,0,1,22,,")), n=3)
     seen = []
 
     def tick(frame: int) -> None:
@@ -80,13 +81,13 @@ def test_a_traced_snr_replaces_the_models_and_events_act_on_it(tmp_path: Path) -
 
     flight.fly(10.0, tick)
     assert [s[0, 1] for s in seen[::25]] == pytest.approx([12.0, 14.5, 17.0 - 5.0, 19.5])
-    plain = Hover(Radio(), n=3)
+    plain = Hover(AirSettings(), n=3)
     plain.fly(10.0, lambda frame: None)
     assert seen[-1][1, 0] == plain.air.snr_db[1, 0]  # nobody traced the way back
 
 
 def test_a_traced_goodput_is_what_a_link_carries(tmp_path: Path) -> None:
-    flight = Hover(Radio(trace=trace(tmp_path, "0,0,1,,,24")))
+    flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,,,24")))
     flight.fly(10.0, lambda frame: flight.send(0, 1, 150_000, kind=f"{frame}"))
     took_s = [r.t_done_s - r.t_start_s for r in flight.rows if r.status is Status.DELIVERED]
     assert np.mean(took_s) == pytest.approx(150_000 * 8 / 24e6, rel=0.03)
@@ -94,7 +95,7 @@ def test_a_traced_goodput_is_what_a_link_carries(tmp_path: Path) -> None:
 
 
 def test_no_goodput_is_no_link(tmp_path: Path) -> None:
-    flight = Hover(Radio(trace=trace(tmp_path, "0,0,1,,,0")))
+    flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,,,0")))
 
     def tick(frame: int) -> None:
         flight.send(0, 1, 1000)
@@ -106,8 +107,8 @@ def test_no_goodput_is_no_link(tmp_path: Path) -> None:
 
 
 def test_a_traced_loss_replaces_fading_and_bursts(tmp_path: Path) -> None:
-    config = Radio(
-        trace=trace(tmp_path, "0,0,1,,0.25,"), bursts=Bursts(good_to_bad=1.0, bad_to_good=0.01), tx_power_dbm=-20
+    config = AirSettings(
+        trace=trace(tmp_path, "0,0,1,,0.25,"), bursts=BurstSettings(good_to_bad=1.0, bad_to_good=0.01), tx_power_dbm=-20
     )
     flight = Hover(config, n=3)
     flight.fly(400.0, lambda frame: flight.publish(0))
@@ -117,11 +118,11 @@ def test_a_traced_loss_replaces_fading_and_bursts(tmp_path: Path) -> None:
 
 
 def test_descriptors_on_a_traced_snr_fade_as_the_models_do(tmp_path: Path) -> None:
-    config = Radio(tx_power_dbm=-15.0, noise_figure_db=12.0, shadowing_sigma_db=0.0)
+    config = AirSettings(tx_power_dbm=-15.0, noise_figure_db=12.0, shadowing_sigma_db=0.0)
     model = Hover(config)
     model.fly(300.0, lambda frame: model.publish(0))
     snr_db = float(model.air.snr_db[0, 1])
-    traced = Hover(config.model_copy(update={"trace": trace(tmp_path, f"0,0,1,{snr_db},,")}))
+    traced = Hover(replace(config, trace=trace(tmp_path, f"0,0,1,{snr_db},,")))
     traced.fly(300.0, lambda frame: traced.publish(0))
     shares = [np.mean([bool(ids) for _, _, ids in f.heard]) for f in (model, traced)]
     assert 0.2 < shares[0] < 0.95

@@ -10,7 +10,7 @@ from radio_examples import CROSS_M, still
 from sortie.radio import Air, Transmission
 from sortie.radio.mac.rate_control import INTERVAL_S, KEEP, Minstrel
 from sortie.radio.rates import STANDARDS, rate_table
-from sortie.scenarios.schema import Radio
+from sortie.radio.settings import AirSettings
 
 RATES = STANDARDS["ax"].rates_mbps[80]
 TABLE = rate_table(80, 12.0, 1494)
@@ -98,7 +98,7 @@ def test_links_draw_from_streams_of_their_own() -> None:
 
 def _delivered(control: str, loss_db: float) -> list[Transmission]:
     env = simpy.Environment()
-    config = Radio(rate_control=control, shadowing_sigma_db=0.0)
+    config = AirSettings(rate_control=control, shadowing_sigma_db=0.0)
     air = Air(env, config, still(CROSS_M[:2]), seed=1, frame_s=0.1)
     rows: list[Transmission] = []
 

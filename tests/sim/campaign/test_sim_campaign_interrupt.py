@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from campaign_examples import CAMPAIGN, CLUSTER, write
+from campaign_examples import CAMPAIGN, CLUSTER, rows_on_disk, write
 
 from sortie.sim.campaign import engine as engines
 from sortie.sim.campaign.engine import open_engine
@@ -42,7 +42,7 @@ def test_ctrl_c_is_one_line_and_leaves_nothing_running(tmp_path: Path, workers: 
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     ) as driver:
-        while not any(file.stat().st_size for file in folder.glob("journal/*.jsonl")):
+        while rows_on_disk(folder) == 0:
             assert driver.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.01)

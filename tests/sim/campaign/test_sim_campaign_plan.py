@@ -12,6 +12,8 @@ from campaign_examples import BASE, CAMPAIGN, plan, write
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import ScenarioError
+from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.work import number, unpack
 from sortie.sim.folders import RunError
@@ -88,6 +90,24 @@ def test_the_base_the_code_and_a_policys_file_change_the_key(tmp_path: Path) -> 
     first = plan(tmp_path, text)
     policy.write_text("def decide(view):\n    return [] # otherwise\n")
     assert plan(tmp_path, text).key(0) != first.key(0)
+
+
+def test_a_module_that_a_policy_imports_is_part_of_what_is_flown(tmp_path: Path) -> None:
+    """An edit of it between two halves of a campaign must not put rows of two codes into one table."""
+    (tmp_path / "mine.py").write_text("def decide(view):\n    from deep import answer\n    return answer(view)\n")
+    (tmp_path / "deep.py").write_text("from deeper import nothing\n\n\ndef answer(view):\n    return nothing()\n")
+    (tmp_path / "deeper.py").write_text("def nothing():\n    return []\n")
+    text = CAMPAIGN.replace("worked", "'mine.py:decide'")
+    before = plan(tmp_path, text)
+    assert set(before.spec["files"]) == {str(tmp_path / f"{name}.py") for name in ("mine", "deep", "deeper")}
+    with open_engine() as engine:
+        run_campaign(before, tmp_path / "out", engine)
+    (tmp_path / "deeper.py").write_text("def nothing():\n    return [] # otherwise\n")
+    after = plan(tmp_path, text)
+    assert after.digest != before.digest
+    assert after.key(0) != before.key(0)
+    with open_engine() as engine, pytest.raises(RunError, match=r"its files\..*deeper\.py differs"):
+        run_campaign(after, tmp_path / "out", engine)
 
 
 def test_the_plan_survives_its_json(tmp_path: Path) -> None:
@@ -172,7 +192,7 @@ def test_the_plan_survives_its_json(tmp_path: Path) -> None:
             "base: base.yaml", "base: link_battery",
             "3: base: link_battery, must be a scenario, it is a campaign itself",
         ),
-        ("base: base.yaml", "base: contexts", "3: base: contexts, must be a scenario, it is a set of contexts"),
+        ("base: base.yaml", "base: conditions", "3: base: conditions, must be a scenario, it is a set of conditions"),
         (
             "fleet.formation.spacing_m:", "mission.phases.3.at_s:",
             "6: mission.phases.3: no such entry, mission.phases has 0 … 0",

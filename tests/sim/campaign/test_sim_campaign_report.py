@@ -14,14 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import CampaignRows, figures, find_row, judged, read_rows, sign
+from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, sign, winner_metrics
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
-from sortie.sim.campaign.winners import contexts, rule, winner
+from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
@@ -71,7 +72,7 @@ def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
 
     rows = rows_of(tmp_path, text, value)
     assert winner(rows, "bytes.data_sent") == "worked"
-    (found,) = contexts(rows, "bytes.data_sent")
+    (found,) = other_winners(rows, "bytes.data_sent")
     assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", True)
     assert found.part.startswith("0.2")
     made = rule(rows, "bytes.data_sent")
@@ -84,7 +85,7 @@ def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
 def test_where_nothing_flips_no_rule_gains(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     rows = rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 80}"), lambda f, p: p + rng.normal(0, 0.1))
-    assert contexts(rows, "bytes.data_sent") == []
+    assert other_winners(rows, "bytes.data_sent") == []
     made = rule(rows, "bytes.data_sent")
     assert made is None or made.gain.low <= 0
 
@@ -96,6 +97,7 @@ def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
     figures = _saltelli(3, y)
     assert figures[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.03)
     assert figures[:, 2] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.03)
+    assert np.array_equal(_saltelli(3, y), figures)  # its bootstrap draws the same each time
 
 
 def test_morris_of_a_plane_is_its_slopes() -> None:
@@ -175,7 +177,7 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     soc = [p.varied(2 * u)["fleet.battery.initial_soc"] for u in range(6)]
     assert means[:, 0] == pytest.approx([10 + s for s in soc])
     assert means[:, 1] == pytest.approx(soc)
-    assert find_row(folder, 3)["error"] == "ValueError: planted"
+    assert find_row(folder, 3)[1]["error"] == "ValueError: planted"
     with pytest.raises(RunError, match=r"--run 48: .* has runs 0 … 47"):
         find_row(folder, 48)
     assert pq.read_table(folder / "runs").num_rows == 48
@@ -276,15 +278,15 @@ def test_what_is_better_of_a_metric(metric: str, better: int) -> None:
 
 
 def test_a_winner_is_told_by_what_is_known_to_be_better() -> None:
-    assert judged(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
-    assert judged(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
-    assert judged(["policies.changes"]) == []
+    assert winner_metrics(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
+    assert winner_metrics(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
+    assert winner_metrics(["policies.changes"]) == []
 
 
 def test_figures_of_an_interval_share_their_prefix() -> None:
-    assert figures(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
-    assert figures(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
-    assert figures(math.nan, 12.0) == ["–", "12"]
+    assert prefixed(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
+    assert prefixed(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
+    assert prefixed(math.nan, 12.0) == ["–", "12"]
 
 
 def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:

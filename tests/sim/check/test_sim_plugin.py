@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.checking import check_scenario
+from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import check, limit
-from sortie.sim.check.golden import golden_path, moved, write_golden
-from sortie.sim.check.plugin import is_scenario
+from sortie.sim.check.golden import differences, golden_path, write_golden
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -107,8 +107,8 @@ def test_a_failure_tells_why_and_how_to_see_it(tmp_path: Path) -> None:
     checked = check_scenario(str(path))
     assert [v.holds for v in checked.verdicts] == [True, False]
     (failed,) = checked.failed
-    assert "payloads: " in failed.why
-    assert "decided because of " in failed.why
+    assert "payloads: " in failed.explanation
+    assert "decided because of " in failed.explanation
     assert checked.replay(checked.verdicts[0]) == f"sortie fly '{path}' --view"
 
 
@@ -131,7 +131,7 @@ def test_a_failure_over_replications_shows_the_worst_of_them(tmp_path: Path) -> 
     worst = int(np.argmax(flown))
     assert worst > 0, "else nothing is shown"
     assert failed.got.endswith(f" over 4, {flown[worst]:.6g} in replication {worst}")
-    assert "payloads: " in failed.why
+    assert "payloads: " in failed.explanation
     assert checked.replay(failed) == f"sortie fly {path} --replication {worst} --view"
 
 
@@ -176,10 +176,10 @@ def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
     path = tmp_path / "x.golden.json"
     result = {"a": 1.0, "b": {"c": [1, "x", None]}, "wall_s": 3.0}
     write_golden(path, result)
-    assert moved(path, {**result, "wall_s": 4.0}) == {}
-    assert moved(path, {**result, "a": 1.0000001}) == {}
-    assert moved(path, {**result, "a": 1.00001}) == {"a": (1.0, 1.00001)}
-    assert moved(path, {"a": 1.0, "b": {"c": [1, "y"]}, "d": 2}) == {
+    assert differences(path, {**result, "wall_s": 4.0}) == {}
+    assert differences(path, {**result, "a": 1.0000001}) == {}
+    assert differences(path, {**result, "a": 1.00001}) == {"a": (1.0, 1.00001)}
+    assert differences(path, {"a": 1.0, "b": {"c": [1, "y"]}, "d": 2}) == {
         "b.c.1": ("x", "y"),
         "b.c.2": (None, "nothing"),
         "d": ("nothing", 2),
@@ -187,7 +187,7 @@ def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
     text = json.loads(path.read_text())
     text["tolerance"]["relative"] = 0.01
     path.write_text(json.dumps(text))
-    assert moved(path, {**result, "a": 1.001}) == {}
+    assert differences(path, {**result, "a": 1.001}) == {}
     write_golden(path, {**result, "a": 2.0})
     assert json.loads(path.read_text())["tolerance"]["relative"] == 0.01
 
@@ -209,11 +209,11 @@ def test_a_broken_golden_outcome_is_named_and_replaced(tmp_path: Path, text: str
     path = tmp_path / "x.golden.json"
     path.write_text(text)
     with pytest.raises(RunError) as error:
-        moved(path, {"a": 1})
+        differences(path, {"a": 1})
     assert str(error.value) == f"{path}: no golden outcome: {what}"
     said = write_golden(path, {"a": 1})
     assert said == f"golden outcome written: {path}, in place of a broken file (no golden outcome: {what})"
-    assert moved(path, {"a": 1}) == {}
+    assert differences(path, {"a": 1}) == {}
 
 
 def test_another_sortie_than_the_files_own_is_never_its_golden_outcome(tmp_path: Path) -> None:
@@ -251,7 +251,11 @@ def test_a_golden_outcome_that_is_not_compared_is_skipped(tmp_path: Path) -> Non
         ("{name: x, fleet: {drones: 2}, expect: [{metric: switches, at_most: 9}]}", True),
         ('\ufeff# a note\n---\n{ "expect_decisions" : [],\n  "name" : x}', True),
         ('"name": x\n"expect": []', True),
-        ("{name: x, expect: [}", True),  # broken: told when it is collected
+        ("{name: x, expect: [}", True),  # broken: reported when it is collected
+        ("{name: x, fleet: {drones: ], expect: []}", True),
+        ("fleet: [\nname: x\nexpect: []", True),
+        ("services: {{ all }}\n  - {name: x, expect: 1}", False),  # a template
+        ("{services: [{name: x, expect: 1}}", False),
         ("{name: x}", False),
         ("{services: {name: x, expect: []}}", False),
         ("{expect: 1, services: [{name: x}]}", False),
@@ -268,6 +272,20 @@ def test_a_scenario_is_told_from_other_yaml(tmp_path: Path, text: str, is_one: b
     assert is_scenario(path) is is_one
     golden_path(path).write_text("{}")
     assert is_scenario(path) is (is_one or text == "{name: x}")
+
+
+def test_yaml_of_other_projects_loads_nothing_heavy(tmp_path: Path) -> None:
+    """The plugin runs in every project of whoever installed Sortie."""
+    (tmp_path / "some.yaml").write_text("services: [{name: x, expect: 1}]")
+    look = (
+        "import sys, pathlib; from sortie.sim.check.discovery import is_scenario\n"
+        "assert not is_scenario(pathlib.Path(sys.argv[1]))\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    command = [sys.executable, "-c", look, str(tmp_path / "some.yaml")]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert "yaml" in loaded
+    assert not {"torch", "numpy", "pyarrow", "pydantic", "simpy"} & set(loaded)
 
 
 def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:

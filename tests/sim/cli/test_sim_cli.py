@@ -151,7 +151,7 @@ def test_a_folder_that_may_not_be_replaced_is_told_before_anything_is_flown(
     def flown(*_: object, **__: object) -> None:
         raise AssertionError("flown")
 
-    monkeypatch.setattr("sortie.sim.cli.fly.run_sortie", flown)
+    monkeypatch.setattr("sortie.fly", flown)
     assert command("fly", scenario, "--no-recording", "--out", path) == 2
     assert "run: holds mynotes.txt, which no run wrote; choose another folder or move it" in capsys.readouterr().err
 

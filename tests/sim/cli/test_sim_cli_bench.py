@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import DENSITIES, Split
 from sortie.perception.geometry import FULL, SMALL
+from sortie.scenarios.errors import SortieError
 from sortie.sim.cli.app import app
 from sortie.sim.cli.bench import DensityName, RangeName, SplitName
-from sortie.sim.folders import RunError
 
 run = CliRunner()
 
@@ -56,7 +56,7 @@ def test_a_frame_is_drawn(folder: Path, tmp_path: Path) -> None:
 )
 def test_what_a_user_can_mend_is_one_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
     result = run.invoke(app, ["bench", *(str(folder) if a == "FOLDER" else a for a in arguments)])
-    assert isinstance(result.exception, RunError)
+    assert isinstance(result.exception, SortieError)
     assert message in str(result.exception)
 
 

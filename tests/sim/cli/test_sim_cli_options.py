@@ -20,15 +20,21 @@ def scenario(tmp_path: Path) -> Path:
     ("arguments", "message"),
     [
         (("view", ".", "--at", "3"), "--at goes with --picture"),
-        (("compare", "example.yaml", "--policies", "silence", "--by-torch"), "--by-torch goes with a set of contexts"),
         (
-            ("compare", "contexts", "--policies", "silence", "--seed", "0"),
+            ("compare", "example.yaml", "--policies", "silence", "--by-torch"),
+            "--by-torch goes with a set of conditions",
+        ),
+        (
+            ("compare", "conditions", "--policies", "silence", "--seed", "0"),
             "--seed goes with a scenario, not with a set",
         ),
-        (("compare", "contexts", "--policies", "silence", "--own-fusion"), "--own-fusion goes with a scenario"),
-        (("compare", "contexts", "--policies", "silence", "--recording", "c.rrd"), "--recording goes with a scenario"),
-        (("compare", "contexts", "--policies", "silence", "--readme", "c.md"), "--readme goes with a scenario"),
-        (("compare", "contexts", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
+        (("compare", "conditions", "--policies", "silence", "--own-fusion"), "--own-fusion goes with a scenario"),
+        (
+            ("compare", "conditions", "--policies", "silence", "--recording", "c.rrd"),
+            "--recording goes with a scenario",
+        ),
+        (("compare", "conditions", "--policies", "silence", "--readme", "c.md"), "--readme goes with a scenario"),
+        (("compare", "conditions", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
         (("compare", "example.yaml", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
         (
             ("compare", "example.yaml", "--policies", "silence", "--recording", "example.yaml/c.rrd"),
@@ -48,7 +54,10 @@ def scenario(tmp_path: Path) -> Path:
         (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
         (("fly", "--from-campaign", ".", "--run", "0", "--replication", "0"), "name nothing else"),
         (("fly", "link_battery"), "link_battery.yaml: is a campaign, not a scenario; its command is: sortie campaign"),
-        (("check", "contexts"), "contexts.yaml: is a set of contexts, not a scenario; its command is: sortie compare"),
+        (
+            ("check", "conditions"),
+            "conditions.yaml: is a set of conditions, not a scenario; its command is: sortie compare",
+        ),
         (
             ("paper", "--frame", "0", "--readme", "example.yaml"),
             "--readme goes with the whole report, not with --frame",

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from sortie.fleet.logs.flightlog import read_log
 from sortie.fleet.logs.logtrace import context_trace
 from sortie.fleet.traces import COLUMNS, read_traces
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
@@ -99,7 +100,7 @@ def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) 
         ([str(log), "--until", "9000"], "9000 s to fly, must be at most 7200"),
         ([str(log), "--until", "5", "--rate", "0.1"], "5.0 s at 0.1 rows a second are one row, must be two at least"),
     ):
-        with pytest.raises(RunError, match=said):
+        with pytest.raises(SortieError, match=said):
             CliRunner().invoke(app, ["import", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/notes.txt").write_text("keep")

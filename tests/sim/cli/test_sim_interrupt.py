@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from sim_examples import BASE
 
-from sortie.sim.cli import app, fly
+import sortie
+from sortie.sim.cli import app
 
 COMMAND = """
 import signal, sys
@@ -64,7 +65,7 @@ def test_while_a_sortie_flies(
 
     scenario = tmp_path / "example.yaml"
     scenario.write_text(BASE)
-    monkeypatch.setattr(fly, "run_sortie", flown)
+    monkeypatch.setattr(sortie, "fly", flown)
     monkeypatch.setattr(sys, "argv", ["sortie", "fly", str(scenario), "--out", str(tmp_path / "run")])
     with pytest.raises(SystemExit) as stop:
         app.app()

@@ -10,10 +10,10 @@ from rich.table import Table
 from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.scenarios.report_text import points
 from sortie.sim.check.expectations import Verdict
 from sortie.sim.cli.tables import transitions_table, verdict_table
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.numbers import points
 from sortie.sim.results.outcome import outcome
 
 REASON = "as in [roi] and [/roi]"
@@ -39,7 +39,9 @@ def test_brackets_in_a_policys_reason_are_brackets() -> None:
 
 
 def test_brackets_in_an_expectation_are_brackets() -> None:
-    verdict = Verdict(f"expected {REASON}", f"got {REASON}", False, f"because {REASON}", why=f"the record {REASON}")
+    verdict = Verdict(
+        f"expected {REASON}", f"got {REASON}", False, f"because {REASON}", explanation=f"the record {REASON}"
+    )
     said = printed(verdict_table("mine", [verdict]))
     for text in (f"expected {REASON}", f"got {REASON}", f"because {REASON}", f"the record {REASON}"):
         assert text in said

@@ -106,14 +106,14 @@ def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: p
     assert "rate_hz <= 4" in capsys.readouterr().out
     rules.write_text("rate_hz <=\n")
     assert command("verify", "worked", *QUICK, "--invariants", rules) == 2
-    assert "line 1, 'rate_hz <=': 'rate_hz <=' is no expression" in capsys.readouterr().err
+    assert "line 1, 'rate_hz <=': 'rate_hz <=' is not an expression" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["too_fast", "eager", "forgetful"])
 def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
     reference = f"{faulty}:{name}"
     policy = resolve(reference)
-    rule = {"too_fast": "bounds kept", "eager": "age-monotone", "forgetful": "one directive a link"}[name]
+    rule = {"too_fast": "bounds kept", "eager": "age-monotone", "forgetful": "one directive per link"}[name]
     view = next(v for v in draw_views(2, 200) if len(v.peers) == 3 and RULES[rule](policy, v) is not None)
     raised = raised_ages(policy, view) if name == "eager" else None
     assert shows_in_flight(replay_scenario(rule, "", reference, {}, view, raised_age_s=raised))

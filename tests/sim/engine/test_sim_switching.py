@@ -180,7 +180,7 @@ def test_counting_changes_nothing_but_the_count(base: SortieRecord) -> None:
 @pytest.mark.parametrize(
     ("invariant", "message"),
     [
-        ("rate_hz <=", r"policy\.invariants: line 1, 'rate_hz <=': 'rate_hz <=' is no expression"),
+        ("rate_hz <=", r"policy\.invariants: line 1, 'rate_hz <=': 'rate_hz <=' is not an expression"),
         ("sum_links(rate_hz) <= 5", r"policy\.invariants: .* a shield cannot keep sum_links"),
     ],
 )

@@ -78,7 +78,7 @@ def test_everything_at_once_keeps_the_ledger() -> None:
     left the packs."""
     scenario = example(
         "fleet.airframe={power_model: momentum, payload_kg: 0.4, air_density_kgpm3: 1.1}",
-        "fleet.battery={ambient_c: -5, cycles: 150, polarisation_mohm: 5, cutoff_cell_v: 2.0}",
+        "fleet.battery={ambient_c: -5, cycles: 150, polarisation: {resistance_mohm: 5}, cutoff_cell_v: 2.0}",
         "events=[{kind: cell_failure, at_s: 2, drone: 1}, {kind: battery_fault, at_s: 3, drone: 2, lost_fraction: 0.3}]",
     )
     record = run_sortie(scenario)

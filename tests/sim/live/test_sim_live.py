@@ -29,9 +29,9 @@ from sortie.sim.live import messages
 from sortie.sim.live.bus import LOOPBACK, Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
-from sortie.sim.live.node import opened
+from sortie.sim.live.node import open_descriptor
 from sortie.sim.live.result import LiveResult, overhead_rows
-from sortie.sim.live.sentences import changes_in_words
+from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import MAX_DRONES, fly_live
 
 DOMAIN = os.getpid() % 200 + 20
@@ -112,11 +112,11 @@ def test_a_descriptor_that_dds_filled_up_is_the_descriptor() -> None:
     cdr = encode_descriptor(said_by_hand())
     assert len(cdr) % 4 == 2
     for sample in (cdr, cdr + b"\0\0"):
-        found = opened(sample)
+        found = open_descriptor(sample)
         assert isinstance(found, Opened)
         assert found.descriptor == said_by_hand()._replace(stamp_ns=STAMP_NS)
-    assert isinstance(opened(cdr + b"\0\1"), Dropped)
-    assert isinstance(opened(cdr + bytes(4)), Dropped)
+    assert isinstance(open_descriptor(cdr + b"\0\1"), Dropped)
+    assert isinstance(open_descriptor(cdr + bytes(4)), Dropped)
 
 
 @pytest.mark.parametrize("content", [b"", b"abc", bytes(70_000)])
@@ -249,7 +249,7 @@ def test_a_killed_process_is_noticed_by_age_and_the_others_fly_on(flown: Flown) 
         assert "features" in {o.representation for o in other}
     assert [d.drone for d in result.each] == [0, 1, 2]
     assert result.each[0].published > result.each[2].published
-    assert "drone 2: its process was killed by SIGKILL" in changes_in_words(result)[0]
+    assert "drone 2: its process was killed by SIGKILL" in describe_changes(result)[0]
 
 
 def test_nobody_is_left_behind(flown: Flown) -> None:

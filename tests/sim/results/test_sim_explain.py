@@ -8,7 +8,7 @@ import pyarrow as pa
 from sim_examples import example
 
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.explain import why
+from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.outcome import outcome
 
 
@@ -19,6 +19,6 @@ def test_a_reason_keeps_its_figures() -> None:
     reasons = ["goodput 4.0 < 5 Mb/s"] + ["detached: descriptor 1.05 s old"] * (table.num_rows - 1)
     table = table.set_column(table.schema.get_field_index("reason"), "reason", pa.array(reasons))
     told = dataclasses.replace(record, tables={**record.tables, "directives": table})
-    assert why("switches", told, outcome(record)) == (
+    assert explain_metric("switches", told, outcome(record)) == (
         f"decided because of 'detached: descriptor 1.05 s old' ×{table.num_rows - 1}, 'goodput 4.0 < 5 Mb/s' ×1"
     )

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from sim_examples import example
 from typer.testing import CliRunner
 
+from sortie.scenarios.report_text import size
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results import report_figures, run_folder
-from sortie.sim.results.numbers import size
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report import page, save_page

@@ -1,4 +1,4 @@
-"""Policies over sets of contexts, and learning from training contexts."""
+"""Policies over sets of conditions, and learning from training conditions."""
 
 from __future__ import annotations
 
@@ -17,81 +17,89 @@ from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.catalogue.adaptive import ARMS, FEATURES, read_model
 from sortie.policies.registry import POLICIES
-from sortie.scenarios.reading.load import ScenarioError, context_sets, library, load_contexts
+from sortie.scenarios.reading.load import ScenarioError, condition_sets, library, load, load_conditions
 from sortie.scenarios.schema import Perception
-from sortie.scenarios.schema.conditions import Contexts
+from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import conditions as commands
 from sortie.sim.cli.app import main
 from sortie.sim.folders import RunError
 from sortie.sim.studies import learn
 from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
 from sortie.sim.studies.in_flight import torch_answers
-from sortie.sim.studies.learn import Lesson, draw_context, fit, save
+from sortie.sim.studies.learn import Lesson, draw_condition, fit, save
 
 SMALL = """
 base: track_target
 set: [perception.detector=surrogate, duration_s=3, "mission.phases=[{at_s: 0, phase: search}]", policy.dwell_s=0.3]
-contexts:
+conditions:
   - {name: poor, rho: 0.02}
   - {name: rich, rho: 0.25, set: [fleet.formation.shape=line]}
 """
 
 
-SETS = ("contexts", "contexts_second", "contexts_third", "contexts_fourth")
+SETS = ("conditions", "conditions_second", "conditions_third", "conditions_fourth")
 
 
-def held_out(name: str) -> Contexts:
-    contexts = load_contexts(name)
-    assert contexts is not None
-    return contexts
+def held_out(name: str) -> ConditionSet:
+    conditions = load_conditions(name)
+    assert conditions is not None
+    return conditions
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_the_held_out_contexts_load_under_every_policy_at_their_budget(name: str) -> None:
-    assert name in context_sets()
+def test_the_held_out_conditions_load_under_every_policy_at_their_budget(name: str) -> None:
+    assert name in condition_sets()
     assert name not in library()
-    contexts = held_out(name)
-    for context in contexts.contexts:
+    conditions = held_out(name)
+    for condition in conditions.conditions:
         for policy in POLICIES:
-            scenario = scenario_of(contexts, context, policy)
-            assert scenario.policy.params.get("rho", context.rho) == context.rho
-        assert (context.metric == "mission") == (scenario.mission.phases[0].phase == "track")
+            scenario = scenario_of(conditions, condition, policy)
+            assert scenario.policy.params.get("rho", condition.rho) == condition.rho
+        assert (condition.metric == "mission") == (scenario.mission.phases[0].phase == "track")
 
 
-def test_no_held_out_context_is_one_of_training_or_of_another_set() -> None:
-    for first, second in itertools.combinations([held_out(name).contexts for name in SETS], 2):
+def test_no_held_out_condition_is_one_of_training_or_of_another_set() -> None:
+    for first, second in itertools.combinations([held_out(name).conditions for name in SETS], 2):
         assert not {c.name for c in first} & {c.name for c in second}
         assert not {c.rho for c in first} & {c.rho for c in second}
-    for contexts, context in [(held_out(name), c) for name in SETS for c in held_out(name).contexts]:
-        scenario = scenario_of(contexts, context, "all-4")
-        assert context.rho not in learn.BUDGETS
+    for conditions, condition in [(held_out(name), c) for name in SETS for c in held_out(name).conditions]:
+        scenario = scenario_of(conditions, condition, "all-4")
+        assert condition.rho not in learn.BUDGETS
         assert scenario.fleet.formation.shape not in learn.SHAPES
         assert scenario.perception.scene.seed not in range(1000, 10**6)
         assert (scenario.radio.tx_power_dbm, scenario.radio.path_loss_exponent) != (5, 2.4), "training's weak links"
 
 
-def test_an_unknown_field_of_a_context_is_named(tmp_path: Path) -> None:
+def test_an_unknown_field_of_a_condition_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text(SMALL.replace("rho: 0.02", "rho: 2"))
-    with pytest.raises(ScenarioError, match=r"contexts\.0\.rho"):
-        load_contexts(path)
+    with pytest.raises(ScenarioError, match=r"conditions\.0\.rho"):
+        load_conditions(path)
     path.write_text(SMALL.replace("name: rich", "name: poor"))
     with pytest.raises(ScenarioError, match="'poor', must be named once"):
-        load_contexts(path)
+        load_conditions(path)
 
 
-def cell(policy: str, context: str, ap: float) -> Cell:
-    return Cell(policy, context, ap, 1e6, 1e3, 0.0)
+def test_the_old_key_is_named_with_its_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(SMALL.replace("conditions:", "contexts:"))
+    for read in (load_conditions, load):
+        with pytest.raises(ScenarioError, match=r"c\.yaml:4: contexts: unknown key, it is now called conditions"):
+            read(path)
 
 
-def test_gains_are_over_the_best_fixed_policy_and_the_oracle_takes_the_best_of_each_context() -> None:
+def cell(policy: str, condition: str, ap: float) -> Cell:
+    return Cell(policy, condition, ap, 1e6, 1e3, 0.0)
+
+
+def test_gains_are_over_the_best_fixed_policy_and_the_oracle_takes_the_best_of_each_condition() -> None:
     ap = {"all-4": (0.4, 0.2, 0.3), "best-2": (0.2, 0.3, 0.3), "learned": (0.5, 0.3, 0.4)}
     rows = summarise([cell(p, f"c{k}", a) for p, values in ap.items() for k, a in enumerate(values)])
     by_name = {r.policy: r for r in rows}
     assert best_fixed(rows) == "all-4"
     assert by_name["all-4"].gain == (0.0, 0.0, 0.0)
     assert by_name["learned"].gain[0] == pytest.approx(0.1)
-    assert by_name["learned"].gain[1:] == pytest.approx((0.1, 0.1)), "the same gain in every context"
+    assert by_name["learned"].gain[1:] == pytest.approx((0.1, 0.1)), "the same gain in every condition"
     assert by_name["learned"].of_oracle == pytest.approx(1.2 / 1.0)
     assert by_name["best-2"].gain[1] < 0 < by_name["best-2"].gain[2]
 
@@ -101,15 +109,15 @@ def test_gains_are_over_a_fixed_policy_also_where_another_is_as_good() -> None:
     assert best_fixed(rows) == "all-4"
 
 
-def test_a_context_without_a_car_counts_for_nothing() -> None:
+def test_a_condition_without_a_car_counts_for_nothing() -> None:
     """Its accuracy is undefined; before, the interval was too, and the best fixed policy was not found."""
     nan = float("nan")
     ap = {"all-4": (0.4, nan, 0.2), "best-2": (0.2, nan, nan), "boxes": (0.5, nan, 0.9)}
     rows = summarise([cell(p, f"c{k}", a) for p, values in ap.items() for k, a in enumerate(values)])
     assert [(r.policy, r.ap) for r in rows] == [("all-4", 0.4), ("best-2", 0.2), ("boxes", 0.5)]
     assert best_fixed(rows) == "all-4"
-    assert rows[2].gain == pytest.approx((0.1, nan, nan), nan_ok=True), "one context is left, which has no interval"
-    with pytest.raises(RunError, match="no context has an accuracy under every policy"):
+    assert rows[2].gain == pytest.approx((0.1, nan, nan), nan_ok=True), "one condition is left, which has no interval"
+    with pytest.raises(RunError, match="no condition has an accuracy under every policy"):
         summarise([cell("all-4", "c0", nan), cell("boxes", "c0", nan)])
 
 
@@ -119,15 +127,15 @@ def test_where_the_fixed_policies_find_nothing_there_is_no_share_of_them() -> No
     assert [r.gain[0] for r in rows] == [0.0, pytest.approx(0.1)]
 
 
-def test_contexts_without_a_detector_are_refused_before_anything_flies(tmp_path: Path) -> None:
+def test_conditions_without_a_detector_are_refused_before_anything_flies(tmp_path: Path) -> None:
     path = tmp_path / "small.yaml"
     path.write_text(SMALL.replace("detector=surrogate", "detector=none"))
-    contexts = load_contexts(path)
-    assert contexts is not None
+    conditions = load_conditions(path)
+    assert conditions is not None
     with pytest.raises(
-        RunError, match=r"context poor: perception\.detector is none, contexts are compared by accuracy"
+        RunError, match=r"condition poor: perception\.detector is none, conditions are compared by accuracy"
     ):
-        fly_all(contexts, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
+        fly_all(conditions, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
 
 
 def test_the_interval_of_a_known_mean() -> None:
@@ -137,7 +145,7 @@ def test_the_interval_of_a_known_mean() -> None:
     assert high == pytest.approx(0.196, abs=0.03)
 
 
-def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_prints_every_policy_over_the_conditions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, out = tmp_path / "small.yaml", tmp_path / "out.json"
     path.write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
@@ -154,7 +162,7 @@ def test_compare_prints_every_policy_over_the_contexts(tmp_path: Path, capsys: p
     assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
 
 
-def test_a_single_context_has_no_interval(
+def test_a_single_condition_has_no_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where the figure stood twice, it looked certain."""
@@ -192,19 +200,19 @@ class Seer:
     def camera_views(self, capture: Capture) -> None: ...
 
 
-def test_contexts_are_scored_by_torch_over_the_surrogates_traffic(
+def test_conditions_are_scored_by_torch_over_the_surrogates_traffic(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "small.yaml"
     path.write_text(SMALL)
-    contexts = load_contexts(path)
-    assert contexts is not None
-    ours = fly_all(contexts, ["all-4", "boxes"])
+    conditions = load_conditions(path)
+    assert conditions is not None
+    ours = fly_all(conditions, ["all-4", "boxes"])
     monkeypatch.setattr("sortie.perception.network.detector.TorchDetector", Seer)
-    theirs = fly_all(contexts, ["all-4", "boxes"], detector_of=torch_answers())
+    theirs = fly_all(conditions, ["all-4", "boxes"], detector_of=torch_answers())
     assert [c.data_bytes for c in theirs] == [c.data_bytes for c in ours]
     assert all(c.ap > 0.9 for c in theirs)
-    assert Seer.asked == 2 * 2 * 5 * 6  # policies, contexts, drones, moments
+    assert Seer.asked == 2 * 2 * 5 * 6  # policies, conditions, drones, moments
 
 
 def test_a_lesson_by_torch_asks_it_at_fewer_moments(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,11 +229,11 @@ def test_a_lesson_by_torch_asks_it_at_fewer_moments(monkeypatch: pytest.MonkeyPa
 
 def test_the_tables_fit_a_narrow_terminal() -> None:
     """As many policies side by side as there is room for; no figure is cut off."""
-    contexts = held_out("contexts")
+    conditions = held_out("conditions")
     policies = list(POLICIES)
-    cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in contexts.contexts]
-    tables = list(commands._by_context(contexts, policies, cells, 80))
-    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("context", "rho")] == policies
+    cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in conditions.conditions]
+    tables = list(commands._by_condition(conditions, policies, cells, 80))
+    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("condition", "rho")] == policies
     console = Console(width=80, record=True, file=io.StringIO())
     for table in tables:
         console.print(table)
@@ -237,10 +245,10 @@ def test_the_tables_fit_a_narrow_terminal() -> None:
 # --- learning ------------------------------------------------------------------------------------
 
 
-def test_training_contexts_are_drawn_from_their_streams() -> None:
-    first, rho = draw_context(0, 3)
-    again, same_rho = draw_context(0, 3)
-    other, _ = draw_context(0, 4)
+def test_training_conditions_are_drawn_from_their_streams() -> None:
+    first, rho = draw_condition(0, 3)
+    again, same_rho = draw_condition(0, 3)
+    other, _ = draw_condition(0, 4)
     assert (first, rho) == (again, same_rho)
     assert other != first
     assert rho in learn.BUDGETS

@@ -12,7 +12,7 @@ from sim_examples import BASE
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.model import SHIPPED
-from sortie.scenarios.reading.load import load, load_contexts
+from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import accuracy, both_matched
@@ -43,12 +43,12 @@ def test_regions_are_told_apart_and_those_without_a_disc_left_out() -> None:
     assert [(m.what, m.region) for m in means(both)] == [("all-4", "full_scene"), ("all-4", "mission")]
     assert next(m for m in means(both) if m.region == "mission").error == pytest.approx(
         (-0.1, np.nan, np.nan), nan_ok=True
-    ), "a single context has no interval"
+    ), "a single condition has no interval"
     assert not [m for m in means(levels("all-4", [0.3], [0.3])) if np.isnan(m.surrogate)]
 
 
-def test_gains_are_of_the_contexts_that_both_policies_saw_something_in() -> None:
-    """A policy that looks from elsewhere may have no car in a context's disc where another has one."""
+def test_gains_are_of_the_conditions_that_both_policies_saw_something_in() -> None:
+    """A policy that looks from elsewhere may have no car in a condition's disc where another has one."""
     first = levels("all-4", [0.3, 0.4, 0.5], [0.3, 0.4, 0.5])
     second = levels("vantage", [0.9, 0.5, 0.7], [0.9, 0.6, 0.7])
     gain = {m.what: m for m in means(first + second[1:])}["vantage − all-4"]
@@ -71,7 +71,7 @@ def test_the_torch_detector_is_asked_what_its_own_sortie_asks(tmp_path: Path) ->
     assert {r: v.surrogate for r, v in found.items()} == pytest.approx(accuracy(run_sortie(ours)))
 
 
-def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_set_is_flown_condition_by_condition_within_its_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the surrogate in the torch detector's place, so that both say the same."""
     flown = []
 
@@ -81,17 +81,17 @@ def test_a_set_is_flown_context_by_context_within_its_budgets(monkeypatch: pytes
 
     monkeypatch.setattr("sortie.sim.studies.in_flight.run_sortie", fly)
     told: list[tuple[str, int, int]] = []
-    found = list(flights("contexts", SHIPPED, None, 2.0, ["silence", "all-4"], lambda *at: told.append(at)))
-    contexts = load_contexts("contexts")
-    assert contexts is not None
-    assert told[-1] == ("contexts by both detectors", 2 * len(contexts.contexts), 2 * len(contexts.contexts))
-    assert flown[2:4] == [("all-4", contexts.contexts[0].rho, contexts.seeds[0])] * 2
-    assert {v.context for v in found} == {c.name for c in contexts.contexts}
+    found = list(flights("conditions", SHIPPED, None, 2.0, ["silence", "all-4"], lambda *at: told.append(at)))
+    conditions = load_conditions("conditions")
+    assert conditions is not None
+    assert told[-1] == ("conditions by both detectors", 2 * len(conditions.conditions), 2 * len(conditions.conditions))
+    assert flown[2:4] == [("all-4", conditions.conditions[0].rho, conditions.seeds[0])] * 2
+    assert {v.condition for v in found} == {c.name for c in conditions.conditions}
     assert all(v.torch == v.surrogate for v in found)
 
 
-def test_a_context_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Both are the surrogate here; each town is another, and a context's AP is that of all their fusions."""
+def test_a_condition_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Both are the surrogate here; each town is another, and a condition's AP is that of all their fusions."""
     (path := tmp_path / "example.yaml").write_text(BASE)
     flown: list[tuple[int, int, str]] = []
     records: list[SortieRecord] = []

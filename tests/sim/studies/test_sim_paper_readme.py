@@ -1,4 +1,4 @@
-"""The committed report and the README's results section are what the committed table renders to."""
+"""The committed reports and the pages of results are what the committed tables render to."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from sortie.perception.study import report as study
 from sortie.perception.study.figures import CAPTIONS
 from sortie.perception.study.measure import from_table
 from sortie.perception.study.plan import read_plan
+from sortie.sim.folders import replace_section
 from sortie.sim.studies import paper
 
 
-def test_the_repositorys_readme_is_what_its_committed_table_renders_to() -> None:
+def test_the_page_of_claims_is_what_its_committed_table_renders_to() -> None:
     table, facts = rows.read(ROOT / "docs" / "paper" / paper.TABLE)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert report.put_into(readme, report.short(table, facts, "docs/paper/README.md")) == readme
+    page = (ROOT / "docs" / "results" / "claims.md").read_text(encoding="utf-8")
+    assert replace_section(page, report.short(table, facts, "../paper/README.md"), report.BEGIN, report.END) == page
     text = (ROOT / "docs" / "paper" / paper.REPORT).read_text(encoding="utf-8")
     varied = [Varied(**row) for row in pq.read_table(ROOT / "docs" / "paper" / paper.VARIED).to_pylist()]
     assert text == report.report(table, facts, list(paper.FIGURES.items()), varied)
@@ -27,7 +28,7 @@ def test_the_repositorys_study_is_what_its_rows_render_to() -> None:
     folder = ROOT / "docs" / "study"
     rows = from_table(pq.read_table(folder / "study.parquet"))
     plan = read_plan()
-    readme = (ROOT / "README.md").read_text("utf-8")
-    section = study.short(plan, rows, "docs/study/README.md")
-    assert report.put_into(readme, section, study.BEGIN, study.END) == readme
+    page = (ROOT / "docs" / "results" / "flip.md").read_text("utf-8")
+    section = study.short(plan, rows, "../study/README.md")
+    assert replace_section(page, section, study.BEGIN, study.END) == page
     assert (folder / "README.md").read_text("utf-8") == study.report(plan, rows, list(CAPTIONS.items()))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from sortie.fleet.flight.formation import slots
+from sortie.scenarios.formation import slots
 
 GROWING = ["cross", "line", "wedge", "grid"]
 SHAPES = [*GROWING, "circle"]

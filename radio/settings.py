@@ -1,0 +1,104 @@
+"""The settings of the air as plain values: what `Air` and its parts need, with no scenario file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sortie.radio.rates import STANDARDS, StandardName
+
+_CHOICES = {
+    "standard": tuple(STANDARDS),
+    "antenna": ("isotropic", "dipole"),
+    "path_loss": ("log_distance", "free_space", "two_ray"),
+    "rate_control": ("ideal", "minstrel"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BurstSettings:
+    """Burst loss of each pair of drones: a good and a bad state, drawn step by step."""
+
+    good_to_bad: float = 0.0
+    """Probability a step that a good pair turns bad; 0: no bursts."""
+    bad_to_good: float = 0.28
+    """Probability a step that a bad pair turns good."""
+    step_s: float = 1.0
+    loss_good: float = 0.0
+    """Probability that a good pair loses a frame at a try, in addition to the losses that follow from the SNR."""
+    loss_bad: float = 1.0
+    """The same for a bad pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class AirSettings:
+    """Radio, channel and transport of a whole fleet.
+
+    Fields, units and defaults are those of a scenario's `radio` section. The exception is `framing`: there the caller
+    of `Air.send` decides, with `piece_bytes`. The section checks every bound; this class checks names and channel
+    widths only.
+
+    Raises:
+        ValueError: a field with a fixed set of values has another value.
+    """
+
+    standard: StandardName = "ax"
+    """802.11 generation, one spatial stream."""
+    carrier_ghz: float = 5.2
+    bandwidth_mhz: int = 80
+    """20, 40 or 80; 802.11n has no 80 MHz."""
+    tx_power_dbm: float = 20.0
+    """Transmit power, antenna gains included."""
+    noise_figure_db: float = 7.0
+    antenna: Literal["isotropic", "dipole"] = "isotropic"
+    path_loss: Literal["log_distance", "free_space", "two_ray"] = "log_distance"
+    path_loss_exponent: float = 2.1
+    """Exponent of `log_distance` beyond 1 m."""
+    ground_roughness_m: float = 0.05
+    """Standard deviation of the ground's height, for `two_ray`."""
+    shadowing_sigma_db: float = 3.5
+    shadowing_time_s: float = 4.5
+    """Correlation time of shadowing."""
+    shadowing_distance_m: float | None = None
+    """Correlation distance of shadowing; None: every pair has its own shadowing, correlated in time only."""
+    rician_k_db: float = 12.0
+    group_rate_mbps: float = 6.0
+    """Basic rate of group-addressed frames."""
+    rate_control: Literal["ideal", "minstrel"] = "ideal"
+    """`ideal` picks the rate by the SNR of the frame before, `minstrel` by statistics of acknowledged frames."""
+    retry_limit: int = 7
+    """MAC retries of a unicast frame."""
+    max_ampdu_frames: int = 64
+    """Frames that are aggregated into one A-MPDU."""
+    fragment_bytes: int = 1344
+    """Payload of a DDS fragment."""
+    relay_max_hops: int = 1
+    """Most hops of a payload's route; 1 sends directly."""
+    bursts: BurstSettings = BurstSettings()
+    trace: str | None = None
+    """CSV or Parquet file of links whose SNR, loss or goodput replaces the models' (`radio/channel/traces.py`)."""
+    heartbeat_s: float = 0.02
+    """Heartbeat period of the reliable writer."""
+    nack_delay_s: float = 0.005
+    """The reader's delay before it requests a repair."""
+
+    def __post_init__(self) -> None:
+        for name, allowed in _CHOICES.items():
+            self._check(name, allowed)
+        self._check("bandwidth_mhz", STANDARDS[self.standard].rates_mbps)
+
+    def _check(self, name: str, allowed: Iterable[object]) -> None:
+        value, choices = getattr(self, name), list(allowed)
+        if value not in choices:
+            raise ValueError(f"{name} is {value!r}, must be one of {choices}")
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> AirSettings:
+        """Settings from a mapping, such as a scenario's `radio` section; `bursts` is a mapping too.
+
+        Raises:
+            TypeError: an unknown name.
+            ValueError: see the class.
+        """
+        return cls(**{**values, "bursts": BurstSettings(**values.get("bursts", {}))})

@@ -1,0 +1,240 @@
+"""The public API: what it loads, what it gives, and what it says of wrong arguments."""
+
+from __future__ import annotations
+
+import doctest
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+import sortie
+from sortie import _api, _run
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+
+SHORT = {"duration_s": 2, "perception.detector": "none", "expect": [], "expect_decisions": []}
+SURROGATE = SHORT | {"perception.detector": "surrogate"}
+
+
+def quiet(view: sortie.FleetView) -> list[sortie.Directive]:
+    return [sortie.Directive(view.ego, peer, reason="quiet") for peer in view.peers]
+
+
+# --- what it loads -------------------------------------------------------------------------------
+
+
+def test_the_import_loads_nothing() -> None:
+    code = "import sys; before = set(sys.modules); import sortie; print(*sorted(set(sys.modules) - before))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "sortie" in loaded
+    assert {name.partition(".")[0] for name in loaded} <= {"sortie", "importlib", "typing", "_typing"} | set(
+        sys.stdlib_module_names
+    )
+
+
+def test_the_import_changes_nothing_in_a_process_of_somebody_else() -> None:
+    code = """
+import gc, os, random, signal, sys, threading
+import numpy as np
+
+def state():
+    return (gc.isenabled(), gc.get_threshold(), random.getstate(), np.random.get_state()[1].tolist(), os.getcwd(),
+            dict(os.environ), signal.getsignal(signal.SIGINT), threading.active_count(), np.geterr(), sys.path[:],
+            sys.getrecursionlimit())
+
+before = state()
+import sortie
+for name in sortie.__all__:
+    getattr(sortie, name)
+assert state() == before, "changed"
+assert "matplotlib" not in sys.modules and "torch" not in sys.modules and "rerun" not in sys.modules
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_everything_public_is_there_documented_and_listed() -> None:
+    assert sorted(sortie.__all__) == dir(sortie)
+    for name in sortie.__all__:
+        assert getattr(sortie, name).__doc__ or name == "__version__"
+    with pytest.raises(AttributeError, match="module 'sortie' has no attribute 'fyl'"):
+        sortie.fyl  # noqa: B018
+
+
+@pytest.mark.parametrize("module", [_api, _run], ids=lambda m: m.__name__)
+def test_the_examples_of_the_docstrings_run(module: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = {"sortie": sortie, "folder": tmp_path}
+    failed, tried = doctest.testmod(module, extraglobs=names, verbose=False)  # type: ignore[arg-type]
+    assert tried
+    assert not failed
+
+
+# --- what it gives -------------------------------------------------------------------------------
+
+
+def test_a_scenario_is_a_name_a_path_a_dict_or_a_scenario(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("name: mine\nduration_s: 5\n")
+    by_path, by_dict = sortie.load(path), sortie.load({"name": "mine", "duration_s": 5})
+    assert by_path == by_dict == sortie.load(by_dict) == sortie.load(str(path))
+    assert sortie.load(by_dict, {"fleet.drones": 3}).fleet.drones == 3
+    assert sortie.load(by_dict, ["fleet.drones=3"]) == sortie.load(by_dict, {"fleet.drones": 3})
+    assert sortie.load("track_target", {"fleet": {"drones": 3}}).fleet.drones == 3
+
+
+def test_a_run_is_the_engines_record() -> None:
+    run = sortie.fly("track_target", SHORT, seed=7)
+    record = run_sortie(sortie.load("track_target", SHORT), None, 7)
+    assert run.fingerprint == record.fingerprint
+    assert {k: v for k, v in run.outcome.items() if k not in WALL} == {
+        k: v for k, v in outcome(record).items() if k not in WALL
+    }
+    assert (run.scenario.name, run.policy, run.seed, run.replication) == ("track_target", "worked", 7, 0)
+    assert repr(run) == "<Run of track_target under worked, seed 7, 2 s>"
+
+
+WALL = {"wall_s", "realtime_factor", "policy_eval_us"}
+
+
+def test_metrics_are_the_outcomes_numbers_by_dotted_name() -> None:
+    run = sortie.fly("track_target", SURROGATE)
+    assert run.metrics["ap50.full_scene"] == run.outcome["ap50"]["full_scene"]
+    assert run.metrics["phases.0.data_rate_mbps"] == run.outcome["phases"][0]["data_rate_mbps"]
+    assert all(isinstance(v, int | float) and not isinstance(v, bool) for v in run.metrics.values())
+
+
+@pytest.mark.parametrize(
+    ("policy", "name"),
+    [(None, "worked"), ("silence", "silence"), ("best-2(rho=0.1)", "best-2"), (quiet, "quiet")],
+)
+def test_a_policy_is_a_name_with_parameters_or_a_callable(policy: object, name: str) -> None:
+    assert sortie.fly("track_target", SHORT, policy=policy).policy == name  # type: ignore[arg-type]
+
+
+def test_a_policy_flies_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import sortie\n\ndef decide(view):\n"
+        "    return [sortie.Directive(view.ego, peer, reason='quiet') for peer in view.peers]\n"
+    )
+    run = sortie.fly("track_target", SHORT, policy=f"{tmp_path}/mine.py:decide")
+    assert run.outcome["bytes"]["data_sent"] == 0
+
+
+def test_a_run_is_saved_and_read_back(tmp_path: Path) -> None:
+    run = sortie.fly("track_target", SHORT)
+    read = sortie.open_run(run.save(tmp_path / "a", recording=False))
+    assert read.path == tmp_path / "a"
+    assert read.fingerprint == run.fingerprint
+    assert json.loads((tmp_path / "a/outcome.json").read_text()) == read.outcome
+    assert not (tmp_path / "a/sortie.rrd").exists()
+    assert (run.save(tmp_path / "b") / "sortie.rrd").is_file()
+    assert "<html" in run.report(tmp_path / "a.html").read_text()[:200].lower()
+
+
+def test_a_comparison_has_a_row_a_sortie_and_says_what_its_intervals_cover() -> None:
+    one = sortie.compare("track_target", ["worked", quiet], SURROGATE)
+    assert isinstance(one.table, pa.Table)
+    assert one.table["policy"].to_pylist() == ["worked", "quiet"]
+    assert {gain.over for gain in one.gains} == {"instants of one sortie"}
+    three = sortie.compare("track_target", ["worked", quiet], SURROGATE, seeds=range(3))
+    assert three.table.select(["policy", "seed"]).to_pylist() == [
+        {"policy": policy, "seed": seed} for seed in range(3) for policy in ("worked", "quiet")
+    ]
+    (gain,) = three.gains
+    assert (gain.policy, gain.metric, gain.over) == ("quiet", "ap50.full_scene", "sorties")
+    assert gain.low <= gain.gain <= gain.high
+
+
+CAMPAIGN = """
+campaign: tiny
+base: track_target
+set: {duration_s: 1, perception.detector: none, mission.phases: [{at_s: 0, phase: search}]}
+policies: [worked, silence]
+vary:
+  fleet.drones: {kind: grid, values: [2, 3]}
+metrics: [bytes.data_sent]
+"""
+
+
+def test_a_campaign_gives_its_rows_and_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(CAMPAIGN)
+    done = sortie.campaign(tmp_path / "tiny.yaml", out=tmp_path / "c")
+    assert (done.finished, done.failed, done.flown) == (4, 0, 4)
+    assert done.rows.num_rows == 4
+    assert {row["policy"] for row in done.rows.to_pylist()} == {"worked", "silence"}
+    assert sortie.campaign(tmp_path / "tiny.yaml", out=tmp_path / "c").flown == 0
+
+
+def test_a_folder_is_checked_whole(tmp_path: Path) -> None:
+    text = (
+        "name: {}\nduration_s: 1\nperception: {{detector: none}}\nexpect: [{{metric: bytes.data_sent, at_least: {}}}]\n"
+    )
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "a.yaml").write_text(text.format("a", 0))
+    (tmp_path / "deep/b.yml").write_text(text.format("b", "1.0e+15"))
+    (tmp_path / "other.yaml").write_text("jobs: [build]\n")
+    a, b = sortie.check(tmp_path)
+    assert (len(a.failed), len(b.failed)) == (0, 1)
+
+
+def test_the_environment_steps() -> None:
+    env = sortie.env("track_target", SURROGATE)
+    env.reset(seed=1)
+    _, rewards, *_ = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    assert set(rewards) == {f"drone_{i}" for i in range(5)}
+    env.close()
+
+
+# --- wrong arguments -----------------------------------------------------------------------------
+
+
+WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
+    "unknown scenario": (lambda: sortie.fly("nonsense"), sortie.ScenarioError, "nonsense: no such file, the library has "),
+    "near miss": (lambda: sortie.load("track_targt"), sortie.ScenarioError, "did you mean track_target?"),
+    "no scenario": (lambda: sortie.load(None), sortie.ScenarioError, "scenario: None, must be a name, a path, a dict or a Scenario"),  # type: ignore[arg-type]
+    "a typo in a dict": (lambda: sortie.load({"name": "a", "fleet": {"dornes": 3}}), sortie.ScenarioError, "scenario: fleet.dornes: unknown key, did you mean drones?"),
+    "a key that is no text": (lambda: sortie.load({3: 4}), sortie.ScenarioError, "the key 3 is no text"),  # type: ignore[dict-item]
+    "not a number": (lambda: sortie.load({"name": "a", "duration_s": float("nan")}), sortie.ScenarioError, "scenario: duration_s: nan, must be a finite number"),
+    "an object": (lambda: sortie.load("track_target", {"fleet.drones": object}), sortie.ScenarioError, "overrides: fleet.drones: <class 'object'>, must be a number, text, a list or a section"),
+    "a wrong override": (lambda: sortie.load("track_target", {"fleet.drones": "x"}), sortie.ScenarioError, "overrides: fleet.drones: x, must be a whole number"),
+    "a text for overrides": (lambda: sortie.load("track_target", "fleet.drones=3"), sortie.ScenarioError, "overrides: 'fleet.drones=3', must be a map or a list: {'fleet.drones': 3}"),
+    "a number for overrides": (lambda: sortie.load("track_target", 3), sortie.ScenarioError, "overrides: 3, must be a map or a list"),  # type: ignore[arg-type]
+    "an override of nothing": (lambda: sortie.load("track_target", {"": 3}), sortie.ScenarioError, "overrides: '' is no field, must be key.path"),
+    "a number for a policy": (lambda: sortie.fly("track_target", policy=42), sortie.PolicyError, "policy: 42, must be a name, file.py:function or a callable of one FleetView"),  # type: ignore[arg-type]
+    "a policy of no view": (lambda: sortie.fly("track_target", policy=lambda: []), sortie.PolicyError, "policy '<lambda>': too many positional arguments, must take one FleetView"),  # type: ignore[arg-type, misc]
+    "an unknown policy": (lambda: sortie.fly("track_target", policy="nope"), sortie.PolicyError, "unknown policy 'nope', known: worked, "),
+    "a policy that gives no directives": (lambda: sortie.fly("track_target", SHORT, policy=lambda view: 5), sortie.PolicyError, "returns int, must be a sequence of directives"),  # type: ignore[arg-type, return-value]
+    "a policy that fails": (lambda: sortie.fly("track_target", SHORT, policy=lambda view: 1 / 0), sortie.PolicyError, "raises ZeroDivisionError: division by zero"),  # type: ignore[arg-type, return-value]
+    "a negative seed": (lambda: sortie.fly("track_target", seed=-1), sortie.ScenarioError, "seed: -1, must be a whole number from 0 to 2^63 - 1"),
+    "a replication and a half": (lambda: sortie.fly("track_target", replication=1.5), sortie.ScenarioError, "replication: 1.5, must be a whole number"),  # type: ignore[arg-type]
+    "policies as text": (lambda: sortie.compare("track_target", "worked"), sortie.PolicyError, "policies: 'worked', must be a list of policies: ['worked', 'silence']"),
+    "a policy twice": (lambda: sortie.compare("track_target", ["worked", "worked"]), sortie.PolicyError, "policies: worked, worked, must be one or more, each named once"),
+    "a seed twice": (lambda: sortie.compare("track_target", ["worked"], seeds=[1, 1]), sortie.ScenarioError, "seeds: [1, 1], must be one or more, each named once"),
+    "a number of seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=3), sortie.ScenarioError, "seeds: 3, must be a list of seeds: range(3)"),  # type: ignore[arg-type]
+    "no run": (lambda: sortie.open_run("nowhere"), sortie.RunError, "nowhere: no run there (outcome.json is missing)"),
+    "a number for a path": (lambda: sortie.open_run(7), sortie.RunError, "path: 7, must be a path"),  # type: ignore[arg-type]
+    "unknown campaign": (lambda: sortie.campaign("nope"), sortie.ScenarioError, "nope: no such file"),
+    "negative workers": (lambda: sortie.campaign("link_battery", workers=-1), sortie.RunError, "workers: -1, must be a whole number from 0 on, or None"),
+    "nothing to check": (lambda: sortie.check("nope"), sortie.ScenarioError, "nope: no such file"),
+    "a lone drone": (lambda: sortie.env({"name": "a", "fleet": {"drones": 1}}), sortie.RunError, "fleet.drones is 1, must be at least 2 to share"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_argument_is_one_line_that_says_what_is_allowed(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    call, kind, said = WRONG[what]
+    with pytest.raises(kind, match=re.escape(said)) as error:
+        call()
+    assert isinstance(error.value, sortie.SortieError)
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []

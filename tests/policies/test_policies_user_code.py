@@ -1,0 +1,193 @@
+"""A policy's file imports the modules beside it, two files never share them, and all of them are known by path."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+from policies_examples import fleet_of
+
+from sortie.policies.contract import PolicyError
+from sortie.policies.registry import describe_error, modules_of, resolve
+from sortie.policies.verification.confine import Reached, confined
+
+START = "from sortie.policies.contract import Directive, nothing\n"
+DECIDE = "\ndef decide(view):\n    return [nothing(view.ego, p, {}) for p in view.peers]\n"
+
+
+def write(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder
+
+
+def reason(folder: Path, file: str = "mine.py") -> str:
+    return resolve(f"{folder / file}:decide")(fleet_of(2))[0].reason
+
+
+def names(folder: Path, file: str = "mine.py") -> list[str]:
+    return [path.relative_to(folder.resolve()).as_posix() for path in modules_of(f"{folder / file}:decide")]
+
+
+FORMS = {
+    "a module": ("import helper" + DECIDE.format("helper.WHY"), {"helper.py": "WHY = 'beside'"}),
+    "a name": ("from helper import WHY" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
+    "all names": ("from helper import *" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
+    "relative": ("from . import helper" + DECIDE.format("helper.WHY"), {"helper.py": "WHY = 'beside'"}),
+    "a relative name": ("from .helper import WHY" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
+    "a helper's helper": (
+        "import helper" + DECIDE.format("helper.WHY"),
+        {"helper.py": "from second import WHY", "second.py": "WHY = 'beside'"},
+    ),
+    "a package": (
+        "import kit.deep.texts as t" + DECIDE.format("t.WHY"),
+        {"kit/__init__.py": "", "kit/deep/__init__.py": "", "kit/deep/texts.py": "WHY = 'beside'"},
+    ),
+    "a package's submodule": (
+        "from kit import texts" + DECIDE.format("texts.WHY"),
+        {"kit/__init__.py": "", "kit/texts.py": "from ..kit.more import WHY", "kit/more.py": "WHY = 'beside'"},
+    ),
+    "a package by its first name": (
+        "import kit.texts" + DECIDE.format("kit.texts.WHY"),
+        {"kit/__init__.py": "", "kit/texts.py": "from . import more\nWHY = more.WHY", "kit/more.py": "WHY = 'beside'"},
+    ),
+    "a folder": ("import kit.texts" + DECIDE.format("kit.texts.WHY"), {"kit/texts.py": "WHY = 'beside'"}),
+    "named like a room": ("import sim, policies.texts" + DECIDE.format("sim.WHY"), {
+        "sim.py": "WHY = 'beside'", "policies/__init__.py": "", "policies/texts.py": "",
+    }),
+    "in a circle": (
+        "import helper" + DECIDE.format("helper.why()"),
+        {"helper.py": "import mine, second\ndef why(): return second.why()",
+         "second.py": "import helper\ndef why(): return 'beside' if helper.mine.decide else ''"},
+    ),
+    "of a dataclass": (
+        "from helper import Why" + DECIDE.format("Why('beside').text"),
+        {"helper.py": "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+                      "@dataclass\nclass Why:\n    text: str\n"},
+    ),
+}  # fmt: skip
+INSIDE = "\ndef decide(view):\n    {}\n    return [nothing(view.ego, p, why()) for p in view.peers]\n"
+FORMS |= {
+    "inside the function": (INSIDE.format("from helper import why"), {"helper.py": "def why(): return 'beside'"}),
+    "relative, inside the function": (
+        INSIDE.format("from .helper import why"),
+        {"helper.py": "def why():\n    import second\n    return second.WHY", "second.py": "WHY = 'beside'"},
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_policy_imports_what_is_beside_it(form: str, tmp_path: Path) -> None:
+    source, files = FORMS[form]
+    write(tmp_path, {"mine.py": START + source, **files})
+    before, path = set(sys.modules), list(sys.path)
+    policy = resolve(f"{tmp_path}/mine.py:decide")
+    assert policy(fleet_of(2))[0].reason == "beside"
+    assert confined(policy)(fleet_of(2))[0].reason == "beside"
+    assert sys.path == path
+    assert not [finder for finder in sys.meta_path if "sortie" in type(finder).__module__]
+    left = {name for name in set(sys.modules) - before if not name.startswith(("sortie.", "sortie_user_"))}
+    assert not left & {"mine", "helper", "second", "kit", "sim", "policies"}
+    assert names(tmp_path) == sorted(["mine.py", *files])
+    assert not list(tmp_path.rglob("__pycache__"))
+
+
+def test_two_policies_keep_their_own_helpers(tmp_path: Path) -> None:
+    late = INSIDE.format("from helper import why")
+    for name in ("one", "two"):
+        write(tmp_path / name, {"mine.py": START + late, "helper.py": f"def why(): return '{name}'"})
+    one, two = (resolve(f"{tmp_path}/{name}/mine.py:decide") for name in ("one", "two"))
+    for _ in range(2):
+        assert (one(fleet_of(2))[0].reason, two(fleet_of(2))[0].reason) == ("one", "two")
+
+
+def test_each_resolving_reads_the_files_anew_and_leaves_older_ones_as_they_were(tmp_path: Path) -> None:
+    """Same size, same second: a compiled file beside it would not have noticed."""
+    late = (
+        "\ndef decide(view):\n    import helper, second\n    return [nothing(view.ego, 1, helper.WHY + second.WHY)]\n"
+    )
+    write(tmp_path, {"mine.py": START + "import helper" + late, "helper.py": "WHY = 'a'", "second.py": "WHY = 'x'"})
+    old = resolve(f"{tmp_path}/mine.py:decide")
+    assert old(fleet_of(2))[0].reason == "ax"
+    write(tmp_path, {"helper.py": "WHY = 'b'", "second.py": "WHY = 'y'"})
+    assert reason(tmp_path) == "by"
+    assert old(fleet_of(2))[0].reason == "ax"
+
+
+def test_python_and_sortie_come_first(tmp_path: Path) -> None:
+    source = START + "import math\nimport numpy" + DECIDE.format("f'{math.pi:.2f} {numpy.ones(1)[0]:g}'")
+    write(tmp_path, {
+        "mine.py": source, "math.py": "pi = 4", "sortie/__init__.py": "raise RuntimeError", "numpy/data.txt": "",
+    })  # fmt: skip
+    assert reason(tmp_path) == "3.14 1"
+    assert names(tmp_path) == ["mine.py"]
+
+
+def test_modules_on_the_path_count_and_installed_ones_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(
+        tmp_path / "lib",
+        {"shop/__init__.py": "from .tools import a\n", "shop/tools/__init__.py": "", "shop/tools/a.py": ""},
+    )
+    write(tmp_path / "venv/site-packages", {"bought.py": ""})
+    write(tmp_path / "own", {"mine.py": "import shop, bought, numpy, json, absent\nimport importlib\n"
+                                        "importlib.import_module('late')", "late.py": ""})  # fmt: skip
+    for folder in ("lib", "venv/site-packages"):
+        monkeypatch.syspath_prepend(tmp_path / folder)
+    importlib.invalidate_caches()
+    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in modules_of(f"{tmp_path}/own/mine.py:decide")]
+    assert found == [
+        "lib/shop/__init__.py",
+        "lib/shop/tools/__init__.py",
+        "lib/shop/tools/a.py",
+        "own/late.py",
+        "own/mine.py",
+    ]
+
+
+def test_a_registered_policy_has_no_files_and_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    assert modules_of("worked") == ()
+    with pytest.raises(PolicyError, match=r"none\.py' not found"):
+        modules_of(f"{tmp_path}/none.py:decide")
+
+
+@pytest.mark.parametrize(
+    ("form", "missing"),
+    [("import absent", "absent"), ("from . import absent", "absent"), ("from helper import absent", "absent")],
+)
+def test_a_missing_module_is_named(form: str, missing: str, tmp_path: Path) -> None:
+    write(tmp_path, {"mine.py": form, "helper.py": ""})
+    with pytest.raises(
+        PolicyError, match=rf"does not load: (ModuleNotFound|Import)Error: .*{missing}.* \(mine\.py, line 1\)"
+    ):
+        resolve(f"{tmp_path}/mine.py:decide")
+
+
+def test_a_helpers_error_names_its_line(tmp_path: Path) -> None:
+    write(
+        tmp_path,
+        {
+            "mine.py": START + "import helper" + DECIDE.format("helper.why()"),
+            "helper.py": "def why():\n    return 1 / 0",
+        },
+    )
+    with pytest.raises(ZeroDivisionError) as caught:
+        reason(tmp_path)
+    assert describe_error(caught.value).endswith("(helper.py, line 2)")
+
+
+@pytest.mark.parametrize("form", ["import helper", "from . import helper"])
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_helper_is_confined_with_its_policy(form: str, inside: bool, tmp_path: Path) -> None:
+    body = "\ndef decide(view):\n    {}\n    return helper.peek()\n"
+    write(tmp_path, {
+        "mine.py": body.format(form) if inside else form + body.format("pass"),
+        "helper.py": "import time\ndef peek(): return [time.time()]",
+    })  # fmt: skip
+    policy = resolve(f"{tmp_path}/mine.py:decide")
+    assert policy(fleet_of(2))
+    with pytest.raises(Reached, match="time"):
+        confined(policy)(fleet_of(2))
