@@ -1,15 +1,13 @@
-"""One drone's part in the plane: publish, read the fleet, decide, gate, send; and hold what arrives.
+"""One drone's part in the plane: it publishes its descriptor, reads the fleet, decides, gates and sends.
 
-An agent sees its own state through `Senses`, the air through `Modem`, and other drones only through what it
-heard: it holds no other drone and no world. One SimPy process a drone, one wake-up a frame.
+An agent sees its own state through `Senses`, the air through `Modem`, and other drones only through its `PeerMemory`.
+It holds no other drone and no world. Each drone is one SimPy process that wakes once a frame.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -17,24 +15,25 @@ import simpy
 
 from sortie.fleet.coverage import NOVEL_FLAG, TARGET_FLAG
 from sortie.fleet.gate import Gate, Payload, make_payload
-from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened, Sealer
-from sortie.fleet.messages.compact import FULL, Form, encode_compact
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.messages.auth import Sealer
+from sortie.fleet.messages.compact import FULL, encode_compact
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
-from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, could_tell, discounted, judge
+from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import (
     Descriptor,
     Directive,
     Disc,
-    FleetView,
     Policy,
     TaskPhase,
     check_directives,
     nothing,
 )
-from sortie.policies.damping import LinkState, apply_hysteresis, damp
+from sortie.policies.damping import LinkState, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -53,44 +52,6 @@ class Task(NamedTuple):
     phase: TaskPhase
     region: Disc | None
     target_ids: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class PlaneRules:
-    """The plane's periods, the same for every drone."""
-
-    period_s: float
-    frames: int
-    degraded_after_periods: float
-    detached_after_periods: float
-    dwell_s: float
-    hysteresis: float
-    compute_delay_s: float
-    tile_limit_bytes: int | None = None
-    """Features go as tiles of at most so many bytes; None: as one sample."""
-    trust: bool = False
-    """Whether peers' claims are judged (`sortie.fleet.trust`)."""
-    publish_every: int = 1
-    """A descriptor every so many frames; staleness counts in periods of that length."""
-    form: Form = FULL
-    """How finely descriptors are written."""
-
-    @property
-    def descriptor_period_s(self) -> float:
-        """From one descriptor of a drone to its next."""
-        return self.period_s * self.publish_every
-
-
-class Received(NamedTuple):
-    """One payload as it arrived: what it shows, and of when."""
-
-    capture: Capture
-    payload: Payload
-    t_done_s: float
-    missing: tuple[int, ...] = ()
-    """Ranks (0 the best) of its feature cells that did not come, ascending."""
-    phy_mbps: float = math.inf
-    """The data rate at which its frames came."""
 
 
 class Senses(Protocol):
@@ -136,130 +97,90 @@ class Agent:
     def __init__(
         self,
         env: simpy.Environment,
-        drone: int,
+        memory: PeerMemory,
         *,
         rules: PlaneRules,
         policy: Policy,
         senses: Senses,
         modem: Modem,
+        gate: Gate,
         log: AgentLog,
         sealer: Sealer | None,
         phase_s: float,
-        handshake_bytes: int = 0,
+        handshake_bytes: Callable[[], int],
     ) -> None:
-        """Args: `phase_s` is when in each frame this drone acts; `sealer` None publishes unauthenticated.
+        """Put a drone together; `start` begins its process.
 
-        `handshake_bytes` is what its sharing method puts on every link and frame before payloads.
+        Args:
+            env: the clock.
+            memory: the drone's number, its shared status, and what it receives.
+            rules: the plane's periods.
+            policy: decides on the links once a frame.
+            senses: the drone's own sensors.
+            modem: the drone's end of the air.
+            gate: enforces the directives.
+            log: gets every act of the drone.
+            sealer: signs descriptors; None publishes them unauthenticated.
+            phase_s: when in each frame this drone acts.
+            handshake_bytes: what its sharing method puts on every link and frame before payloads, at the moment.
         """
-        self.env = env
-        self.drone = drone
-        self.policy = policy  # may be replaced while the sortie flies
-        self.clock_skew_s = 0.0
-        self.airborne = True
-        self.lies: dict[int, Callable[[Descriptor], Descriptor]] = {}
-        """What it says against the truth; scenario events put them here."""
-        self.sensed = False  # whether perception ran in the current frame
+        self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
-        """Its body in this frame, whether perception runs or rests."""
+        """The drone's pose in this frame, whether or not perception runs."""
         self.latest: Capture | None = None
-        """The newest look whose features are computed."""
-        self.held: dict[int, Received] = {}
-        self.inbox = Inbox()
+        """The newest capture with computed features."""
+        self._env = env
         self._rules = rules
+        self._policy = policy
         self._senses = senses
         self._modem = modem
+        self._gate = gate
         self._log = log
         self._sealer = sealer
         self._phase_s = phase_s
+        self._handshake_bytes = handshake_bytes
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
-        self._fresh_s = self._period_s * rules.degraded_after_periods  # surely fresh: no rule to ask
-        self._claims: dict[int, Descriptor] = {}
-        self._known: dict[int, Descriptor] = {}  # what policies read of them; by ascending id
-        self._heard_at_s: dict[int, float] = {}
+        self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
-        self._standings: dict[int, Standing] = {}
-        self._doubted: frozenset[int] = frozenset()
-        self._arrivals: dict[int, list[Arrival]] = {}
-        self._judged_at_s = -math.inf
         self._judged_every = max(1, round(JUDGED_EVERY_S / rules.period_s))
-        self.gate = Gate()
-        self.handshake_bytes = handshake_bytes  # goes with the policy
 
     def start(self) -> None:
         """Begin the drone's process; call once."""
-        self.env.process(self._fly())
-
-    def stop(self) -> None:
-        """The drone leaves the plane for good."""
-        self.airborne = False
-
-    def hear(self, opened: Opened | Dropped) -> DropReason | None:
-        """A datagram came in: one that may be believed replaces the descriptor held of its sender (keep-last-1).
-
-        Returns:
-            Why it was refused, None where it was not.
-        """
-        heard = self.inbox.accept(opened)
-        if isinstance(heard, DropReason):
-            return heard
-        if heard.agent_id != self.drone:
-            self._hold(heard)
-        return None
-
-    def _hold(self, descriptor: Descriptor) -> None:
-        known, sender = self._known, descriptor.agent_id
-        self._claims[sender] = descriptor
-        if sender in known:
-            known[sender] = apply_hysteresis(known[sender], descriptor, self._rules.hysteresis)
-        else:  # by ascending id, so that the order of hearing decides nothing
-            self._known = dict(sorted([*known.items(), (sender, descriptor)]))
-        self._heard_at_s[sender] = self.env.now
-
-    def receive(self, received: Received) -> None:
-        """A peer's payload arrived; the freshest capture is kept, late ones do not replace newer ones."""
-        peer = received.capture.drone
-        held = self.held.get(peer)
-        if self._rules.trust:
-            took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
-            self._arrivals.setdefault(peer, []).append(
-                Arrival(
-                    0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
-                )
-            )
-        if self.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
-            self.held[peer] = received
+        self._env.process(self._fly())
 
     def _fly(self) -> Generator[simpy.Event, Any, None]:
-        env, rules = self.env, self._rules
+        env, rules = self._env, self._rules
         for frame in range(rules.frames):
             yield env.timeout(max(0.0, frame * rules.period_s + self._phase_s - env.now))
-            if not self.airborne:
+            if not self.status.airborne:
                 return
             self._tick(frame)
 
     def _tick(self, frame: int) -> None:
         sensed = self._senses.sense(frame)
         self.here = sensed.capture
-        self._hold(self._publish(sensed, due=frame % self._rules.publish_every == 0))
+        own = self._publish(sensed, due=frame % self._rules.publish_every == 0)
+        self.memory.hold(own, self._env.now)
         if self._rules.trust and frame % self._judged_every == 0:
-            self._judge()
+            for peer, standing in self.memory.judge(self._env.now):
+                self._log.trust(self._env.now, self.drone, peer, standing)
         self._decide()
-        duty = self.gate.duty_percent
-        self.sensed = (frame + 1) * duty // 100 > frame * duty // 100
-        if self.sensed:
-            self.env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
+        duty = self._gate.duty_percent
+        self.status.perceiving = (frame + 1) * duty // 100 > frame * duty // 100
+        if self.status.perceiving:
+            self._env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 
     def _publish(self, sensed: Sensed, due: bool) -> Descriptor:
-        """Publish this frame's descriptor, where one is due; returns it as every peer reads it, rounded by the wire."""
+        """Publish this frame's descriptor if one is due, and return it as rounded by the wire."""
         capture, velocity_mps, footprint_m, grid, novel = sensed
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids = self._senses.task()
         descriptor = Descriptor(
             # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
-            stamp_ns=round((capture.t_s + self.clock_skew_s) * 1e9),
+            stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
             agent_id=self.drone,
             position_m=capture.est_position_m,
             orientation_xyzw=capture.orientation_xyzw,
@@ -277,66 +198,33 @@ class Agent:
         )
         if not due:
             return decode_descriptor(self._encode(descriptor))
-        told = descriptor
-        for lie in self.lies.values():
-            told = lie(told)
-        payload = self._encode(told)
+        claimed = descriptor
+        for lie in self.status.lies.values():
+            claimed = lie(claimed)
+        payload = self._encode(claimed)
         datagram = payload if self._sealer is None else self._sealer.seal(payload)
         self._modem.broadcast(datagram)
-        self._log.descriptor(self.env.now, told, len(datagram))
-        # a liar decides by what is true
-        return decode_descriptor(payload if told is descriptor else self._encode(descriptor))
-
-    def _ages_s(self) -> dict[int, float]:
-        """Age of every descriptor held, by this drone's clock and never less than the time since it came in."""
-        now_s = self.env.now
-        clock_s, heard_at_s = now_s + self.clock_skew_s, self._heard_at_s
-        return {
-            i: stamped_s if (stamped_s := clock_s - d.stamp_ns * 1e-9) > (heard_s := now_s - heard_at_s[i]) else heard_s
-            for i, d in self._known.items()
-        }
-
-    def trust_in(self, peer: int) -> float:
-        """What this drone thinks of a peer, 0 … 1; payloads are fused with their weight times this."""
-        return self._standings.get(peer, UNJUDGED).trust
-
-    def _judge(self) -> None:
-        """Hold what peers claimed since the last time against what is known otherwise, each claim once."""
-        now_s, before = self.env.now, self._standings
-        since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
-        heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
-        arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
-        for i, came in self._arrivals.items():
-            told_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
-            arrivals[i], later = could_tell(came, told_s)
-            self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
-        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form)
-        self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
-        for peer in heard:
-            if after[peer].trust != before.get(peer, UNJUDGED).trust:
-                self._log.trust(now_s, self.drone, peer, after[peer])
+        self._log.descriptor(self._env.now, claimed, len(datagram))
+        # a drone that lies decides by its true state
+        return decode_descriptor(payload if claimed is descriptor else self._encode(descriptor))
 
     def _decide(self) -> None:
-        now_s, me, links, fresh_s = self.env.now, self.drone, self._links, self._fresh_s
-        ages_s = self._ages_s()
-        known = dict(self._known)
-        for doubted in self._doubted:
-            known[doubted] = discounted(known[doubted])
-        view = FleetView(me, self._period_s, known, ages_s)
+        now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
+        view = self.memory.view(now_s)
         begin_ns = time.perf_counter_ns()
-        directives = self.policy(view)
+        directives = self._policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         check_directives(directives, view)
         asked_of = {d.destination: d for d in directives}
         peer_ages_s = []
-        for peer, age_s in ages_s.items():
+        for peer, age_s in view.age_s.items():
             if peer == me:
                 continue
             peer_ages_s.append(age_s)
             link = links.get(peer)
             if link is None:
                 link = links[peer] = _OutgoingLink(me, peer)
-                self.gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
+                self._gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             changed = asked is not link.asked and asked != link.asked
             if changed or age_s > fresh_s or link.state.upgrade_since_s is not None:
@@ -353,21 +241,22 @@ class Agent:
         link.state = after = damp(before, capped, now_s, rules.dwell_s)
         if after.enforced is not before.enforced and after.enforced != before.enforced:
             enforced = decode_directive(encode_directive(after.enforced))
-            self.gate.enforce(enforced)
+            self._gate.enforce(enforced)
             self._log.directive(now_s, asked, enforced, fidelity, after.enforced.reason)
 
     # --- the data plane ------------------------------------------------------------------------
 
     def _send(self, computed: simpy.Event) -> None:
         """The capture's features are there: hand each link that is due what its directive allows."""
-        if not self.airborne:
+        if not self.status.airborne:
             return
         self.latest = capture = cast(Capture, computed.value)
-        if self.handshake_bytes:
-            self._shake_hands(capture)
+        handshake_bytes = self._handshake_bytes()
+        if handshake_bytes:
+            self._shake_hands(handshake_bytes, capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
         made: dict[tuple[Any, ...], Payload | None] = {}  # what goes to several peers is made once
-        for directive in self.gate.due(self.env.now):
+        for directive in self._gate.due(self._env.now):
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
                 made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
@@ -375,9 +264,9 @@ class Agent:
             if payload is not None:
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)
 
-    def _shake_hands(self, capture: Capture) -> None:
-        """What the method asks and answers before payloads, to every peer that is not detached."""
+    def _shake_hands(self, size_bytes: int, capture: Capture) -> None:
+        """Send the method's request or answer to every peer that is not detached."""
         limit_s = self._period_s * self._rules.detached_after_periods
-        for peer, age_s in self._ages_s().items():
+        for peer, age_s in self.memory.ages_s(self._env.now).items():
             if peer != self.drone and age_s <= limit_s:
-                self._modem.handshake(peer, self.handshake_bytes, capture, self._rules.period_s)
+                self._modem.handshake(peer, size_bytes, capture, self._rules.period_s)

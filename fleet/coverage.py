@@ -1,4 +1,4 @@
-"""What a drone says about what it sees: footprint and coverage grid, from geometry alone (no content).
+"""Footprint and coverage grid of a drone, from geometry alone.
 
 The grid is 16 × 16 cells of 12.8 m, north-aligned and snapped to the world's 12.8 m lattice, so that two drones'
 grids can be compared cell by cell. It covers the ±102.4 m that the perception covers.
@@ -12,6 +12,7 @@ from typing import overload
 import numpy as np
 import numpy.typing as npt
 
+from sortie.perception.geometry import FULL
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
 from sortie.policies.contract import COVERAGE_CELLS, Coverage
 
@@ -19,7 +20,8 @@ Array = npt.NDArray[np.float64]
 
 HALF_FIELD_OF_VIEW_DEG = 35.0
 """Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
-RANGE_M = 102.4
+RANGE_M = FULL.half_extent_m
+"""From the drone to each edge of the square that perception covers."""
 NOVEL_FLAG, TARGET_FLAG = 1, 2
 _HALF_FIELD_OF_VIEW_TAN = math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
 _HALF = COVERAGE_CELLS // 2

@@ -1,37 +1,34 @@
 """The gate: the only place that sees both a directive and a payload.
 
-It turns a directive into a payload of an exact size, at the directive's rate. Sizes: feature cells × 160 B and
-their index (sortie.perception.budget), boxes × 24 B, tracks × 20 B, raw images as rendered sizes of UAV3D's cameras;
-each payload carries a header with capture stamp and pose, and the directive it obeys.
+It turns a directive into a payload of an exact size, at the directive's rate. `sortie.perception.budget` works out the
+size of the content. Each payload adds a header with capture stamp and pose, and the directive that it obeys.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 from sortie.fleet import tiles
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
 from sortie.policies.contract import Directive, Disc, Representation
-from sortie.scenarios.representation import BOXES
+from sortie.scenarios.representation import BOXES, NAME_OF
 
 HEADER_BYTES = 40
 """Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
-RAW_BYTES = 5 * 800 * 450 * 3
-"""Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
 _EPSILON_S = 1e-6
-_NONE, _FEATURES = Representation.NONE, Representation.FEATURES  # members of an enumeration are slow to look up
+# members of an enumeration are slow to look up
+_NONE, _FEATURES, _RAW = Representation.NONE, Representation.FEATURES, Representation.RAW
 _RELIABLE = tuple(rung in BOXES for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
-"""How many boxes the drone's own detector reports in a region right now."""
+"""Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
 
 
 class Payload(NamedTuple):
-    """What goes on the air for one link and frame; the content is named, not carried."""
+    """What one link sends in one frame: a description of the content and its exact size."""
 
     representation: Representation
     rho: float
@@ -48,7 +45,7 @@ class Payload(NamedTuple):
 
     @property
     def reliable(self) -> bool:
-        """Compact payloads go reliably, high-rate ones best effort (the paper's QoS mapping)."""
+        """Whether it is sent reliably: compact payloads are, others are sent best effort (the paper's QoS mapping)."""
         return _RELIABLE[self.representation]
 
 
@@ -62,9 +59,9 @@ def make_payload(
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
-    Args: `tile_limit_bytes`: features go as tiles of at most so many bytes (sortie.fleet.tiles); None: as one sample.
+    Args: `tile_limit_bytes`: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
     """
-    rung, rho, roi = directive.representation, directive.rho, directive.roi
+    rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
     if rung == _NONE:
         return None
@@ -74,38 +71,13 @@ def make_payload(
             return None
         if tile_limit_bytes is not None:
             t = tiles.cut(cells, tile_limit_bytes)
-            return Payload(
-                rung,
-                rho,
-                roi,
-                directive.fusion_weight,
-                cells,
-                0,
-                t.index_bytes,
-                t.size_bytes,
-                t.cells_each,
-                t.tile_bytes,
-            )
-        content, index_bytes = _feature_bytes(cells)
-    elif rung == Representation.RAW:
-        content = RAW_BYTES
-    else:
-        boxes = count_boxes(roi)
-        if rung == Representation.TRACKS:
-            boxes = min(boxes, budget.MAX_TRACKS)
-            content = boxes * budget.TRACK_BYTES
-        else:
-            content = boxes * budget.DETECTION_BYTES
-    # the directive rides along, so that the receiver knows rung, ROI and fusion weight
-    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + content
-    return Payload(rung, rho, roi, directive.fusion_weight, cells, boxes, index_bytes, size_bytes)
-
-
-@lru_cache(maxsize=budget.CELLS + 1)
-def _feature_bytes(cells: int) -> tuple[int, int]:
-    """Of so many cells with their index, and of the index."""
-    index_bytes = budget.index_bytes(cells)
-    return budget.payload_bytes(cells) + index_bytes, index_bytes
+            return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
+        index_bytes = budget.index_bytes(cells)
+    elif rung != _RAW:
+        boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi))
+    # the directive goes with the payload, so that the receiver has representation, region and fusion weight
+    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes)
+    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes)
 
 
 class Gate:
@@ -115,7 +87,7 @@ class Gate:
         self._directives: dict[int, Directive] = {}  # by ascending peer
         self._last_slot_s: dict[int, float] = {}
         self.duty_percent = 100
-        """The duty cycle asked for: the highest over the links, 100 where there is no link."""
+        """The highest duty cycle of the links' directives, 100 where there is no link."""
 
     def enforce(self, directive: Directive) -> None:
         """Put a directive in force. Repeating one changes nothing: timers run from the last send, not from here."""

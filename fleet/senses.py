@@ -1,6 +1,6 @@
-"""What every drone senses of itself, frame by frame: a flown `Trajectories` as the agents read it.
+"""What each drone senses of itself in each frame, computed from a flown `Trajectories`.
 
-All of it follows from the motion alone, so it is worked out for many frames and all drones in one pass.
+It follows from the motion alone, so it is computed for many frames and all drones in one pass.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tiles: feature cells in fragments that are of use each alone.
+"""Tiles: feature cells cut into fragments that can each be used alone.
 
 A feature map sent as one sample is lost with any of its fragments. Cut into tiles, each fragment carries whole cells
 with their indices and a header of its own, best cells first, so that whatever arrives can be fused. It costs a header
@@ -19,7 +19,7 @@ _CELL_BYTES = budget.payload_bytes(1)
 
 
 class Tiles(NamedTuple):
-    """How many cells are cut into tiles."""
+    """Number and sizes of the tiles of one payload."""
 
     cells_each: int
     """Of every tile but the last."""
@@ -32,12 +32,8 @@ class Tiles(NamedTuple):
 
 
 def _tile_bytes(cells: int) -> int:
-    return TILE_HEADER_BYTES + cells * _CELL_BYTES + _index_bytes(cells)
-
-
-def _index_bytes(cells: int) -> int:
-    """12 bits a cell: a tile has too few for a bitmap."""
-    return -(-cells * 12 // 8)
+    """A tile lists its indices: it has too few cells for a bitmap."""
+    return TILE_HEADER_BYTES + cells * _CELL_BYTES + budget.index_list_bytes(cells)
 
 
 @lru_cache(maxsize=budget.CELLS + 1)
@@ -47,14 +43,14 @@ def cut(cells: int, fragment_bytes: int) -> Tiles:
     Raises:
         ValueError: if a fragment does not hold one cell.
     """
-    each = (2 * (fragment_bytes - TILE_HEADER_BYTES)) // (2 * _CELL_BYTES + 3)
+    each = 8 * (fragment_bytes - TILE_HEADER_BYTES) // (8 * _CELL_BYTES + budget.INDEX_BITS)
     if each < 1:
         raise ValueError(
             f"fragment_bytes is {fragment_bytes}, must be at least {_tile_bytes(1)} for a tile of one cell"
         )
     count = -(-cells // each)
     last = cells - (count - 1) * each
-    index_bytes = (count - 1) * _index_bytes(each) + _index_bytes(last)
+    index_bytes = (count - 1) * budget.index_list_bytes(each) + budget.index_list_bytes(last)
     return Tiles(each, _tile_bytes(each), count, index_bytes, (count - 1) * _tile_bytes(each) + _tile_bytes(last))
 
 

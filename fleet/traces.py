@@ -30,7 +30,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from sortie.fleet.energy.cell import energy_fraction
 from sortie.fleet.energy.recorded import BatteryTrace
 from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.flight.motion import Trajectories, body_rates
+from sortie.fleet.flight.motion import Trajectories, body_rates, fly
+from sortie.scenarios.schema import Fleet
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
@@ -95,15 +96,28 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
             raise TraceError(f"{path}: {what} needs all of {', '.join(names)}")
     who = columns.get("drone", np.zeros(len(columns["t_s"])))
     check_whole(path, "drone", who)
-    found = {}
+    traces = {}
     for drone in np.unique(who).astype(int).tolist():
         if drone >= drones:
             raise TraceError(f"{path}: drone {drone}, must be below fleet.drones = {drones}")
         rows = np.flatnonzero(who == drone)
         check_increasing(path, columns["t_s"], rows, f"drone {drone}")
         own = {name: values[rows] for name, values in columns.items()}
-        found[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
-    return found
+        traces[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
+    return traces
+
+
+def flown_motion(
+    fleet: Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0
+) -> tuple[Trajectories, dict[int, DroneTrace]]:
+    """The motion of a fleet whose traces, if it has any, replace its model; and these traces by drone.
+
+    Raises:
+        TraceError: a trace that cannot be read or does not fit.
+        MotionError: a way that cannot be flown.
+    """
+    traces = {} if fleet.trace is None else read_traces(fleet.trace, fleet.drones)
+    return follow(fly(fleet, duration_s, frame_s, seed, replication), traces, frame_s), traces
 
 
 def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: float) -> Trajectories:

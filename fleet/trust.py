@@ -34,7 +34,7 @@ FALSE_CELLS = 4
 # --- goodput
 LARGE_BYTES = 10_000
 """Smaller payloads say too little about a link."""
-TELLS_FOR_S = 2.0 * JUDGED_EVERY_S
+COUNTS_FOR_S = 2.0 * JUDGED_EVERY_S
 ROUNDING_S = 1e-6
 UNDERSTATED, OVERSTATED = 0.1, 1.5
 """A claim is a doubt below the first times what was seen to arrive (an estimate rises by 0.3 of the gap at each
@@ -241,19 +241,19 @@ def battery_doubt(
     return ""
 
 
-def could_tell(arrivals: Sequence[Arrival], told_s: float) -> tuple[list[Arrival], list[Arrival]]:
-    """What came before a claim was made at `told_s`, and may be held against it; and what came since, for the next.
+def split_arrivals(arrivals: Sequence[Arrival], claimed_s: float) -> tuple[list[Arrival], list[Arrival]]:
+    """Arrivals to check a claim of `claimed_s` against, and arrivals after it, which are kept for the next claim.
 
-    What came longer before it than TELLS_FOR_S tells of a link that may have broken meanwhile: of neither. Where their
-    row broke off, or is none, the claim may be of a payload that did not come: then they tell how fast their frames were,
-    which no loss lets an estimate exceed, but nothing of how much must have arrived.
+    Arrivals more than COUNTS_FOR_S before the claim are in neither list: their link may have broken since. Where the
+    series of arrivals has a gap before the claim, a payload may have been lost. Such arrivals bound the data rate from
+    above, and their sizes are set to zero, so that they say nothing about how much must have arrived.
     """
-    told = [a for a in arrivals if told_s - TELLS_FOR_S < a.t_done_s <= told_s]
-    sent_s = sorted(a.sent_s for a in told)
+    before = [a for a in arrivals if claimed_s - COUNTS_FOR_S < a.t_done_s <= claimed_s]
+    sent_s = sorted(a.sent_s for a in before)
     apart_s = min((b - a for a, b in pairwise(sent_s)), default=0.0)
-    if told_s - max(sent_s, default=told_s) > apart_s + ROUNDING_S:
-        told = [a._replace(size_bytes=0) for a in told]
-    return told, [a for a in arrivals if a.t_done_s > told_s]
+    if claimed_s - max(sent_s, default=claimed_s) > apart_s + ROUNDING_S:
+        before = [a._replace(size_bytes=0) for a in before]
+    return before, [a for a in arrivals if a.t_done_s > claimed_s]
 
 
 def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:

@@ -28,6 +28,10 @@ DETECTION_BYTES = 24
 TRACK_BYTES = 20
 """One track: x, y, vx, vy as float32, id, class and score packed in 4 B."""
 MAX_TRACKS = 12
+INDEX_BITS = 12
+"""One cell index: 4096 cells."""
+RAW_BYTES = 5 * 800 * 450 * 3
+"""Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
 
 def payload_bytes(cells: int) -> int:
@@ -35,9 +39,37 @@ def payload_bytes(cells: int) -> int:
     return cells * CHANNELS * 2
 
 
+def index_list_bytes(cells: int) -> int:
+    """Bytes of a list of cell indices, 12 bits each."""
+    return -(-cells * INDEX_BITS // 8)
+
+
 def index_bytes(cells: int) -> int:
-    """Bytes that say which cells were sent: 12 bits a cell or a 512 B bitmap, the smaller; none when all were."""
-    return 0 if cells >= CELLS else min(CELLS // 8, math.ceil(cells * 12 / 8))
+    """Bytes that name the cells sent: a list or a 512 B bitmap, the smaller; nothing when all cells are sent."""
+    return 0 if cells >= CELLS else min(CELLS // 8, index_list_bytes(cells))
+
+
+def boxes_sent(representation: str, boxes: int) -> int:
+    """How many of a drone's boxes it sends: all as detections, at most 12 as tracks."""
+    return min(boxes, MAX_TRACKS) if representation == "tracks" else boxes
+
+
+def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0) -> int:
+    """Bytes of a payload without its header: features with their index, detections, tracks, or raw images.
+
+    Raises:
+        ValueError: another representation, naming it.
+    """
+    match representation:
+        case "features":
+            return payload_bytes(cells) + index_bytes(cells)
+        case "detections":
+            return boxes * DETECTION_BYTES
+        case "tracks":
+            return boxes * TRACK_BYTES
+        case "raw":
+            return RAW_BYTES
+    raise ValueError(f"representation is {representation!r}, must be features, detections, tracks or raw")
 
 
 @lru_cache(maxsize=4)
@@ -138,18 +170,3 @@ def select(
         out[order[:count]] = True
         out[order[list(missing)]] = False
     return out.reshape(GRID, GRID)
-
-
-def payload(representation: str, *, cells: int = 0, boxes: int = 0) -> int:
-    """Content bytes of one payload: features with their index, detections, or tracks (at most 12).
-
-    Raises:
-        ValueError: another representation, naming it.
-    """
-    if representation == "features":
-        return payload_bytes(cells) + index_bytes(cells)
-    if representation == "detections":
-        return boxes * DETECTION_BYTES
-    if representation == "tracks":
-        return min(boxes, MAX_TRACKS) * TRACK_BYTES
-    raise ValueError(f"representation is {representation!r}, must be features, detections or tracks")

@@ -35,7 +35,7 @@ RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES
 BUDGETS = (0.02, 0.1, 0.25, 1.0)
 RATES_HZ = (2.0, 5.0, 10.0)
 CHOICES = (len(RUNGS), len(BUDGETS), len(RATES_HZ), 2)
-"""Of an action, for each link: rung, budget of the features rung, rate, and whether it is confined to the region."""
+"""Choices of an action for each link: representation, feature budget, rate, and whether it is confined to the region."""
 ROW = 24
 """Numbers of one drone in an observation; `_row` says which."""
 LIMIT = 10.0
@@ -62,7 +62,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     metadata = {"name": "sortie_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - the library's own way
 
     def __init__(self, scenario: Scenario) -> None:
-        """Args: `scenario` with at least two drones; its policy is not asked.
+        """Args: `scenario` with at least two drones; its policy is not used.
 
         Raises:
             ValueError: a lone drone, which has nothing to decide.
@@ -155,14 +155,14 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     def _observe(self, agent: str) -> Obs:
         assert self._flight is not None  # noqa: S101
         ego, n = int(agent.removeprefix("drone_")), len(self.possible_agents)
-        found = np.zeros((n, ROW), np.float32)
+        rows = np.zeros((n, ROW), np.float32)
         view = self._flight.views.get(ego)
         me = None if view is None else view.me
         if view is not None and me is not None:
             for k, i in enumerate([ego, *(i for i in range(n) if i != ego)]):
                 if i in view.descriptors:
-                    found[k] = _row(me, view.descriptors[i], view.age_s[i])
-        return np.clip(found, -LIMIT, LIMIT)
+                    rows[k] = _row(me, view.descriptors[i], view.age_s[i])
+        return np.clip(rows, -LIMIT, LIMIT)
 
 
 def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
@@ -194,14 +194,13 @@ class _Flight:
         self._error: Exception | None = None
         self._new: dict[str, pa.Table] = {}
         self._mission: pa.Table | None = None
-        self._soc_j: dict[int, float] = {}
         self._mine, self._theirs = threading.Semaphore(0), threading.Semaphore(0)
         self._closing = False
         self._thread = threading.Thread(target=self._fly, args=(seed, replication), daemon=True)
         self._started = False
 
     def advance(self) -> None:
-        """Let the sortie fly until its next second or its end; what went wrong there is raised here, each time."""
+        """Let the sortie fly until its next second or its end; an error of the sortie is raised here, at each call."""
         if self._error is not None:
             raise self._error
         if self.done:
@@ -265,7 +264,7 @@ class _Flight:
             directives.append(Directive(view.ego, peer, RUNGS[rung], rho, roi, RATES_HZ[rate], reason="action"))
         return directives
 
-    # --- what the last second came to --------------------------------------------------------
+    # --- results of the last second ------------------------------------------------------------
 
     def airborne(self, drone: int) -> bool:
         """Whether the drone still flew at the last frame."""

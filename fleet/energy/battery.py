@@ -95,7 +95,7 @@ class FleetBatteries:
         self.voltage_v = [float(open_circuit_cell_v(s)) * k for s, k in zip(self.soc, self.cells, strict=True)]
         self.current_a = [0.0] * n
         self.landed = [soc <= config.landing_soc for soc in self.soc]
-        self.why_landed = [self._charge(i) if down else "" for i, down in enumerate(self.landed)]
+        self.landing_reason = [self._charge(i) if down else "" for i, down in enumerate(self.landed)]
         """In words, for whom the pack brought down."""
         self._kept = [1.0] * n  # of what a trace says, after faults
 
@@ -199,10 +199,10 @@ class FleetBatteries:
         self.cells[drone] -= 1
         self._read_off(drone)
 
-    def land(self, drone: int, why: str = "") -> None:
-        """Take a drone out of the air, for good; its pack is at rest. `why` is left out where its charge says it."""
+    def land(self, drone: int, reason: str = "") -> None:
+        """Take a drone out of the air, for good; its pack is at rest. `reason` is left out where its charge is the reason."""
         self.landed[drone] = True
-        self.why_landed[drone] = why or self._charge(drone)
+        self.landing_reason[drone] = reason or self._charge(drone)
         self.current_a[drone] = 0.0
         self._polarised_v[drone] = 0.0
         self._read_off(drone)

@@ -29,7 +29,7 @@ from sortie.scenarios.schema.campaign import PARAMS, Campaign
 from sortie.scenarios.traces import located
 from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
 from sortie.sim.campaign.work import task_key
-from sortie.sim.engine.pilot import named
+from sortie.sim.engine.pilot import named_policy
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version, file_digest
@@ -272,5 +272,5 @@ def _metric_keys(study: Study, policies: Sequence[Mapping[str, Any]]) -> dict[st
     flown = [change for section in policies for change in section["changes"]]
     if not any(name.startswith(PARAMS) for name in vary):  # else every run has another name for its policy
         flown += policies
-    names = [named(one["name"], dict(sorted(one["params"].items()))).name for one in flown]  # as tasks have them
+    names = [named_policy(one["name"], dict(sorted(one["params"].items()))).name for one in flown]  # as tasks have them
     return open_keys(study.drones, phases, names, traced=traced)

@@ -23,6 +23,7 @@ from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version, file_digest
+from sortie.sim.process import collect_rarely
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
@@ -67,6 +68,12 @@ def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]
         raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
     _set_up()
     return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
+
+
+def fly_in_worker(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
+    """`fly_batch`, in a process that is the campaign's alone."""
+    collect_rarely()
+    return fly_batch(code, tasks)
 
 
 def fly_task(task: str) -> SortieRecord:

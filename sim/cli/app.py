@@ -33,6 +33,7 @@ from sortie.sim.cli import (
 )
 from sortie.sim.cli.console import err, out
 from sortie.sim.identity import code_version
+from sortie.sim.process import collect_rarely
 
 
 class _Commands(TyperGroup):
@@ -69,6 +70,7 @@ for name, command in COMMANDS.items():
 
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
+    collect_rarely()
     try:
         app()
     except SortieError as error:

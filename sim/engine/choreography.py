@@ -1,7 +1,7 @@
-"""Viewpoints in flight: what policies wish, what of it the formation grants, and the flight that comes of it.
+"""Viewpoints in flight: the moves that policies request, those that are safe, and the motion that follows.
 
-A sortie whose policies choose no viewpoints has none of this. Wishes of a frame are granted together, by ascending id,
-at the begin of the next one; whenever one is, the rest of the flight is worked out anew.
+It is used only where a policy chooses viewpoints. Requests of one frame are decided together at the begin of the next
+frame, by ascending drone. After a granted move the rest of the flight is computed again.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.world import World
 
 RETRY_S = 1.0
-"""A wish that was refused is looked at again after so long: the others have hardly moved on before."""
+"""Time until a refused request is decided again; the other drones have hardly moved before."""
 EVENT = "viewpoint"
-"""The kind under which grants and refusals stand among the record's events."""
+"""The kind of grants and refusals among the record's events."""
 
 
 class Choreography:
-    """Where every drone flies, as its policy asks and safety allows."""
+    """Moves drones to the viewpoints that their policies request, as far as safety allows."""
 
     def __init__(self, scenario: Scenario, world: World, *, posed_by_trace: bool) -> None:
-        """Args: `posed_by_trace` says that a drone flies a recorded pose: nobody knows its plans, so nobody moves.
+        """Args: `posed_by_trace`: some drone flies a recorded pose. Its plans are unknown, so no drone may move.
 
         Raises:
             MotionError: a slot's own way leaves the fence.
@@ -34,64 +34,64 @@ class Choreography:
         self._bounds = bounds_of(scenario.fleet)
         self._fixed = posed_by_trace
         self._frame = 0
-        self._wishes: dict[int, tuple[float, float, str]] = {}
-        self._told: dict[int, str] = {}
+        self._requests: dict[int, tuple[float, float, str]] = {}
+        self._reported: dict[int, str] = {}
         self._again_at: dict[int, int] = {}
         self._retry_frames = max(1, round(RETRY_S / scenario.frame_s))
         self.plans: list[Plan] = [()] * scenario.fleet.drones
 
-    def ask(self, drone: int, asked: Reposition | None) -> None:
-        """A drone's wish from now on; None is its slot."""
-        if asked is None:
-            self._wishes[drone] = (0.0, 0.0, "back to its slot")
+    def request(self, drone: int, viewpoint: Reposition | None) -> None:
+        """Request a viewpoint for a drone from now on; None requests its slot."""
+        if viewpoint is None:
+            self._requests[drone] = (0.0, 0.0, "back to its slot")
             return
         motion, at = self._world.motion, (self._frame, drone)
         error_x_m, error_y_m, _ = (motion.est_position_m[at] - motion.position_m[at]).tolist()
-        shift = self._course.wanted_shift_m(drone, self._frame, asked.x_m - error_x_m, asked.y_m - error_y_m)
-        self._wishes[drone] = (*shift, asked.reason)
+        shift = self._course.wanted_shift_m(drone, self._frame, viewpoint.x_m - error_x_m, viewpoint.y_m - error_y_m)
+        self._requests[drone] = (*shift, viewpoint.reason)
 
     def renew(self, frame: int) -> None:
-        """Grant what can be granted, to begin with this frame; call it before anything else looks at the frame."""
+        """Decide the open requests; granted moves begin with this frame. Call it first in a frame."""
         self._frame = frame
-        agents, again_at = self._world.agents, self._again_at
-        asking = [i for i in sorted(self._wishes) if agents[i].airborne and frame >= again_at.get(i, 0)]
+        drones, again_at = self._world.drones, self._again_at
+        requesting = [i for i in sorted(self._requests) if drones[i].airborne and frame >= again_at.get(i, 0)]
         if self._fixed:
-            for drone in asking:
-                self._tell(drone, "holds its slot: a drone of the fleet flies a recorded pose")
+            for drone in requesting:
+                self._report_once(drone, "holds its slot: a drone of the fleet flies a recorded pose")
             return
         answers: dict[int, Move | str | None] = {}
         moved = False
-        while asking:  # who was in the way may have been granted a move meanwhile
-            answers |= {i: self._granted(i) for i in asking}
-            again = [i for i in asking if isinstance(answers[i], str)]
-            moved |= any(isinstance(answers[i], Move) for i in asking)
-            asking = again if len(again) < len(asking) else []
+        while requesting:  # who was in the way may have been granted a move meanwhile
+            answers |= {i: self._granted(i) for i in requesting}
+            again = [i for i in requesting if isinstance(answers[i], str)]
+            moved |= any(isinstance(answers[i], Move) for i in requesting)
+            requesting = again if len(again) < len(requesting) else []
         for drone, answer in answers.items():
             self._write(drone, answer)
         if moved:
             self._world.reroute(displaced(self._world.motion, self._base, self._course, self.plans, frame))
 
     def _granted(self, drone: int) -> Move | str | None:
-        """What comes of a wish; a move is on the plan from here on."""
-        x_m, y_m, _ = self._wishes[drone]
-        gone = [agent.drone for agent in self._world.agents if not agent.airborne]
+        """The answer to a request: a move, which is then part of the plan, or the reason for refusal."""
+        x_m, y_m, _ = self._requests[drone]
+        gone = [i for i, status in enumerate(self._world.drones) if not status.airborne]
         answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame, gone)
         if isinstance(answer, Move):
             self.plans[drone] = (*self.plans[drone], answer)
         return answer
 
     def _write(self, drone: int, answer: Move | str | None) -> None:
-        reason = self._wishes[drone][2]
+        reason = self._requests[drone][2]
         if isinstance(answer, Move):
             (x_m, y_m), what = answer.end_m, f"moves {answer.length_m:.1f} m in {answer.width_s:.1f} s"
-            self._told.pop(drone, None)
+            self._reported.pop(drone, None)
             self._world.note(drone, EVENT, f"{what}, to {x_m:+.1f} m ahead and {y_m:+.1f} m left of its slot: {reason}")
         elif answer is not None:
             self._again_at[drone] = self._frame + self._retry_frames
-            self._tell(drone, f"stays, {answer}: {reason}")
+            self._report_once(drone, f"stays, {answer}: {reason}")
 
-    def _tell(self, drone: int, text: str) -> None:
-        """Once, however often the wish is repeated."""
-        if self._told.get(drone) != text:
-            self._told[drone] = text
+    def _report_once(self, drone: int, text: str) -> None:
+        """Record a text once, however often the request is repeated."""
+        if self._reported.get(drone) != text:
+            self._reported[drone] = text
             self._world.note(drone, EVENT, text)

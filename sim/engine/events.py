@@ -1,4 +1,4 @@
-"""Scenario events: what goes wrong, when, put on the clock."""
+"""Puts scenario events (link drops, jammers, losses, faults, attacks, lies) on the clock."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sortie.scenarios.schema import (
     Spoof,
 )
 from sortie.scenarios.streams import stream
-from sortie.sim.engine.transport import Ether
+from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import World, at, with_frame
 
 OVERSIZED_BYTES = 2000
@@ -38,13 +38,14 @@ def group_key(seed: int) -> bytes:
     return hashlib.sha256(b"sortie group key" + struct.pack("<Q", seed)).digest()
 
 
-def schedule(scenario: Scenario, world: World, ether: Ether, *, seed: int, replication: int) -> None:
+def schedule(scenario: Scenario, world: World, transport: Transport, *, seed: int, replication: int) -> None:
     """Put every event of the scenario on the clock; call once, before anything else is scheduled.
 
-    Events come before the frame that begins at the same instant, and so do their ends: from now, the clock says all of
-    their times to the last digit.
+    Events and their ends come before the frame that begins at the same instant.
     """
-    begins = [_Begin(scenario, world, ether, e, index, seed, replication) for index, e in enumerate(scenario.events)]
+    begins = [
+        _Begin(scenario, world, transport, e, index, seed, replication) for index, e in enumerate(scenario.events)
+    ]
     for begin in begins:
         at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
     for begin in begins:
@@ -57,9 +58,16 @@ class _Begin:
     """An event's begin; a callable, so that each keeps its own event."""
 
     def __init__(
-        self, scenario: Scenario, world: World, ether: Ether, event: Event, index: int, seed: int, replication: int
+        self,
+        scenario: Scenario,
+        world: World,
+        transport: Transport,
+        event: Event,
+        index: int,
+        seed: int,
+        replication: int,
     ) -> None:
-        self.scenario, self.world, self.ether, self.event = scenario, world, ether, event
+        self.scenario, self.world, self.transport, self.event = scenario, world, transport, event
         self.index, self.seed, self.replication = index, seed, replication
 
     def __call__(self) -> None:
@@ -74,34 +82,34 @@ class _Begin:
                 world.jammers[self.index] = (event.position_m, event.power_dbm)
             case DroneLost():
                 world.drain()  # what it has spent up to now
-                if world.agents[event.drone].airborne:
+                if world.drones[event.drone].airborne:
                     world.remove(event.drone, "drone_lost", "fell silent")
             case BatteryFault():
                 world.drain()
-                if world.agents[event.drone].airborne:  # who left the air spends nothing any more
+                if world.drones[event.drone].airborne:  # who left the air spends nothing any more
                     lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
                     world.note(event.drone, "battery_fault", lost)
                     world.batteries.fault(event.drone, event.lost_fraction)
                     world.ground_landed()
             case CellFailure():
                 world.drain()
-                if world.agents[event.drone].airborne:
+                if world.drones[event.drone].airborne:
                     world.batteries.drop_cell(event.drone)
                     world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
                     world.ground_landed()
             case ClockSkew():
                 world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
-                world.agents[event.drone].clock_skew_s = event.skew_s
+                world.drones[event.drone].clock_skew_s = event.skew_s
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
             case Lie():
                 world.note(event.drone, "lie", f"claims {event.claim} {event.about}")
                 lie = partial(falsified, about=event.about, claim=event.claim)
-                world.agents[event.drone].lies[self.index] = lie
+                world.drones[event.drone].lies[self.index] = lie
 
     def end(self) -> None:
-        """What lasts is over."""
+        """End an event that lasts."""
         world, event = self.world, self.event
         match event:
             case LinkDrop():
@@ -111,7 +119,7 @@ class _Begin:
                 del world.jammers[self.index]
                 world.note(-1, "jam_over", "the jammer is off")
             case Lie():
-                del world.agents[event.drone].lies[self.index]
+                del world.drones[event.drone].lies[self.index]
                 world.note(event.drone, "lie_over", "tells the truth again")
 
     def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
@@ -122,10 +130,10 @@ class _Begin:
         end_s = self.scenario.duration_s if event.until_s is None else event.until_s
         listeners = [i for i in range(self.scenario.fleet.drones) if i != event.drone]
         while env.now < end_s:
-            genuine = self.ether.last_datagram.get(event.drone, b"")
+            genuine = self.transport.last_datagram.get(event.drone, b"")
             captured = captured or genuine
             if genuine:
-                self.ether.inject(self._datagram(event, genuine, captured, sealer, rng), listeners)
+                self.transport.inject(self._datagram(event, genuine, captured, sealer, rng), listeners)
             yield env.timeout(1.0 / event.rate_hz)
 
     def _datagram(

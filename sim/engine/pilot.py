@@ -1,8 +1,8 @@
-"""Who decides on a drone right now: its policy, as the mission, the clock and the ground change it; and the audit.
+"""A drone's policy in flight, which the mission, the clock or a command may change; and the audit of its decisions.
 
-A pilot stands where the agent's policy stands. It takes over another policy between two decisions; what a link
-carries, its dwell time and when it last sent are the agent's and stay. It shows the policy a kept view where the
-scenario says so, counts the directives that break an invariant, and with a shield puts right what it can.
+The agent calls its pilot as its policy. The pilot may change to another policy between two decisions; the agent keeps
+what a link carries, its dwell time and its last sending time. The pilot replays recorded views where the scenario has
+them. It counts directives that break an invariant. With a shield it also replaces such directives where it can.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import simpy
 
-from sortie.fleet.agent import Agent
 from sortie.policies.contract import (
     PHASE_NAMES,
     PHASE_OF,
@@ -43,39 +42,39 @@ from sortie.sim.engine.world import at, with_frame
 from sortie.sim.results.record import DECISIONS_OF, Recorder
 
 
-class Named(NamedTuple):
+class NamedPolicy(NamedTuple):
     """A policy and what the audit calls it."""
 
     name: str
     decide: Policy
     handshake_bytes: int = 0
-    """What it puts on every link and frame before payloads."""
+    """Size of the request or answer that its method sends on every link in every frame, before payloads."""
 
 
 class PolicyPlan(NamedTuple):
-    """What a scenario says of the policies, resolved and checked before anything flies."""
+    """A scenario's policies, resolved and checked before anything flies."""
 
-    first: Named
-    changes: tuple[tuple[PolicyChange, Named], ...] = ()
+    first: NamedPolicy
+    changes: tuple[tuple[PolicyChange, NamedPolicy], ...] = ()
     commands: tuple[tuple[float, str, tuple[int, ...]], ...] = ()
     rules: tuple[Invariant, ...] = ()
     shielded: bool = False
     replays: tuple[tuple[float, int, FleetView], ...] = ()
 
     @property
-    def looks(self) -> bool:
+    def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
         policies = (self.first, *(policy for _, policy in self.changes))
         return any(viewpoint_of(policy.decide) is not None for policy in policies)
 
 
-def plan_of(section: PolicySection, first: Named | None = None) -> PolicyPlan:
-    """A scenario's policies; `first` flies instead of them all, with the scenario's invariants and shield.
+def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyPlan:
+    """The policies of a scenario. `first` replaces them all, but the scenario's invariants and shield still apply.
 
     Raises:
         PolicyError: an unknown policy or parameter, an invariant that is none, a view that cannot be read.
     """
-    changes = () if first is not None else tuple((c, named(c.name, c.params)) for c in section.changes)
+    changes = () if first is not None else tuple((c, named_policy(c.name, c.params)) for c in section.changes)
     commands = () if first is not None else tuple((c.at_s, c.command, c.drones) for c in section.commands)
     try:
         rules = parse(section.invariants)
@@ -89,16 +88,18 @@ def plan_of(section: PolicySection, first: Named | None = None) -> PolicyPlan:
     for k, (_, drone, view) in enumerate(replays):
         if view.ego != drone:
             raise PolicyError(f"policy.replays.{k}.view: its ego is {view.ego}, must be drone {drone}")
-    return PolicyPlan(first or named(section.name, section.params), changes, commands, rules, section.shield, replays)
+    return PolicyPlan(
+        first or named_policy(section.name, section.params), changes, commands, rules, section.shield, replays
+    )
 
 
-def named(name: str, params: Mapping[str, object]) -> Named:
+def named_policy(name: str, params: Mapping[str, object]) -> NamedPolicy:
     inside = ", ".join(f"{k}={v}" for k, v in params.items())
-    return Named(f"{name}({inside})" if inside else name, resolve(name, params), handshake_bytes(name, params))
+    return NamedPolicy(f"{name}({inside})" if inside else name, resolve(name, params), handshake_bytes(name, params))
 
 
 class Audit:
-    """Writes down which policy took over when and why, and where a directive broke an invariant."""
+    """Records each change of policy with its reason, and each directive that breaks an invariant."""
 
     def __init__(self, env: simpy.Environment, recorder: Recorder) -> None:
         self._env, self._rows = env, recorder.rows
@@ -110,10 +111,10 @@ class Audit:
         """Counts, and decisions by policy as `decisions_of NAME`."""
         return {**self.counts, **{f"{DECISIONS_OF}{name}": n for name, n in self.decisions.items()}}
 
-    def took_over(self, drone: int, before: str, after: str, why: str) -> None:
+    def took_over(self, drone: int, before: str, after: str, reason: str) -> None:
         """A drone's policy changed."""
         self.counts["policy_changes"] += 1
-        self._rows["events"].append((self._env.now, drone, "policy", f"{before} → {after}: {why}"))
+        self._rows["events"].append((self._env.now, drone, "policy", f"{before} → {after}: {reason}"))
 
     def stepped_in(self, policy: str, directive: Directive) -> None:
         """The shield replaced a directive, or could not keep an invariant."""
@@ -121,7 +122,7 @@ class Audit:
         self._write(directive.source, directive.destination, policy, "shield", directive.reason.removeprefix(MARK))
 
     def broke(self, drone: int, peer: int, policy: str, what: str) -> None:
-        """A directive that goes to the gate breaks an invariant; peer −1: they all together."""
+        """A directive that goes to the gate breaks an invariant; peer −1: all of a drone's directives together."""
         self.counts["invariant_violations"] += 1
         self._write(drone, peer, policy, "broken", what)
 
@@ -133,12 +134,15 @@ class Pilot:
     """One drone's policy in flight."""
 
     def __init__(
-        self, drone: int, plan: PolicyPlan, audit: Audit, wish: Callable[[int, Reposition | None], None] | None = None
+        self,
+        drone: int,
+        plan: PolicyPlan,
+        audit: Audit,
+        request_viewpoint: Callable[[int, Reposition | None], None] | None = None,
     ) -> None:
-        """Args: `wish` takes where the drone asks to look from; None where no policy of the plan does."""
-        self.drone, self.policy, self._wish = drone, plan.first, wish
-        self._look = viewpoint_of(plan.first.decide)
-        self.agent: Agent | None = None
+        """Args: `request_viewpoint` takes the viewpoints that the policy chooses; None where no policy of the plan does."""
+        self.drone, self.policy, self._request = drone, plan.first, request_viewpoint
+        self._viewpoint = viewpoint_of(plan.first.decide)
         changes = enumerate(plan.changes)
         self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision
@@ -148,34 +152,36 @@ class Pilot:
         self._shown: FleetView | None = None
         self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
 
-    def take_over(self, policy: Named, why: str, place: int) -> None:
+    def take_over(self, policy: NamedPolicy, reason: str, place: int) -> None:
         """From the next decision on, `policy` decides; `place` is the change's in the scenario's list."""
         self._place = place
         if policy.name != self.policy.name:
-            self._audit.took_over(self.drone, self.policy.name, policy.name, why)
-            self.policy, self._look = policy, viewpoint_of(policy.decide)
-            if self._look is None and self._wish is not None:
-                self._wish(self.drone, None)
-            if self.agent is not None:
-                self.agent.handshake_bytes = policy.handshake_bytes
+            self._audit.took_over(self.drone, self.policy.name, policy.name, reason)
+            self.policy, self._viewpoint = policy, viewpoint_of(policy.decide)
+            if self._viewpoint is None and self._request is not None:
+                self._request(self.drone, None)
+
+    def handshake_bytes(self) -> int:
+        """Size of the request or answer that the present policy's method sends on every link, before payloads."""
+        return self.policy.handshake_bytes
 
     def show(self, view: FleetView) -> None:
         """The next decision is made on this view."""
         self._shown = view
 
     def __call__(self, view: FleetView) -> Sequence[Directive]:
-        """The agent's policy: the present policy's directives, put right where there is a shield."""
+        """The present policy's directives; with a shield, those that break an invariant are replaced."""
         if self._by_phase:
             self._follow_phase(view)
         self._place = -1
         decisions = self._audit.decisions
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
-        if self._look is not None and self._wish is not None:
-            self._wish(self.drone, self._looked(view if self._shown is None else self._shown))
+        if self._viewpoint is not None and self._request is not None:
+            self._request(self.drone, self._requested_viewpoint(view if self._shown is None else self._shown))
         if not self._rules and self._shown is None:
-            return self._ask(view)
+            return self._decide(view)
         shown, self._shown = self._shown, None
-        directives = self._kept(view if shown is None else shown)
+        directives = self._decide_within_rules(view if shown is None else shown)
         if shown is not None:
             self._judge_shown(shown, directives)
         return directives
@@ -188,18 +194,18 @@ class Pilot:
             if place > self._place:  # else a later one of the list came with the phase
                 self.take_over(policy, f"phase {PHASE_NAMES[TaskPhase(me.task_phase)]}", place)
 
-    def _looked(self, view: FleetView) -> Reposition | None:
-        """Where the policy asks to look from."""
-        assert self._look is not None  # noqa: S101
+    def _requested_viewpoint(self, view: FleetView) -> Reposition | None:
+        """The viewpoint that the policy chooses; None keeps its slot."""
+        assert self._viewpoint is not None  # noqa: S101
         try:
-            asked = self._look(view)
+            asked = self._viewpoint(view)
         except Exception as error:
             what = f"its viewpoint raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
         check_reposition(asked, view)
         return asked
 
-    def _ask(self, view: FleetView) -> Sequence[Directive]:
+    def _decide(self, view: FleetView) -> Sequence[Directive]:
         try:
             answer = self.policy.decide(view)
         except PolicyError:
@@ -212,11 +218,11 @@ class Pilot:
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
         return answer
 
-    def _kept(self, view: FleetView) -> Sequence[Directive]:
+    def _decide_within_rules(self, view: FleetView) -> Sequence[Directive]:
         name, audit = self.policy.name, self._audit
-        directives = self._ask(view)
+        directives = self._decide(view)
         check_directives(directives, view)  # before the rules read them
-        fresh = self._ask(just_heard(view)) if self._asks_fresh else ()
+        fresh = self._decide(just_heard(view)) if self._asks_fresh else ()
         if self._shielded:
             directives = enforce(self._rules, view, directives, fresh)
             for d in directives:
@@ -243,27 +249,23 @@ class Pilot:
                 self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
 
 
-def schedule_policies(
-    env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], agents: Sequence[Agent], frame_s: float
-) -> None:
+def schedule_policies(env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], frame_s: float) -> None:
     """Put changes by time, commands and replays on the clock; each comes before the frame of the same instant, and of
     two changes at one instant the later in the list comes last."""
-    for pilot, agent in zip(pilots, agents, strict=True):
-        pilot.agent = agent
     due: list[tuple[float, int, Callable[[], None]]] = []
     for place, (change, policy) in enumerate(plan.changes):
         if change.at_s is not None:
             due.append((change.at_s, place, partial(_take_over, pilots, policy, f"time {change.at_s:g} s", place)))
         for at_s, word, drones in plan.commands:
             if change.command == word:
-                told = [p for p in pilots if not drones or p.drone in drones]
-                due.append((at_s, place, partial(_take_over, told, policy, f"command {word!r}", place)))
+                addressed = [p for p in pilots if not drones or p.drone in drones]
+                due.append((at_s, place, partial(_take_over, addressed, policy, f"command {word!r}", place)))
     for at_s, _, act in sorted(due, key=lambda entry: entry[:2]):
         at(env, with_frame(at_s, frame_s), act)
     for at_s, drone, view in plan.replays:
         at(env, at_s, partial(pilots[drone].show, view))
 
 
-def _take_over(pilots: Sequence[Pilot], policy: Named, why: str, place: int) -> None:
+def _take_over(pilots: Sequence[Pilot], policy: NamedPolicy, reason: str, place: int) -> None:
     for pilot in pilots:
-        pilot.take_over(policy, why, place)
+        pilot.take_over(policy, reason, place)

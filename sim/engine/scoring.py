@@ -1,28 +1,22 @@
-"""Fusion and scoring: at each scored frame every receiver fuses what it holds, and its boxes are written down."""
+"""Fusion and scoring: at each scored frame every drone fuses the payloads it holds, and its boxes are recorded."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import simpy
 
-from sortie.fleet.agent import Agent, Received
-from sortie.perception.detectors import DetectsAhead, DetectsMany
+from sortie.fleet.agent import Agent
+from sortie.fleet.memory import Received
+from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import Recorder
-
-
-class Detector(Protocol):
-    """What a sortie needs of a detector."""
-
-    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]: ...
-    def truth(self, t_s: float, ego: Capture) -> Boxes: ...
 
 
 def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
@@ -32,14 +26,14 @@ def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
 
 
 def as_share(received: Received, trust: float = 1.0) -> Share:
-    """A held payload as the detector takes it, from a sender that its receiver trusts so far."""
+    """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender."""
     payload = received.payload
     name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
     return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing)
 
 
 Job = tuple[Capture, list[Share]]
-"""An ego's look, and what it holds of its peers."""
+"""An ego's capture, and the shares of its peers."""
 
 
 class Ego(NamedTuple):
@@ -48,7 +42,7 @@ class Ego(NamedTuple):
     here: Capture
     """Where it is."""
     job: Job | None
-    """What it fuses; None where its own look is too old for that, so that it sees nothing."""
+    """What it fuses; None where its own capture is too old, so that it detects nothing."""
 
 
 Moment = tuple[float, list[Ego]]
@@ -56,15 +50,15 @@ Moment = tuple[float, list[Ego]]
 
 
 def jobs_of(moment: Moment) -> list[Job]:
-    """What the detector is asked of a moment."""
+    """The detector's jobs at a moment."""
     return [ego.job for ego in moment[1] if ego.job is not None]
 
 
 class Scorer:
     """Runs the detector over the fleet at the scored frames' fusion times.
 
-    A detector that takes many moments together is asked when `flush` is called, any other at the moment itself; one that
-    works in the background may take until the next moment.
+    A detector that takes many moments together runs when `flush` is called. Any other runs at the moment itself. One that
+    works in the background has time until the next moment.
     """
 
     def __init__(
@@ -76,7 +70,7 @@ class Scorer:
         recorder: Recorder,
     ) -> None:
         self._env, self._scenario, self._detector = env, scenario, detector
-        # asked once: what a protocol asks of a class takes longer to find out than a fusion takes
+        # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._agents, self._recorder = agents, recorder
@@ -100,7 +94,7 @@ class Scorer:
         now_s = self._env.now
         moment: Moment = now_s, []
         for agent in self._agents:
-            if agent.airborne and agent.here is not None and agent.latest is not None:
+            if agent.status.airborne and agent.here is not None and agent.latest is not None:
                 moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
@@ -110,25 +104,25 @@ class Scorer:
             self.flush()
 
     def flush(self, but: int = 0) -> None:
-        """Write down what the moments since the last call come to, but the latest so many."""
+        """Record the results of the moments since the last call, except the latest `but`."""
         n = len(self._waiting) - but
         waiting, self._waiting = self._waiting[:n], self._waiting[n:]
         begun, self._begun = self._begun[:n], self._begun[n:]
-        asked = [(t_s, ego) for t_s, egos in waiting for ego in egos]
-        if not asked:
+        egos_scored = [(t_s, ego) for t_s, egos in waiting for ego in egos]
+        if not egos_scored:
             return
         rows, detector = self._recorder.rows, self._detector
-        found: Iterable[Boxes]
+        detections: Iterable[Boxes]
         truths: Iterable[Boxes]
         if self._many is not None:
-            found = self._many.detect_many([jobs_of(moment) for moment in waiting])
-            truths = self._many.truth_many([t_s for t_s, _ in asked], [ego.here for _, ego in asked])
+            detections = self._many.detect_many([jobs_of(moment) for moment in waiting])
+            truths = self._many.truth_many([t_s for t_s, _ in egos_scored], [ego.here for _, ego in egos_scored])
         else:
             ready = begun or [partial(detector.detect, jobs_of(moment)) for moment in waiting]
-            found = (boxes for wait in ready for boxes in wait())
-            truths = (detector.truth(t_s, ego.here) for t_s, ego in asked)
-        each = iter(found)
-        for (now_s, ego), truth in zip(asked, truths, strict=True):
+            detections = (boxes for wait in ready for boxes in wait())
+            truths = (detector.truth(t_s, ego.here) for t_s, ego in egos_scored)
+        each = iter(detections)
+        for (now_s, ego), truth in zip(egos_scored, truths, strict=True):
             boxes, shares = (Boxes.empty(), []) if ego.job is None else (next(each), ego.job[1])
             drone = ego.here.drone
             rows["detections"].append((now_s, drone, boxes))
@@ -141,17 +135,18 @@ class Scorer:
             )  # fmt: skip
 
     def _job(self, agent: Agent, look: Capture, now_s: float) -> Job | None:
-        """The agent's look and what it holds, by ascending peer, of what is young enough; None where it rested too long."""
+        """The agent's capture and recent shares, by ascending peer; None where its own capture is too old."""
         config = self._scenario.perception
         limit_s = config.max_age_s + 1e-9
-        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # what a look takes anyhow
+        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
             return None
-        held = [agent.held[p] for p in sorted(agent.held) if now_s - agent.held[p].capture.t_s <= limit_s]
-        return look, [as_share(r, agent.trust_in(r.capture.drone)) for r in held]
+        memory = agent.memory
+        held = [received for _, received in sorted(memory.held.items()) if now_s - received.capture.t_s <= limit_s]
+        return look, [as_share(r, memory.trust_in(r.capture.drone)) for r in held]
 
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
-    """A fusion's boxes stand in one row."""
+    """Columns of the table; each row gathered holds all boxes of a fusion."""
     t_s, drones, several = zip(*rows, strict=True)
     boxes, counts = Boxes.join(several), [len(b) for b in several]
     values = boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad, boxes.score

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import pyarrow as pa
 import simpy
 
-from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.agent import Agent
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
-from sortie.fleet.flight.motion import fly
+from sortie.fleet.gate import Gate
+from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
-from sortie.fleet.traces import follow, read_traces
+from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Capture
-from sortie.policies.contract import Disc, Policy
+from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
@@ -31,17 +31,16 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.mission import MissionPlan
-from sortie.sim.engine.pilot import Audit, Named, Pilot, PolicyPlan, named, plan_of, schedule_policies
+from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
-from sortie.sim.engine.transport import Ether
-from sortie.sim.engine.world import World, route_bounds
+from sortie.sim.engine.transport import Transport
+from sortie.sim.engine.world import OwnSenses, World, route_bounds
 from sortie.sim.identity import code_version
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
 KEY_ID = 1
 PHASE_SHARE, PHASE_S = 0.1, 0.01
-"""Drones act within the first tenth of a frame, and within its first 10 ms, each at its own moment: clocks disciplined,
-not locked."""
+"""Each drone acts at its own moment, within the first tenth of a frame and its first 10 ms."""
 
 
 class Observer(Protocol):
@@ -51,23 +50,10 @@ class Observer(Protocol):
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
 
 
-@contextmanager
-def _not_collecting() -> Iterator[None]:
-    """No look for reference cycles in a flight: it makes none, and every look goes over its record."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-DetectorOf = Callable[[SceneModel, Perception, int, int], Detector | None]
+DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
 """As `sortie.perception.detectors.Constructor`; None flies without."""
 
 
-@_not_collecting()
 def run_sortie(
     scenario: Scenario,
     policy: str | Policy | None = None,
@@ -76,18 +62,18 @@ def run_sortie(
     replication: int = 0,
     progress: Callable[[float], None] | None = None,
     observer: Observer | None = None,
-    detector_of: DetectorOf = make_detector,
+    detector_of: DetectorMaker = make_detector,
 ) -> SortieRecord:
     """Fly one sortie from 0 to `scenario.duration_s` (exclusive) and return its record.
 
     Args:
-        scenario: what is to be flown.
+        scenario: the scenario to fly.
         policy: a policy's name, `file.py:function`, or a callable; None takes the scenario's own.
         seed: None takes the scenario's own.
-        replication: another draw of everything random, for campaigns.
+        replication: number of the repetition; each has other random draws.
         progress: called with the simulated time once a simulated second.
         observer: gets the new rows once a simulated second.
-        detector_of: makes the detector; left out, the one that the scenario names.
+        detector_of: makes the detector; the default makes the one that the scenario names.
 
     Returns:
         The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
@@ -97,15 +83,53 @@ def run_sortie(
     """
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
-    name, flight_plan = _policy(scenario, policy)
-    n, config, air_of = scenario.fleet.drones, scenario.perception, scenario.radio
-    env, recorder = simpy.Environment(), Recorder()
+    name, policies = _policy(scenario, policy)
+    parts = build(scenario, policies, seed, replication, detector_of)
+    _fly(parts, progress, observer)
+    record = _collect(parts, name, seed, replication)
+    return dataclasses.replace(record, wall={"wall_s": time.perf_counter() - begin_s, **record.wall})
 
-    motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
-    traces = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, n)
-    motion = follow(motion, traces, scenario.frame_s)
+
+@dataclass(frozen=True)
+class Parts:
+    """Everything that flies in one sortie, wired and not yet started. No part is replaced or completed afterwards."""
+
+    scenario: Scenario
+    env: simpy.Environment
+    recorder: Recorder
+    scene: SceneModel
+    batteries: FleetBatteries
+    air: Air
+    world: World
+    transport: Transport
+    choreography: Choreography | None
+    """None where no policy chooses viewpoints."""
+    pilots: Sequence[Pilot]
+    agents: Sequence[Agent]
+    detector: Detector | None
+    scorer: Scorer | None
+    """None without a detector."""
+    audit: Audit
+    notes: AgentNotes
+
+
+def build(
+    scenario: Scenario,
+    policies: PolicyPlan,
+    seed: int,
+    replication: int = 0,
+    detector_of: DetectorMaker = make_detector,
+) -> Parts:
+    """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
+    env, recorder = simpy.Environment(), Recorder()
+    drones, rules = range(scenario.fleet.drones), _rules(scenario)
+    statuses = [DroneStatus() for _ in drones]
+    memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
+
+    motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
-    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, n, charges)
+    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, len(drones), charges)
+    up = up_vector(motion.orientation_xyzw)
     air = Air(
         env,
         AirSettings.of(scenario.radio.model_dump(exclude={"framing"})),
@@ -113,60 +137,51 @@ def run_sortie(
         seed=seed,
         replication=replication,
         frame_s=scenario.frame_s,
-        up=up_vector(motion.orientation_xyzw),
+        up=up,
     )
-    scene = SceneModel(config.scene, scenario.mission.target, route_bounds(motion))
-    plan = MissionPlan(scenario.mission)
-    world = World(env, scenario, motion, batteries, air, scene, plan, recorder)
-    keys = {KEY_ID: group_key(seed)} if scenario.context.authentication else None
-    rates_mbps = STANDARDS[air_of.standard].rates_mbps[air_of.bandwidth_mhz] if air_of.trace is None else ()
-    ether = Ether(air, recorder, keys=keys, rates_mbps=rates_mbps)
-    detector = detector_of(scene, config, seed, replication)
-
-    def count_boxes(capture: Capture, roi: Disc | None) -> int:
-        assert detector is not None  # noqa: S101
-        return detector.count_boxes(capture, roi)
-
-    rules = PlaneRules(
-        period_s=scenario.frame_s,
-        frames=scenario.frames,
-        degraded_after_periods=scenario.context.degraded_after_periods,
-        detached_after_periods=scenario.context.detached_after_periods,
-        dwell_s=scenario.policy.dwell_s,
-        hysteresis=scenario.policy.hysteresis,
-        compute_delay_s=config.compute_delay_s,
-        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
-        trust=scenario.context.trust,
-        publish_every=scenario.context.publish_every,
-        form=Form(**scenario.context.form.model_dump()),
+    scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
+    world = World(env, scenario, statuses, motion, batteries, air, scene, MissionPlan(scenario.mission), recorder)
+    key = group_key(seed) if scenario.context.authentication else None
+    transport = Transport(
+        env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)
     )
-    audit = Audit(env, recorder)
-    choreography: Choreography | None = None
-    if flight_plan.looks:
+
+    audit, choreography = Audit(env, recorder), None
+    if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
-        world.before_frame = choreography.renew
-    wish = None if choreography is None else choreography.ask
-    pilots = [Pilot(i, flight_plan, audit, wish) for i in range(n)]
+    pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.request) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
+    detector = detector_of(scene, scenario.perception, seed, replication)
+    count_boxes = None if detector is None else detector.count_boxes
     agents = [
         Agent(
             env,
-            i,
+            memories[i],
             rules=rules,
             policy=pilots[i],
-            senses=world.senses(i, count_boxes if detector is not None else None),
-            modem=ether.modem(i),
+            senses=OwnSenses(world, i, count_boxes),
+            modem=transport.modem(i),
+            gate=Gate(),
             log=notes,
-            sealer=None if keys is None else Sealer(keys[KEY_ID], KEY_ID),
+            sealer=None if key is None else Sealer(key, KEY_ID),
             phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
-            handshake_bytes=flight_plan.first.handshake_bytes,
+            handshake_bytes=pilots[i].handshake_bytes,
         )
-        for i in range(n)
+        for i in drones
     ]
-    world.agents = ether.agents = agents
-
     scorer = None if detector is None else Scorer(env, scenario, detector, agents, recorder)
+    schedule(scenario, world, transport, seed=seed, replication=replication)
+    schedule_policies(env, policies, pilots, scenario.frame_s)
+    return Parts(
+        scenario, env, recorder, scene, batteries, air, world, transport, choreography, pilots, agents, detector, scorer,
+        audit, notes,
+    )  # fmt: skip
+
+
+def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Observer | None) -> None:
+    """Start every process, run the clock to the end, and record what is still in flight."""
+    world, scorer, recorder = parts.world, parts.scorer, parts.recorder
 
     def each_second(t_s: float) -> None:
         if progress is not None:
@@ -176,44 +191,63 @@ def run_sortie(
                 scorer.flush()
             observer.second(t_s, recorder.take_new())
 
-    world.on_second = each_second
     if observer is not None:
-        observer.begin(scenario, scene)
-    schedule(scenario, world, ether, seed=seed, replication=replication)
-    schedule_policies(env, flight_plan, pilots, agents, scenario.frame_s)
-    world.start()
-    for agent in agents:
+        observer.begin(parts.scenario, parts.scene)
+    world.start(each_second, None if parts.choreography is None else parts.choreography.renew)
+    for agent in parts.agents:
         agent.start()
     if scorer is not None:
         scorer.start()
-
-    env.run(until=scenario.duration_s)
+    parts.env.run(until=parts.scenario.duration_s)
     world.drain()
-    ether.finish()
-    recorder.rows["energy"].extend(
-        (i, cause, joules) for cause, per_drone in batteries.energy_j.items() for i, joules in enumerate(per_drone)
-    )
+    parts.transport.finish()
+    energy_j = parts.batteries.energy_j
+    recorder.rows["energy"].extend((i, cause, j) for cause, each in energy_j.items() for i, j in enumerate(each))
     if scorer is not None:
         scorer.flush()
-    each_second(env.now)
+    each_second(parts.env.now)
+
+
+def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRecord:
+    """The record of a sortie that has ended."""
+    air, notes, recorder = parts.air, parts.notes, parts.recorder
     tables = recorder.tables()
-    recorder.rows.clear()  # agents and air hold one another, so that nothing else lets go of the rows at once
+    recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
+    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
-        scenario=scenario,
-        policy=name,
+        scenario=parts.scenario,
+        policy=policy,
         seed=seed,
         replication=replication,
         version=code_version(),
         tables=tables,
-        totals={**notes.totals(), **audit.totals(), **_air_totals(air)},
-        calibration=detector.calibration if isinstance(detector, DetectsMany) else None,
-        wall={"wall_s": time.perf_counter() - begin_s, **notes.policy_eval_us()},
+        totals={**notes.totals(), **parts.audit.totals(), **counters, "medium_busy_fraction": air.utilisation},
+        calibration=parts.detector.calibration if isinstance(parts.detector, DetectsMany) else None,
+        wall=notes.policy_eval_us(),
     )
 
 
-def _air_totals(air: Air) -> dict[str, float]:
-    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
-    return {**counters, "medium_busy_fraction": air.utilisation}
+def _rules(scenario: Scenario) -> PlaneRules:
+    context = scenario.context
+    return PlaneRules(
+        period_s=scenario.frame_s,
+        frames=scenario.frames,
+        degraded_after_periods=context.degraded_after_periods,
+        detached_after_periods=context.detached_after_periods,
+        dwell_s=scenario.policy.dwell_s,
+        hysteresis=scenario.policy.hysteresis,
+        compute_delay_s=scenario.perception.compute_delay_s,
+        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
+        trust=context.trust,
+        publish_every=context.publish_every,
+        form=Form(**context.form.model_dump()),
+    )
+
+
+def _rates_mbps(scenario: Scenario) -> Sequence[float]:
+    """The channel's data rates by MCS; none where links are traced."""
+    radio = scenario.radio
+    return STANDARDS[radio.standard].rates_mbps[radio.bandwidth_mhz] if radio.trace is None else ()
 
 
 def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, PolicyPlan]:
@@ -224,5 +258,9 @@ def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Polic
     section = scenario.policy
     if policy is None or policy == section.name:
         return section.name, plan_of(section)
-    first = named(policy, {}) if isinstance(policy, str) else Named(getattr(policy, "__name__", "policy"), policy)
+    first = (
+        named_policy(policy, {})
+        if isinstance(policy, str)
+        else NamedPolicy(getattr(policy, "__name__", "policy"), policy)
+    )
     return first.name, plan_of(section, first)

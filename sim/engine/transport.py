@@ -1,7 +1,7 @@
-"""Between the agents and the air: who hears which bytes, and what became of each payload.
+"""Between the drones and the air: which drone receives which bytes, and the fate of each payload.
 
-The radio knows bytes and positions only. This is where a datagram that was heard is opened and handed to its
-receivers, and where a transmission number is joined again with the payload it stands for.
+The radio handles bytes and positions only. This module opens each datagram and hands it to its receivers. It also finds
+the payload that belongs to a transmission number.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from sortie.fleet.agent import Agent, Received
+import simpy
+
 from sortie.fleet.gate import Payload
+from sortie.fleet.memory import PeerMemory, Received
 from sortie.fleet.messages.auth import Dropped, Opened, open_datagram
 from sortie.fleet.tiles import cells_of
 from sortie.perception.types import Capture
@@ -22,16 +24,32 @@ from sortie.scenarios.representation import NAME_OF
 from sortie.sim.results.record import HANDSHAKE, Recorder
 
 
-class Ether:
-    """Joins every agent's modem to the one air."""
+class Transport:
+    """Joins every drone's modem and memory to the one air."""
 
     def __init__(
-        self, air: Air, recorder: Recorder, *, keys: dict[int, bytes] | None, rates_mbps: Sequence[float]
+        self,
+        env: simpy.Environment,
+        air: Air,
+        receivers: Sequence[PeerMemory],
+        recorder: Recorder,
+        *,
+        keys: dict[int, bytes] | None,
+        rates_mbps: Sequence[float],
     ) -> None:
-        """Args: `keys` by key id, None where descriptors go unauthenticated; `rates_mbps` of the channel by MCS, none where
-        links are traced: then what a frame's rate is told is not what it came at."""
+        """Put the transport on the air.
+
+        Args:
+            env: the clock.
+            air: carries bytes.
+            receivers: takes in what arrives, by drone.
+            recorder: gets each payload's fate, and each descriptor that is refused.
+            keys: by key id; None where descriptors are unauthenticated.
+            rates_mbps: the channel's data rates by MCS; empty where links are traced, which have no known data rate.
+        """
+        self._env = env
         self._rates_mbps = rates_mbps
-        self.agents: Sequence[Agent] = ()
+        self._receivers = receivers
         self.air = air
         self.last_datagram: dict[int, bytes] = {}
         """The latest genuine datagram of each drone, for whoever listens."""
@@ -57,11 +75,11 @@ class Ether:
     def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
         """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
         for receiver in heard:
-            agent = self.agents[receiver]
-            if agent.airborne:
-                refused = agent.hear(opened)
+            memory = self._receivers[receiver]
+            if memory.status.airborne:
+                refused = memory.hear(opened, self._env.now)
                 if refused is not None:
-                    self._recorder.rows["drops"].append((agent.env.now, receiver, refused.value))
+                    self._recorder.rows["drops"].append((self._env.now, receiver, refused.value))
 
     def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
         """Hand a payload to the radio."""
@@ -97,7 +115,7 @@ class Ether:
             if missing:
                 missing = cells_of(missing, payload.cells, payload.tile_cells)
             phy_mbps = rates_mbps[mcs] if 0 <= mcs < len(rates_mbps) else math.inf
-            self.agents[transmission.receiver].receive(
+            self._receivers[transmission.receiver].receive(
                 Received(capture, payload, transmission.t_done_s, missing, phy_mbps)
             )
 
@@ -121,8 +139,8 @@ def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
 class _Modem:
     """One drone's end of the air (sortie.fleet.agent.Modem)."""
 
-    def __init__(self, ether: Ether, drone: int) -> None:
-        self.broadcast = partial(ether.publish, drone)
-        self.send = partial(ether.send, drone)
-        self.handshake = partial(ether.handshake, drone)
-        self.goodput_mbps = partial(ether.air.goodput_mbps, drone)
+    def __init__(self, transport: Transport, drone: int) -> None:
+        self.broadcast = partial(transport.publish, drone)
+        self.send = partial(transport.send, drone)
+        self.handshake = partial(transport.handshake, drone)
+        self.goodput_mbps = partial(transport.air.goodput_mbps, drone)

@@ -1,4 +1,4 @@
-"""Several observers of one flight."""
+"""Joins several observers of one flight into one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Watcher(Observer, Protocol):
 
 
 class Watchers:
-    """Tells each of them, in their order (sortie.sim.engine.sortie.Observer), and lets go of them when the `with` ends."""
+    """An observer that passes each call on to several, in their order, and closes them when the `with` ends."""
 
     def __init__(self, watchers: Sequence[Watcher]) -> None:
         self._watchers = watchers

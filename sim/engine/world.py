@@ -1,6 +1,6 @@
-"""The physical side of a sortie: once a frame, drones have moved and drained, and the links are new.
+"""The physical side of a sortie: in each frame it moves the drones, drains their batteries and computes the links.
 
-Also where scenario events act on the physics: extra loss, jammers, battery faults, lost drones.
+Scenario events act on the physics here: extra loss, jammers, battery faults, lost drones.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import simpy
 
-from sortie.fleet.agent import Agent, Platform, Task
+from sortie.fleet.agent import Platform, Task
 from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
+from sortie.fleet.plane import DroneStatus
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
@@ -39,7 +40,7 @@ LEAST_MBPS = 1e-6
 """A link that carries anything at all."""
 
 INSTANT_S = 1e-9
-"""Times so little apart are one, and differ by rounding."""
+"""Times closer together than this are equal but for rounding."""
 
 
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
@@ -49,8 +50,10 @@ def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
 
 
 def with_frame(t_s: float, frame_s: float) -> float:
-    """When what happens at `t_s` is due, so that it is no later than a frame that begins then: at 7.5 Hz the clock of
-    14.8 s says a last digit less."""
+    """Round `t_s` to the begin of a frame if it differs from it by rounding alone.
+
+    So an event is no later than a frame of the same instant: at 7.5 Hz the frame of 14.8 s begins a last digit earlier.
+    """
     frame_at_s = round(t_s / frame_s) * frame_s
     return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
 
@@ -62,6 +65,7 @@ class World:
         self,
         env: simpy.Environment,
         scenario: Scenario,
+        drones: Sequence[DroneStatus],
         motion: Trajectories,
         batteries: FleetBatteries,
         air: Air,
@@ -72,15 +76,11 @@ class World:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
             env, motion, batteries, air, scene, plan,
         )  # fmt: skip
-        self.agents: Sequence[Agent] = ()
-        n = scenario.fleet.drones
+        self.drones = drones
+        n = len(drones)
         self.extra_loss_db: np.ndarray | None = None
         """[N, N] what scenario events add to the path loss; None until one does."""
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
-        self.on_second: Callable[[float], None] | None = None
-        """Called once a simulated second; must not change anything."""
-        self.before_frame: Callable[[int], None] | None = None
-        """Called at each frame's begin, before the links are new: where the fleet may take another way."""
         self._scenario, self._recorder = scenario, recorder
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
@@ -97,11 +97,18 @@ class World:
         self.now = plan.at(0.0)
         """The mission in this frame: the ground station's cue comes with the frame."""
 
-    def start(self) -> None:
-        """Begin the world's process; call once, before the agents start."""
-        self.env.process(self._run())
+    def start(self, on_second: Callable[[float], None], before_frame: Callable[[int], None] | None = None) -> None:
+        """Begin the world's process; call once, before the agents start.
 
-    def _run(self) -> Generator[simpy.Event, Any, None]:
+        Args:
+            on_second: called once a simulated second; must not change anything.
+            before_frame: called at the begin of each frame, before the links are computed. It may reroute the fleet.
+        """
+        self.env.process(self._run(on_second, before_frame))
+
+    def _run(
+        self, on_second: Callable[[float], None], before_frame: Callable[[int], None] | None
+    ) -> Generator[simpy.Event, Any, None]:
         env, scenario = self.env, self._scenario
         frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
         for frame in range(scenario.frames):
@@ -109,26 +116,25 @@ class World:
             self.drain()
             self._frame = frame
             self.now = self.plan.at(env.now)
-            if self.before_frame is not None:
-                self.before_frame(frame)
+            if before_frame is not None:
+                before_frame(frame)
             self.air.advance(self.extra_loss_db, list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
-                if self.on_second is not None:
-                    self.on_second(env.now)
+                on_second(env.now)
 
     def reroute(self, motion: Trajectories) -> None:
-        """From the frame that begins on the fleet flies another way; what was flown before must be the same."""
+        """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
         self._flight = FlightSenses(motion, self._scenario.frame_s)
         self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
 
     def drain(self) -> None:
-        """Drain the batteries for the time since the last call, and land who has to."""
+        """Drain the batteries for the time since the last call, and land the drones that are empty."""
         dt_s = self.env.now - self._stepped_to_s
-        if dt_s <= INSTANT_S:  # no time to tell shares of
+        if dt_s <= INSTANT_S:  # too short for shares of it
             return
         self._stepped_to_s = self.env.now
         airtime_s = list(self.air.airtime_s)
@@ -137,28 +143,28 @@ class World:
         self.batteries.step(
             dt_s,
             self._rotor_w[self._frame],
-            [self.busy_sensing if a.sensed else 0.0 for a in self.agents],
+            [self.busy_sensing if d.perceiving else 0.0 for d in self.drones],
             self.airtime_share,
         )
         self.ground_landed()
 
     def ground_landed(self) -> None:
-        """Take drones whose battery gave out off the plane and the air."""
-        for agent, landed in zip(self.agents, self.batteries.landed, strict=True):
-            if landed and agent.airborne:
-                self.remove(agent.drone, "landed", self.batteries.why_landed[agent.drone])
+        """Remove the drones with a battery that gave out."""
+        for drone, (status, landed) in enumerate(zip(self.drones, self.batteries.landed, strict=True)):
+            if landed and status.airborne:
+                self.remove(drone, "landed", self.batteries.landing_reason[drone])
 
     def remove(self, drone: int, kind: str, text: str) -> None:
         """A drone leaves the sortie: it is silent from now on, draws nothing, and stays where it is."""
         self._down_since.setdefault(drone, int(self.env.now / self._scenario.frame_s + 1e-6))
-        self.agents[drone].stop()
+        self.drones[drone].leave()
         self.air.silence(drone)
         self.batteries.land(drone)
         self.note(drone, kind, text)
 
     def add_loss(self, drone: int, peer: int | None, loss_db: float) -> None:
         """Add loss to both directions of a link, or of every link of a drone."""
-        n = len(self.agents)
+        n = len(self.drones)
         loss = np.zeros((n, n)) if self.extra_loss_db is None else self.extra_loss_db.copy()
         others = slice(None) if peer is None else peer
         loss[drone, others] += loss_db
@@ -175,7 +181,7 @@ class World:
         since_s = self.env.now - self._busy_at_s[0]
         busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
         self._busy_at_s = (self.env.now, busy_s)
-        flying = [a.drone for a in self.agents if a.airborne]
+        flying = [drone for drone, status in enumerate(self.drones) if status.airborne]
         usable = self.air.usable(USABLE_SNR_DB)
         linked = linked_drones(usable if len(flying) == len(usable) else usable[np.ix_(flying, flying)], threshold=1.0)
         self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
@@ -183,7 +189,7 @@ class World:
             self._write_topology(flying)
 
     def _write_topology(self, flying: Sequence[int]) -> None:
-        """How the fleet hangs together: whether all reach all, who is cut off, and the link that limits the worst-off pair."""
+        """Record whether all drones reach each other, which are cut off, and the link that limits the worst pair."""
         whole = connectivity(self.air.link_mbps()[np.ix_(flying, flying)], LEAST_MBPS)
         i, j, mbps = whole.bottleneck or (None, None, NAN)
         ends = (-1, -1) if i is None or j is None else (flying[i], flying[j])
@@ -192,7 +198,7 @@ class World:
 
     def _write(self, frame: int) -> None:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
-        airborne = [agent.airborne for agent in self.agents]
+        airborne = [status.airborne for status in self.drones]
         rows["states"].append(
             (now_s, frame, batteries.soc.copy(), batteries.voltage_v.copy(), batteries.current_a.copy(), airborne)
         )
@@ -202,7 +208,7 @@ class World:
     def _unfold_states(self, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
         now_s, frames, *changing = zip(*rows, strict=True)
-        n, m = len(self.agents), self.motion
+        n, m = len(self.drones), self.motion
         at = np.tile(np.array(frames)[:, None], n)
         for drone, since in self._down_since.items():
             at[:, drone] = np.minimum(at[:, drone], since)
@@ -217,29 +223,34 @@ class World:
             *(list(chain.from_iterable(c)) for c in changing),
         ]
 
-    # --- what one drone knows of itself ----------------------------------------------------------
+    # --- what one drone senses of itself ---------------------------------------------------------
 
-    def senses(self, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> _OwnSenses:
-        """The drone's own sensors (sortie.fleet.agent.Senses); without a detector, boxes are the cars in range."""
-        return _OwnSenses(self, drone, count_boxes)
+    def sensed(self, drone: int, frame: int) -> Sensed:
+        """The drone's pose, velocity and coverage in a frame."""
+        return self._flight.at(frame)[drone]
+
+    def platform(self, drone: int) -> Platform:
+        """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
+        sensing = self.busy_sensing if self.drones[drone].perceiving else 0.0
+        return Platform(self.batteries.soc[drone], 1.0 - self.airtime_share[drone], 1.0 - sensing)
 
 
-class _OwnSenses:
-    """One drone's view of itself; the rest of the world stays behind it."""
+class OwnSenses:
+    """One drone's own sensors (sortie.fleet.agent.Senses); it shows the agent no other drone."""
 
-    def __init__(self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None) -> None:
+    def __init__(
+        self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None = None
+    ) -> None:
+        """Args: `count_boxes` counts what the detector reports; None counts the cars in range."""
         self._world, self._drone, self._count_boxes = world, drone, count_boxes
-        self._sensed = world._flight.at(0)[drone]
+        self._sensed = world.sensed(drone, 0)
 
     def sense(self, frame: int) -> Sensed:
-        self._sensed = sensed = self._world._flight.at(frame)[self._drone]
-        return sensed
+        self._sensed = self._world.sensed(self._drone, frame)
+        return self._sensed
 
     def platform(self) -> Platform:
-        """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
-        world, i = self._world, self._drone
-        sensing = world.busy_sensing if world.agents[i].sensed else 0.0
-        return Platform(world.batteries.soc[i], 1.0 - world.airtime_share[i], 1.0 - sensing)
+        return self._world.platform(self._drone)
 
     def task(self) -> Task:
         sensed = self._sensed

@@ -1,4 +1,4 @@
-"""What each drone of a live fleet senses: a sortie flown before, told again at the wall's pace.
+"""The senses of each drone of a live fleet: a sortie flown before, replayed at the wall clock's pace.
 
 The paper's publishers replay context traces; here the trace is a flown scenario. Poses are the motion model's, the
 mission is the plan's; charge, headrooms and goodput are those that the drone published in the simulated flight, under
@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
-from sortie.fleet.flight.motion import fly
 from sortie.fleet.senses import FlightSenses, Sensed
-from sortie.fleet.traces import follow, read_traces
+from sortie.fleet.traces import flown_motion
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
@@ -49,12 +48,12 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     """
     perception = scenario.perception.model_copy(update={"detector": "none"})
     record = run_sortie(scenario.model_copy(update={"perception": perception}), progress=progress)
-    rows, found = record.tables["descriptors"], []
+    rows, drones = record.tables["descriptors"], []
     for drone in range(scenario.fleet.drones):
         own = rows.filter(pc.equal(rows["drone"], drone)).to_pylist()
         t_s = tuple(row["t_s"] for row in own)
         silent_s = t_s[-1] + 1.5 * scenario.frame_s * scenario.context.publish_every if t_s else 0.0
-        found.append(
+        drones.append(
             Trace(
                 t_s,
                 tuple(Platform(row["soc"], row["cpu_headroom"], row["gpu_headroom"]) for row in own),
@@ -62,16 +61,14 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
                 silent_s if silent_s < scenario.duration_s else float("inf"),
             )
         )
-    return found
+    return drones
 
 
 class ReplaySenses:
     """One drone's own sensors (sortie.fleet.agent.Senses), frame 0 being the one of `begin_s`."""
 
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
-        motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
-        poses = {} if scenario.fleet.trace is None else read_traces(scenario.fleet.trace, scenario.fleet.drones)
-        motion = follow(motion, poses, scenario.frame_s)
+        motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
         self._flight = FlightSenses(motion, scenario.frame_s)
         self._scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
         self._plan = MissionPlan(scenario.mission)
@@ -81,7 +78,7 @@ class ReplaySenses:
         self._row = trace.at(begin_s)
 
     def sense(self, frame: int) -> Sensed:
-        """The drone in a frame; what is asked for next is of the same moment."""
+        """The drone in a frame; the other methods then answer for the same moment."""
         self._sensed = sensed = self._flight.at(self._first + frame)[self._drone]
         self._row = self._trace.at(sensed.capture.t_s)
         return sensed

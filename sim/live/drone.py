@@ -7,7 +7,9 @@ import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from sortie.fleet.agent import Agent, PlaneRules
+from sortie.fleet.agent import Agent
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
@@ -40,7 +42,7 @@ class Orders:
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
-    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus tells no rates."""
+    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus has no data rates."""
     return PlaneRules(
         period_s=scenario.frame_s,
         frames=round((end_s - begin_s) / scenario.frame_s),
@@ -54,8 +56,8 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
 
 
 def fly_one(orders: Orders, pipe: Connection) -> None:
-    """The process of one drone: ready, go, fly, report; ends with its flight, a word from the bench or its death."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the bench's, which tells everybody to stop
+    """The process of one drone: ready, go, fly, report. It ends with its flight, or when the bench says so or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the bench handles Ctrl-C and stops every process
     try:
         node = LiveNode(
             Bus(orders.domain), orders.drone, orders.scenario.fleet.drones, seed=orders.scenario.seed, loss=orders.loss
@@ -85,37 +87,39 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
     pilot = Pilot(drone, plan, Audit(clock, recorder))
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
     phase_s = PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
+    # stamps are nanoseconds since 1970, as in ROS 2
+    memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
     agent = Agent(
         clock,
-        drone,
+        memory,
         rules=rules,
         policy=node.watched(pilot),
         senses=senses,
         modem=node,
+        gate=node.gate,
         log=node,
         sealer=None,
         phase_s=orders.begin_s + phase_s,
-        handshake_bytes=plan.first.handshake_bytes,
+        handshake_bytes=pilot.handshake_bytes,
     )
-    agent.clock_skew_s = go.unix_ns * 1e-9 - orders.begin_s  # stamps are ns since 1970, as ROS 2 has them
-    node.fly(agent, rules, senses.goodput_mbps)
-    schedule_policies(clock, plan, [pilot], [agent], scenario.frame_s)
+    node.fly(clock, memory, rules, senses.goodput_mbps)
+    schedule_policies(clock, plan, [pilot], scenario.frame_s)
     if orders.trace.end_s < orders.end_s:
-        at(clock, orders.trace.end_s, agent.stop)
+        at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
 
-    def tell() -> None:
+    def send_report() -> None:
         pipe.send(_with_notices(node.report(clock.now), recorder))
 
-    told_s = orders.begin_s
+    reported_s = orders.begin_s
     while clock.now < orders.end_s and not pipe.poll():
         node.wait(min(clock.peek(), orders.end_s) - clock.now)
         node.take()
         clock.catch_up()
-        if clock.now - told_s >= 1.0:
-            told_s = clock.now
-            tell()
-    tell()
+        if clock.now - reported_s >= 1.0:
+            reported_s = clock.now
+            send_report()
+    send_report()
     pipe.send(Home(drone))
 
 

@@ -17,11 +17,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sortie.fleet.agent import Agent, PlaneRules
 from sortie.fleet.gate import HEADER_BYTES, Gate, Payload
+from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened, open_datagram
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
+from sortie.fleet.plane import PlaneRules
 from sortie.fleet.staleness import LinkHealth, health
 from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
@@ -30,6 +31,7 @@ from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
+from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
 from sortie.sim.live.reports import Count, HealthChange, NewDirective, Report, SinceLastReport
 
@@ -104,10 +106,11 @@ class LiveNode:
         others = [w for link in self._links.values() for w in link.writers]
         return self._context.listeners > drones and all(w.listeners >= 2 for w in others)
 
-    def fly(self, agent: Agent, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]) -> None:
-        """Connect the agent to these nodes, and count its processor time from here."""
-        self.agent, self._rules = agent, rules
-        agent.gate = self.gate
+    def fly(
+        self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]
+    ) -> None:
+        """Begin the flight: what comes in goes to `memory`, and processor time counts from here."""
+        self._clock, self._memory, self._rules = clock, memory, rules
         self.goodput_mbps = goodput_mbps
         self._began_cpu_s = time.process_time()
 
@@ -159,7 +162,7 @@ class LiveNode:
         directive = self.gate.in_force(peer)
         if directive is None:
             return
-        stamp_ns = round((capture.t_s + self.agent.clock_skew_s) * 1e9)
+        stamp_ns = round((capture.t_s + self._memory.status.clock_skew_s) * 1e9)
         header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)
         content = (header + encode_directive(directive)).ljust(payload.size_bytes, b"\0")
         self._write(peer, TopicKind.of(payload.representation), content)
@@ -170,7 +173,7 @@ class LiveNode:
     # --- sortie.fleet.agent.AgentLog --------------------------------------------------------------------
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None:
-        clock_s = t_s + self.agent.clock_skew_s
+        clock_s = t_s + self._memory.status.clock_skew_s
         self._late_s = max(self._late_s, clock_s - descriptor.stamp_ns * 1e-9)
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
@@ -196,7 +199,7 @@ class LiveNode:
                 return
             if sender not in self._links:
                 self._add_peer(sender)
-        refused = self.agent.hear(heard)
+        refused = self._memory.hear(heard, self._clock.now)
         if isinstance(refused, DropReason):
             self._refused[f"descriptor {refused}"] += 1
         else:
@@ -245,7 +248,7 @@ class LiveNode:
         return self._draws[sender]
 
     def _note_health(self, view: FleetView) -> None:
-        rules, now_s = self._rules, self.agent.env.now
+        rules, now_s = self._rules, self._clock.now
         for peer in view.peers:
             age_s = view.age_s[peer]
             found = health(age_s, rules.descriptor_period_s, rules.degraded_after_periods, rules.detached_after_periods)

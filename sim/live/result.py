@@ -11,7 +11,7 @@ import numpy as np
 from sortie.fleet.staleness import LinkHealth
 from sortie.perception.evaluation.claims import OVERHEAD
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.pilot import named
+from sortie.sim.engine.pilot import named_policy
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.reports import HealthChange, NewDirective, Notice
@@ -141,7 +141,7 @@ def summarise(
     ]  # fmt: skip
     return LiveResult(
         scenario=scenario.name,
-        policy=named(scenario.policy.name, scenario.policy.params).name,
+        policy=named_policy(scenario.policy.name, scenario.policy.params).name,
         drones=scenario.fleet.drones,
         begin_s=begin_s,
         flown_s=flown_s,

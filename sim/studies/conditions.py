@@ -14,7 +14,7 @@ from sortie.policies.registry import POLICIES, parameters, resolve
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
-from sortie.sim.engine.sortie import DetectorOf, run_sortie
+from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import matched, outcome
 
@@ -58,7 +58,7 @@ def fly_all(
     policies: Sequence[str],
     *,
     progress: Callable[[str, int], None] | None = None,
-    detector_of: DetectorOf = make_detector,
+    detector_of: DetectorMaker = make_detector,
 ) -> list[Cell]:
     """Every policy in every condition; the budget goes to every policy that takes one.
 
@@ -95,7 +95,7 @@ def scenario_of(conditions: ConditionSet, condition: Condition, policy: str) -> 
 
 
 def _fly(
-    policy: str, condition: Condition, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorOf
+    policy: str, condition: Condition, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorMaker
 ) -> Cell:
     frames, results = [], []
     for scenario, seed in zip(scenarios, seeds, strict=True):

@@ -24,7 +24,7 @@ from sortie.policies.contract import Directive, FleetView
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
-from sortie.sim.engine.sortie import DetectorOf, run_sortie
+from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import write_text
 from sortie.sim.results.outcome import matched
 from sortie.sim.studies.in_flight import torch_answers
@@ -80,7 +80,7 @@ def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
 def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
     """Fly every arm in a training condition; `by_torch`: scored by the torch detector, at fewer moments."""
     scenario, rho = draw_condition(seed, number)
-    detector_of: DetectorOf = make_detector
+    detector_of: DetectorMaker = make_detector
     if by_torch:
         perception = scenario.perception.model_copy(update={"sample_rate_hz": TORCH_RATE_HZ})
         scenario, detector_of = scenario.model_copy(update={"perception": perception}), torch_answers()

@@ -16,11 +16,11 @@ from sortie.fleet.trust import (
     Arrival,
     Standing,
     battery_doubt,
-    could_tell,
     coverage_doubt,
     discounted,
     goodput_doubt,
     judge,
+    split_arrivals,
 )
 from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, TaskPhase
 
@@ -178,20 +178,20 @@ def test_a_charge_in_whole_percents_is_no_lie() -> None:
 
 def test_a_claim_answers_for_what_came_before_it() -> None:
     came = [Arrival(160_000, 0.02, 600.0, t_done_s) for t_done_s in (1.0, 2.0, 3.0, 4.0)]
-    assert could_tell(came, 2.0) == (came[:2], came[2:])
-    assert could_tell(came, 0.5) == ([], came)
-    assert could_tell(came, 4.5) == (came[2:], []), "a link may break in the two seconds before"
+    assert split_arrivals(came, 2.0) == (came[:2], came[2:])
+    assert split_arrivals(came, 0.5) == ([], came)
+    assert split_arrivals(came, 4.5) == (came[2:], []), "a link may break in the two seconds before"
 
 
 def test_a_claim_may_be_of_what_did_not_come() -> None:
     """At the edge of range a payload that is lost brings an honest estimate to nothing at once."""
     came = [Arrival(160_000, 0.02, 600.0, t_done_s) for t_done_s in (1.0, 1.1, 1.3, 1.4)]
-    assert could_tell(came, 1.47) == (came, []), "the next is not sent yet"
+    assert split_arrivals(came, 1.47) == (came, []), "the next is not sent yet"
     for some, told_s, why in (
         (came, 1.49, "one that was sent at 1.48 may be on its way, or lost"),
         (came[:1], 1.07, "how often its sender sends is not known"),
     ):
-        told, _ = could_tell(some, told_s)
+        told, _ = split_arrivals(some, told_s)
         assert goodput_doubt(0.1, told) == "", why
         assert goodput_doubt(901.0, told) == "goodput: 901 Mb/s claimed, frames came at 600", "lost or not"
 

@@ -20,15 +20,17 @@ poses = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-4, 4))
 def test_bytes_are_the_papers(cells: int, content: int, index: int) -> None:
     assert budget.payload_bytes(cells) == content
     assert budget.index_bytes(cells) == index
-    assert budget.payload("features", cells=cells) == content + index
+    assert budget.content_bytes("features", cells=cells) == content + index
 
 
 def test_bytes_of_boxes_and_tracks() -> None:
-    assert budget.payload("detections", boxes=40) == 960
-    assert budget.payload("tracks", boxes=5) == 100
-    assert budget.payload("tracks", boxes=40) == 240
-    with pytest.raises(ValueError, match=r"representation is 'raw', must be features, detections or tracks"):
-        budget.payload("raw")
+    assert [budget.boxes_sent("detections", n) for n in (5, 40)] == [5, 40]
+    assert [budget.boxes_sent("tracks", n) for n in (5, 40)] == [5, 12]
+    assert budget.content_bytes("detections", boxes=40) == 960
+    assert budget.content_bytes("tracks", boxes=12) == 240
+    assert budget.content_bytes("raw") == 5_400_000
+    with pytest.raises(ValueError, match=r"representation is 'none', must be features, detections, tracks or raw"):
+        budget.content_bytes("none")
 
 
 def test_the_mission_disc_is_314_cells() -> None:

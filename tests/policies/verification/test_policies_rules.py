@@ -280,9 +280,9 @@ def throws_numpys_dice(view: FleetView) -> list[Directive]:
 
 
 def imports_the_fleet(view: FleetView) -> list[Directive]:
-    from sortie.fleet.gate import RAW_BYTES
+    from sortie.fleet.gate import HEADER_BYTES
 
-    return share(view, float(RAW_BYTES % 7))
+    return share(view, float(HEADER_BYTES % 7))
 
 
 def uses_the_api(view: FleetView) -> list[Directive]:

@@ -1,0 +1,119 @@
+"""What one drone knows of the others: their descriptors, their payloads, and how far it trusts each of them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from sortie.fleet.gate import Payload
+from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
+from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
+from sortie.perception.types import Capture
+from sortie.policies.contract import Descriptor, FleetView
+from sortie.policies.damping import apply_hysteresis
+
+
+class Received(NamedTuple):
+    """One payload as it arrived, and the capture that it was made of."""
+
+    capture: Capture
+    payload: Payload
+    t_done_s: float
+    missing: tuple[int, ...] = ()
+    """Ranks of its feature cells that did not arrive, ascending; rank 0 is the best cell."""
+    phy_mbps: float = math.inf
+    """The data rate at which its frames arrived."""
+
+
+class PeerMemory:
+    """The descriptors and payloads that one drone received, and its trust in each peer."""
+
+    def __init__(self, drone: int, rules: PlaneRules, status: DroneStatus) -> None:
+        self.drone, self.status = drone, status
+        self.held: dict[int, Received] = {}
+        """The newest payload of each peer."""
+        self._rules = rules
+        self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
+        self._inbox = Inbox()
+        self._claims: dict[int, Descriptor] = {}
+        self._known: dict[int, Descriptor] = {}  # the claims as policies read them, by ascending id
+        self._heard_at_s: dict[int, float] = {}
+        self._standings: dict[int, Standing] = {}
+        self._doubted: frozenset[int] = frozenset()
+        self._arrivals: dict[int, list[Arrival]] = {}
+        self._judged_at_s = -math.inf
+
+    def hear(self, opened: Opened | Dropped, now_s: float) -> DropReason | None:
+        """Take a datagram in: a credible one replaces the last descriptor of its sender.
+
+        Returns:
+            Why the datagram was refused; None if it was accepted.
+        """
+        heard = self._inbox.accept(opened)
+        if isinstance(heard, DropReason):
+            return heard
+        if heard.agent_id != self.drone:
+            self.hold(heard, now_s)
+        return None
+
+    def hold(self, descriptor: Descriptor, now_s: float) -> None:
+        """Replace the last descriptor of this sender, which may be the drone itself."""
+        known, sender = self._known, descriptor.agent_id
+        self._claims[sender] = descriptor
+        if sender in known:
+            known[sender] = apply_hysteresis(known[sender], descriptor, self._rules.hysteresis)
+        else:  # by ascending id, so that the order of arrival decides nothing
+            self._known = dict(sorted([*known.items(), (sender, descriptor)]))
+        self._heard_at_s[sender] = now_s
+
+    def receive(self, received: Received) -> None:
+        """Keep a peer's payload, unless a newer capture of that peer arrived before it."""
+        peer = received.capture.drone
+        held = self.held.get(peer)
+        if self._rules.trust:
+            took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
+            self._arrivals.setdefault(peer, []).append(
+                Arrival(
+                    0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
+                )
+            )
+        if self.status.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
+            self.held[peer] = received
+
+    def ages_s(self, now_s: float) -> dict[int, float]:
+        """Age of every descriptor by this drone's clock, and at least the time since it arrived."""
+        clock_s, heard_at_s = now_s + self.status.clock_skew_s, self._heard_at_s
+        return {
+            i: stamped_s if (stamped_s := clock_s - d.stamp_ns * 1e-9) > (heard_s := now_s - heard_at_s[i]) else heard_s
+            for i, d in self._known.items()
+        }
+
+    def view(self, now_s: float) -> FleetView:
+        """What a policy reads: the fleet as this drone knows it, without the claims that it doubts."""
+        known = dict(self._known)
+        for doubted in self._doubted:
+            known[doubted] = discounted(known[doubted])
+        return FleetView(self.drone, self._period_s, known, self.ages_s(now_s))
+
+    def trust_in(self, peer: int) -> float:
+        """Trust in a peer, 0 … 1. The fusion weight of its payloads is multiplied by it."""
+        return self._standings.get(peer, UNJUDGED).trust
+
+    def judge(self, now_s: float) -> list[tuple[int, Standing]]:
+        """Check each claim once that peers made since the last call.
+
+        Returns:
+            Peers for which trust changed, with their new standing.
+        """
+        before = self._standings
+        since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
+        heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
+        arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
+        for i, came in self._arrivals.items():
+            claimed_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
+            arrivals[i], later = split_arrivals(came, claimed_s)
+            self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
+        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form)
+        self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
+        return [(peer, after[peer]) for peer in heard if after[peer].trust != before.get(peer, UNJUDGED).trust]

@@ -1,0 +1,61 @@
+"""The rules of the context plane, and the state of a drone that several parts of a simulation share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sortie.fleet.messages.compact import FULL, Form
+from sortie.policies.contract import Descriptor
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneRules:
+    """The plane's periods, the same for every drone."""
+
+    period_s: float
+    frames: int
+    degraded_after_periods: float
+    detached_after_periods: float
+    dwell_s: float
+    hysteresis: float
+    compute_delay_s: float
+    tile_limit_bytes: int | None = None
+    """Features are sent as tiles of at most this size. None sends them as one sample."""
+    trust: bool = False
+    """Whether drones check the claims of their peers (`sortie.fleet.trust`)."""
+    publish_every: int = 1
+    """Frames from one descriptor to the next. Staleness counts in periods of that length."""
+    form: Form = FULL
+    """The resolution of descriptors on the wire."""
+
+    @property
+    def descriptor_period_s(self) -> float:
+        """Time from one descriptor of a drone to its next."""
+        return self.period_s * self.publish_every
+
+    @property
+    def fresh_s(self) -> float:
+        """A descriptor up to this age is fresh."""
+        return self.descriptor_period_s * self.degraded_after_periods
+
+
+@dataclass(slots=True)
+class DroneStatus:
+    """The state of one drone that its agent, the world and the scenario's events share.
+
+    It is made before them and handed to each, so that none of them has to hold another.
+    """
+
+    airborne: bool = True
+    """False from the moment when the drone lands or is lost."""
+    perceiving: bool = False
+    """Whether perception runs in the current frame."""
+    clock_skew_s: float = 0.0
+    """Error of the drone's clock."""
+    lies: dict[int, Callable[[Descriptor], Descriptor]] = field(default_factory=dict)
+    """Falsifications of the drone's descriptors, by the index of the scenario event that causes them."""
+
+    def leave(self) -> None:
+        """The drone leaves the plane for good."""
+        self.airborne = False
