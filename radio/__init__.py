@@ -1,4 +1,4 @@
-"""The air between the drones: bytes and positions in, fates out; never what is in the bytes."""
+"""The air between the drones: carries bytes between positions, whatever the bytes mean."""
 
 from sortie.radio.air import Air
 from sortie.radio.counters import Counters

@@ -1,7 +1,7 @@
-"""The air as the fleet sees it: broadcast, send, silence, and what each sample came to.
+"""The air between the drones: broadcasts, unicast samples, silenced drones, and the outcome of each sample.
 
 `Air` puts the parts together: `channel` says how good each link is in this frame, `rates` which MCS that
-allows (the sender knows the SNR of the frame before, so a sudden drop costs it a frame), `airtime` what a sample then asks of the `medium`, and `goodput` what the sender learns of it.
+allows (the sender knows the SNR of the frame before, so a sudden drop costs it a frame), `airtime` how much of the `medium` a sample then needs, and `goodput` what the sender learns of it.
 
 Transport. *Best effort*: a sample with one lost fragment is lost. *Reliable, keep-last-1*: the writer's
 heartbeat and the reader's NACK bring lost fragments back, `heartbeat_s + nack_delay_s` after the pass in
@@ -21,7 +21,7 @@ import numpy as np
 import simpy
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.channel.snr import Channel, FloatArray, Jammer, SampleLuck
+from sortie.radio.channel.snr import Channel, FloatArray, Jammer, SampleDraws
 from sortie.radio.channel.traces import read_links
 from sortie.radio.counters import Counters
 from sortie.radio.goodput import Goodput
@@ -36,7 +36,7 @@ from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 from sortie.scenarios.streams import stream
 
-# an enumeration's member costs a quarter of a microsecond to look up, and each sample asks some ten times
+# an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
 _SERVED, _DEADLINE_QUEUED = End.SERVED, End.DEADLINE_QUEUED
 _DELIVERED, _LOST, _EXPIRED = Status.DELIVERED, Status.LOST, Status.EXPIRED
 _WINDOW_S = 1e-3
@@ -104,8 +104,8 @@ class Air:
         )  # fmt: skip
         self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
         self._service = Service(settings, seed, replication)
-        self._luck = SampleLuck(seed, replication)
-        self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, once asked for
+        self._draws = SampleDraws(seed, replication)
+        self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, made at first use
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._in_flight: dict[int, Sample] = {}
@@ -226,7 +226,7 @@ class Air:
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
             *sample_wire(payload_bytes, piece_bytes or self._settings.fragment_bytes, piece_bytes is not None),
-            self._luck.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
+            self._draws.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
             self._order,
         )  # fmt: skip
         s.receiver = hop
@@ -322,8 +322,8 @@ class Air:
             self._close(s, _LOST, "fragment_lost")
 
     def _order(self, s: Sample, count: int) -> IntArray:
-        """A random order of so many pieces, of the luck of the sample's present pass."""
-        entity = (s.sender, s.receiver, int(s.round_luck() * 2.0**53))
+        """A random order of so many pieces, from the draw of the sample's present pass."""
+        entity = (s.sender, s.receiver, int(s.round_draw() * 2.0**53))
         return stream(*self._seed, entity, "lost pieces").permutation(count)
 
     def _forward(self, s: Sample, now_s: float) -> None:
@@ -332,7 +332,7 @@ class Air:
         self._forget(s)
         here = s.receiver
         hop = self._routes.next_hop(here, s.target, self._routes.max_hops - s.hops)
-        s.forward(here, hop, now_s, self._luck.next(here, hop), self._drained(here))
+        s.forward(here, hop, now_s, self._draws.next(here, hop), self._drained(here))
         s.pass_bytes = self._service.wire_bytes(s)
         self._queue(s)
 
@@ -378,7 +378,7 @@ class Air:
         """Goodput to every other drone, ascending by id, as the sender measured it; see `sortie.radio.goodput`.
 
         Samples that are still in service or queued lower it already by how little has got through so far. Where a
-        payload would go over others, it is what their hops' goodputs come to one after the other.
+        payload would go over others, it is the goodput of its hops in sequence.
         """
         known = self._known_mbps(sender)
         if self._routes is not None:

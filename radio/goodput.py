@@ -12,7 +12,7 @@ A sample that expires or is replaced half-way counts with what was acknowledged 
 be served was held up by its own sender's queue, and the rate at which that queue moved bounds the estimate.
 A link never measured reports 0.
 
-**Bias and lag** were measured (`tests/validation/link.py`, told in the README): none on a still link; some 5 % low under
+**Bias and lag** were measured (`tests/validation/link.py`, see the README): none on a still link; some 5 % low under
 shadowing, because falling is quicker than rising; a drop shows in the next frame, a recovery in eight.
 """
 

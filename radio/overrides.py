@@ -58,7 +58,7 @@ class Overrides:
         nothing = np.full((n, n), np.nan)
         self._given = Given(nothing, nothing, nothing)
         self._burst_loss: FloatArray = np.zeros((n, n))
-        self._luck: FloatArray = np.zeros((n, n))
+        self._draws: FloatArray = np.zeros((n, n))
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
         self._group_gain_db = 10.0 * float(np.log10(settings.bandwidth_mhz / 20.0))
         self._group_mcs = group_mcs(settings.group_rate_mbps)
@@ -79,7 +79,7 @@ class Overrides:
             noise_rise_db: [N], how far jammers lift each receiver's noise; None is not at all.
         """
         self._frame += 1
-        self._luck = self._numbers.row()
+        self._draws = self._numbers.row()
         if self._states is not None:
             self._burst_loss = self._states.advance()
         if self._trace is not None:
@@ -135,19 +135,19 @@ class Overrides:
             heard: whom it reaches by the models, ascending.
             times: how many group frames the sender has sent in this frame before.
         """
-        luck = (self._luck[sender] + times * _GOLDEN) % 1.0
+        draws = (self._draws[sender] + times * _GOLDEN) % 1.0
         on_top = self._burst_loss[sender]
         if self._trace is None:
-            return [i for i in heard if luck[i] >= on_top[i]]
+            return [i for i in heard if draws[i] >= on_top[i]]
         loss, snr_db = self._given.loss[sender], self._given.snr_db[sender]
         traced = ~(np.isnan(loss) & np.isnan(snr_db))
-        reached = [i for i in heard if not traced[i] and luck[i] >= on_top[i]]
+        reached = [i for i in heard if not traced[i] and draws[i] >= on_top[i]]
         for i in np.flatnonzero(traced).tolist():
             missed = float(loss[i])
             if isnan(missed):
                 table = rate_table(20, self._k_db, mpdu_bytes)  # kept: frames come in few lengths
                 per = table.all_per[self._group_mcs][table.index(float(snr_db[i]) + self._group_gain_db)]
                 missed = 1.0 - (1.0 - per) * (1.0 - float(on_top[i]))
-            if i != sender and luck[i] >= missed:
+            if i != sender and draws[i] >= missed:
                 reached.append(i)
         return sorted(reached)

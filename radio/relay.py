@@ -51,7 +51,7 @@ def cheapest(cost: ArrayLike, max_hops: int) -> tuple[list[FloatArray], list[Int
 
 
 class Routes:
-    """The fleet's routes in one frame, worked out when first asked for."""
+    """The fleet's routes in one frame, worked out at their first use."""
 
     def __init__(self, max_hops: int) -> None:
         self.max_hops = max_hops

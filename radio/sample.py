@@ -40,6 +40,7 @@ class Sample(AirJob):
     __slots__ = (
         "arrived",
         "drained_bits",
+        "draws",
         "fragments",
         "full_mbps",
         "hops",
@@ -48,7 +49,6 @@ class Sample(AirJob):
         "loss_probability",
         "loss_share",
         "lost",
-        "luck",
         "mark_bits",
         "mark_left",
         "mark_s",
@@ -87,13 +87,13 @@ class Sample(AirJob):
         on_done: Callable[[Transmission], None],
         fragments: int,
         wire_bytes: int,
-        luck: list[float],
+        draws: list[float],
         snr_db: float,
         drained_bits: float,
         piece_bytes: int,
         order: Callable[[Sample, int], IntArray],
     ) -> None:
-        """Args: `fragments` and `wire_bytes` of the whole sample; `luck` one uniform number a pass; `drained_bits` what
+        """Args: `fragments` and `wire_bytes` of the whole sample; `draws` one uniform number a pass; `drained_bits` what
         the sender had got through when this was written; the rest as in `Air.send`."""
         super().__init__(number, sender, deadline_s)
         self.receiver = receiver  # of this hop, as `sender`
@@ -113,7 +113,7 @@ class Sample(AirJob):
         self.lost = 0
         self.repairs = 0
         self.passes = 0  # through the medium, on this hop and before this one
-        self.luck = luck
+        self.draws = draws
         self.piece_bytes = piece_bytes  # 0: it is of use as a whole only
         self.pieces: IntArray | None = np.arange(fragments) if piece_bytes else None  # of this pass, in their order
         self.arrived: list[IntArray] = []  # pieces at the end of this hop
@@ -144,10 +144,10 @@ class Sample(AirJob):
         self.mark_left = self.remaining
         return bits
 
-    def round_luck(self) -> float:
+    def round_draw(self) -> float:
         """The uniform number of the present pass; beyond those it was given, the last one shifted by golden ratios."""
-        extra = self.passes - len(self.luck) + 1
-        return self.luck[self.passes] if extra <= 0 else (self.luck[-1] + extra * _GOLDEN) % 1.0
+        extra = self.passes - len(self.draws) + 1
+        return self.draws[self.passes] if extra <= 0 else (self.draws[-1] + extra * _GOLDEN) % 1.0
 
     def lose(self) -> int:
         """What of this pass did not get through, its progress being booked; returns how many fragments.
@@ -158,7 +158,7 @@ class Sample(AirJob):
         sent = self.left if done >= 1.0 else int(done * self.left + 1e-9)
         if self.unreachable or sent == 0:
             return self.left
-        lost = losses(self.round_luck(), sent, min(1.0, self.loss_share / done)) if self.loss_share > 0.0 else 0
+        lost = losses(self.round_draw(), sent, min(1.0, self.loss_share / done)) if self.loss_share > 0.0 else 0
         missing = lost + self.left - sent
         if self.pieces is not None:
             which = np.sort(self.order(self, sent)[:lost]) if lost else np.arange(0)
@@ -166,14 +166,14 @@ class Sample(AirJob):
             self.pieces = np.concatenate([self.pieces[which], self.pieces[sent:]])
             self.left = len(self.pieces)
         self.lost += lost
-        self.restart()  # told; a second call finds nothing sent
+        self.restart()  # the caller has these figures; a second call returns nothing sent
         return missing
 
-    def forward(self, sender: int, receiver: int, now_s: float, luck: list[float], drained_bits: float) -> None:
+    def forward(self, sender: int, receiver: int, now_s: float, draws: list[float], drained_bits: float) -> None:
         """Begin the next hop with what the last one brought."""
         self.sender, self.receiver = sender, receiver
         self.hops += 1
-        self.luck, self.passes = luck, 0
+        self.draws, self.passes = draws, 0
         self.t_queued_s, self.drained_bits = now_s, drained_bits
         if self.pieces is not None:
             self.pieces = np.sort(np.concatenate(self.arrived))
@@ -208,7 +208,7 @@ class Sample(AirJob):
 
 
 class Service:
-    """What a link of a given quality asks of the medium for a sample: rate control, MAC retries, exchanges."""
+    """Load that a sample puts on the medium over a link of a given quality: rate control, MAC retries, exchanges."""
 
     def __init__(self, settings: AirSettings, seed: int, replication: int) -> None:
         self._settings = settings

@@ -11,7 +11,7 @@ from scipy.special import bdtr
 
 
 class Status(StrEnum):
-    """What became of a sample."""
+    """Outcome of a sample."""
 
     DELIVERED = "delivered"
     LOST = "lost"

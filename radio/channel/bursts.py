@@ -30,18 +30,18 @@ def mean_loss(settings: BurstSettings) -> float:
     return (1.0 - bad) * settings.loss_good + bad * settings.loss_bad
 
 
-def walk(bad: BoolArray, luck: FloatArray, good_to_bad: float, bad_to_good: float) -> BoolArray:
+def walk(bad: BoolArray, draws: FloatArray, good_to_bad: float, bad_to_good: float) -> BoolArray:
     """The states after each step.
 
     Args:
         bad: [...] the states before the first step.
-        luck: [steps, ...] uniform numbers.
+        draws: [steps, ...] uniform numbers.
 
     Returns:
         [steps, ...], True where bad.
     """
-    states = np.empty(luck.shape, bool)
-    for step, u in enumerate(luck):
+    states = np.empty(draws.shape, bool)
+    for step, u in enumerate(draws):
         bad = np.where(bad, u >= bad_to_good, u < good_to_bad)
         states[step] = bad
     return states

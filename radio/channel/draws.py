@@ -37,18 +37,18 @@ def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
 
 
 class StreamDraws:
-    """Shadowing, fades and luck of every link of n drones, block after block."""
+    """Shadowing, fades and uniform draws for every link of n drones, block after block."""
 
     def __init__(self, settings: AirSettings, seed: int, replication: int, n: int, frame_s: float) -> None:
         self._settings, self._n = settings, n
         self._keep = keep(frame_s, settings.shadowing_time_s)
         self._shadow = [stream(seed, replication, h, "shadowing") for h in range(n)]
         self._fade = [stream(seed, replication, h, "fading") for h in range(n)]
-        self._luck = [stream(seed, replication, h, "group loss") for h in range(n)]
+        self._loss_streams = [stream(seed, replication, h, "group loss") for h in range(n)]
         self._last_db: FloatArray | None = None
 
     def block(self, frames: int, flown: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the next frames: shadowing in dB, fades in dB, and luck (uniform; NaN on the diagonal).
+        """Of the next frames: shadowing in dB, fades in dB, and draws (uniform; NaN on the diagonal).
 
         Args:
             frames: how many to draw, the same in every block.
@@ -58,19 +58,19 @@ class StreamDraws:
             [flown, n, n] each, sender by receiver.
         """
         b, n = frames, self._n
-        shadow_z, x, y, luck = (np.zeros((b, n, n)) for _ in range(4))
+        shadow_z, x, y, draws = (np.zeros((b, n, n)) for _ in range(4))
         for h in range(1, n):
             z = self._shadow[h].standard_normal((b, h))
             shadow_z[:, h, :h] = z
             shadow_z[:, :h, h] = z
             self._scatter(x, h, f := self._fade[h].standard_normal((b, 2, 2, h)), 0)
             self._scatter(y, h, f, 1)
-            self._scatter(luck, h, self._luck[h].random((b, 1, 2, h)), 0)
-        luck[:, range(n), range(n)] = np.nan
+            self._scatter(draws, h, self._loss_streams[h].random((b, 1, 2, h)), 0)
+        draws[:, range(n), range(n)] = np.nan
         shadow_db = gauss_markov(shadow_z, self._settings.shadowing_sigma_db, self._keep, self._last_db)
         self._last_db = shadow_db[-1]
         gain = rician_gain(x[:flown], y[:flown], self._settings.rician_k_db)
-        return shadow_db[:flown], 10.0 * np.log10(np.maximum(gain, 1e-12)), luck[:flown]
+        return shadow_db[:flown], 10.0 * np.log10(np.maximum(gain, 1e-12)), draws[:flown]
 
     @staticmethod
     def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:

@@ -1,4 +1,4 @@
-"""Who can hear whom: the list of links that are worth working out.
+"""Who can hear whom: the list of links to work out.
 
 Small fleets have every link, in a square; in larger ones a link is listed while its ends are within earshot.
 Values of links are kept as vectors [L].

@@ -1,6 +1,6 @@
 """A block of frames of a large fleet: the links within earshot and what is drawn for them, in single precision.
 
-The work grows with drones × neighbours; links out of earshot cost nothing, and fades and luck are drawn for those
+The work grows with drones × neighbours; links out of earshot cost nothing, and fades and losses are drawn for those
 links alone whose frames may be lost. Links between the first drones keep the
 numbers that they have in a small fleet, so that one more drone changes none of the others'.
 """
@@ -70,7 +70,7 @@ class Crowd:
         self._frame = self._pairs = self._early_count = 0
         self._link_keys = self._keys[:0]
         self._early_fades_db: Array
-        self._early_luck: Array
+        self._early_draws: Array
         # where the shadowing stood at the end of the one before
         self._last_pairs: IntArray = np.empty(0, np.int64)
         self._last_db: Array = np.empty(0, np.float32)
@@ -89,7 +89,7 @@ class Crowd:
         n = self._n_early
         places = np.concatenate([low[:early] * n + high[:early], high[:early] * n + low[:early]])
         early_shadow_db, *chance = (x.reshape(len(p), -1) for x in self._early.block(EPOCH, len(p)))
-        self._early_fades_db, self._early_luck = (np.take(x, places, axis=1, mode="clip") for x in chance)
+        self._early_fades_db, self._early_draws = (np.take(x, places, axis=1, mode="clip") for x in chance)
         shadow_db: Array
         if self._field is not None:
             at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
@@ -101,9 +101,9 @@ class Crowd:
         return BlockStart(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
 
     def chance(self, first: int, frames: int, links: IntArray) -> tuple[Array, Array]:
-        """Fades in dB and luck, [frames, L'], of some links in the block's frames from `first` on."""
+        """Fades in dB and draws, [frames, L'], of some links in the block's frames from `first` on."""
         bits = numbers(self._link_keys[links], self._frame + first, frames)
-        fades_db, luck = np.take(self._fades, levels(bits, 0), mode="clip"), uniforms(bits)
+        fades_db, draws = np.take(self._fades, levels(bits, 0), mode="clip"), uniforms(bits)
         # the first drones' own numbers in their places; their pairs are the first ones
         back = links >= self._pairs
         pair = np.where(back, links - self._pairs, links)
@@ -112,8 +112,8 @@ class Crowd:
             there = pair[early] + self._early_count * back[early]
             rows = slice(first, first + frames)
             fades_db[:, early] = np.take(self._early_fades_db[rows], there, axis=1)
-            luck[:, early] = np.take(self._early_luck[rows], there, axis=1)
-        return fades_db, luck
+            draws[:, early] = np.take(self._early_draws[rows], there, axis=1)
+        return fades_db, draws
 
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]

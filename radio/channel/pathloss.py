@@ -67,7 +67,7 @@ def two_ray_loss_db(
 def path_loss_db(
     settings: AirSettings, distance_m: ArrayLike, height_a_m: ArrayLike, height_b_m: ArrayLike
 ) -> FloatArray:
-    """The path loss that a scenario asks for, dB; arguments as for `two_ray_loss_db`."""
+    """Path loss by the model of the settings, dB; arguments as for `two_ray_loss_db`."""
     if settings.path_loss == "two_ray":
         return two_ray_loss_db(distance_m, height_a_m, height_b_m, settings.carrier_ghz, settings.ground_roughness_m)
     exponent = 2.0 if settings.path_loss == "free_space" else settings.path_loss_exponent

@@ -32,7 +32,7 @@ Jammer = tuple[Sequence[float], float]
 SQUARE = 32
 """Fleets of up to so many drones work out every link; larger ones those within earshot."""
 OUT_OF_RANGE_DB = -100.0
-"""SNR that is told of a link out of earshot."""
+"""SNR that is reported for a link out of earshot."""
 SAFE_DB = 5.0
 """Above s50 by this, fewer than one group frame in 10^12 is lost: for large fleets, none."""
 _EARSHOT_SIGMA = 5.0
@@ -58,15 +58,15 @@ def earshot_m(settings: AirSettings) -> float:
     return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
 
 
-def _reach_at_1(luck: AnyFloats) -> AnyFloats:
-    """How long a frame may be, bytes, to arrive with this luck where −log s (see `Channel._reach`) is 1."""
-    if luck.dtype == np.float32:  # in steps of 2⁻²⁴, whose difference from 1 is exact
-        return np.asarray(-REFERENCE_BYTES * np.log(1.0 - luck))
-    return np.asarray(-REFERENCE_BYTES * np.log1p(-luck))
+def _reach_at_1(draws: AnyFloats) -> AnyFloats:
+    """How long a frame may be, bytes, to arrive with these draws where −log s (see `Channel._reach`) is 1."""
+    if draws.dtype == np.float32:  # in steps of 2⁻²⁴, whose difference from 1 is exact
+        return np.asarray(-REFERENCE_BYTES * np.log(1.0 - draws))
+    return np.asarray(-REFERENCE_BYTES * np.log1p(-draws))
 
 
 class FrameLinks:
-    """The mean SNR of the links in one frame; squares and rows are made when they are asked for."""
+    """The mean SNR of the links in one frame; squares and rows are made at their first use."""
 
     __slots__ = ("_rows", "_square", "links", "snr_db")
 
@@ -95,7 +95,7 @@ class Channel:
 
     `now` is the mean (over small-scale fading) SNR of the links in this frame, in the whole channel; `before` that of
     the frame before (the first frame's own, in the first). `reach_bytes` is the longest group-addressed frame that
-    each link carries in this frame, its fade and its luck drawn. `snr_db`, `fade_db`, `shadow_db` and
+    each link carries in this frame, its fade and its random draw. `snr_db`, `fade_db`, `shadow_db` and
     `group_reach_bytes` show the same as squares [N, N], sender by receiver, NaN on the diagonal.
 
     What follows from the flight alone is worked out for a block of frames in one pass; a frame in which nothing
@@ -162,7 +162,7 @@ class Channel:
         self._snr_db: AnyFloats
         self._shadow_db: AnyFloats
         self._fades_db: AnyFloats
-        self._luck: AnyFloats
+        self._losses: AnyFloats
         self._reach_bytes: AnyFloats
         self._snr_rows: list[list[list[float]]] = []  # of a small fleet: the block as lists, which one looks up faster
         self._reach_rows: list[list[list[float]]] = []
@@ -205,8 +205,8 @@ class Channel:
                 snr -= extra[links.sender, links.receiver]
             if jammers:
                 snr -= self.noise_rise_db(jammers)[links.receiver]
-            fades_db, luck = self._chance(row)
-            self.reach_bytes = self._reach(snr + fades_db, luck)
+            fades_db, draws = self._chance(row)
+            self.reach_bytes = self._reach(snr + fades_db, draws)
             rows_db = None
             if self._crowd is None:
                 self._reach_now = self.reach_bytes.reshape(self.n, self.n).tolist()
@@ -214,7 +214,7 @@ class Channel:
         self.now = FrameLinks(links, snr, rows_db)
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
-        """From the next frame on the fleet flies another way; what was drawn of shadowing, fades and luck stays.
+        """From the next frame on the fleet flies another way; what was drawn of shadowing, fades and losses stays.
 
         In fleets of more than `SQUARE` drones links follow it from the next block of `EPOCH` frames on.
 
@@ -259,15 +259,15 @@ class Channel:
         Args:
             sender: whose frame.
             length_bytes: its length.
-            times: how many frames it has sent before in this frame of time: same fade, new luck. The luck is the
+            times: how many frames it has sent before in this frame of time: same fade, new draws. The draws are the
                 first frame's shifted by multiples of the golden ratio, modulo 1.
         """
         links = self.links
         if times:
             mine = links.by_sender[links.begin[sender] : links.begin[sender + 1]]
-            fades_db, luck = self._chance(self.frame % self._block, mine)
-            luck = (luck + times * 0.6180339887498949) % 1.0
-            reach = self._reach(self.now.snr_db[mine] + fades_db, luck)
+            fades_db, draws = self._chance(self.frame % self._block, mine)
+            draws = (draws + times * 0.6180339887498949) % 1.0
+            reach = self._reach(self.now.snr_db[mine] + fades_db, draws)
             again = links.receiver[mine[reach >= length_bytes]]
             return cast(Sequence[int], again if self._crowd else again.tolist())
         if self._crowd is None:
@@ -282,7 +282,7 @@ class Channel:
                 self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
         return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
 
-    def _reach(self, faded_db: AnyFloats, luck: AnyFloats) -> AnyFloats:
+    def _reach(self, faded_db: AnyFloats, draws: AnyFloats) -> AnyFloats:
         # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
         x = faded_db + (self._group_gain_db - self._group_s50_db)
         x *= -self._group_slope
@@ -290,7 +290,7 @@ class Channel:
         np.minimum(x, 80.0 if is_single else 700.0, out=x)  # keeps the exponential finite
         minus_log_s: AnyFloats = np.log1p(np.exp(x, out=x), out=x)
         np.maximum(minus_log_s, 1e-30 if is_single else 1e-300, out=minus_log_s)
-        minus_log_s = np.divide(_reach_at_1(luck), minus_log_s, out=minus_log_s)
+        minus_log_s = np.divide(_reach_at_1(draws), minus_log_s, out=minus_log_s)
         return minus_log_s
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
@@ -319,13 +319,13 @@ class Channel:
             self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
             safe_db = self._group_s50_db - self._group_gain_db + SAFE_DB - float(fade_table_db(c.rician_k_db)[0])
             risky = np.flatnonzero(self._snr_db.min(axis=0) < safe_db)
-            fades_db, luck = self._crowd.chance(0, len(p), risky)
+            fades_db, draws = self._crowd.chance(0, len(p), risky)
             self._all_ids = self.links.receiver[self.links.by_sender]
             self._reach_bytes = np.full_like(self._snr_db, np.inf)
-            self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, luck)
+            self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, draws)
             return
         drawn = self._draws.block(self._block, len(p))
-        self._shadow_db, self._fades_db, self._luck = (x.reshape(len(p), -1) for x in drawn)
+        self._shadow_db, self._fades_db, self._losses = (x.reshape(len(p), -1) for x in drawn)
         self._work_out(self.frame)
 
     def _work_out(self, first: int) -> None:
@@ -337,20 +337,20 @@ class Channel:
             at = [self._field.between(q, (first + t) * self._frame_s) for t, q in enumerate(p)]
             self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
-        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._luck)
+        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._losses)
         square = (len(p), self.n, self.n)
         self._snr_rows = self._snr_db.reshape(square).tolist()
         self._reach_rows = self._reach_bytes.reshape(square).tolist()
 
     def _chance(self, row: int, links: IntArray | None = None) -> tuple[AnyFloats, AnyFloats]:
-        """Fades in dB and luck of some links, or all, in a frame of the block."""
+        """Fades in dB and uniform draws of some links, or all, in a frame of the block."""
         if self._crowd is not None:
             which = np.arange(len(self.links.sender)) if links is None else links
-            fades_db, luck = self._crowd.chance(row, 1, which)
-            return fades_db[0], luck[0]
+            fades_db, draws = self._crowd.chance(row, 1, which)
+            return fades_db[0], draws[0]
         if links is None:
-            return self._fades_db[row], self._luck[row]
-        return self._fades_db[row, links], self._luck[row, links]
+            return self._fades_db[row], self._losses[row]
+        return self._fades_db[row, links], self._losses[row, links]
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""
@@ -367,7 +367,7 @@ class Channel:
         return loss_db
 
 
-class SampleLuck:
+class SampleDraws:
     """Uniform draws for unicast samples, keyed per ordered link and taken by the link's own sample number.
 
     Each sample gets `ROUNDS` numbers whether it needs them or not, so that what one sample needed (its repair

@@ -98,7 +98,7 @@ def ampdu_frames(frame: int, rate_mbps: float, max_frames: int, standard: Standa
 
 @dataclass(frozen=True, slots=True)
 class Exchanges:
-    """What a sample asks of the medium when no frame fails."""
+    """Load that a sample puts on the medium when no frame fails."""
 
     count: float
     """Number of exchanges (frame or A-MPDU, SIFS, ack)."""

@@ -74,7 +74,7 @@ class Broadcasts:
         self._heard_times = [0] * n  # how often in that frame before
 
     def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
-        """One more frame of a drone, its luck drawn; arguments and errors as for `Air.broadcast`."""
+        """One more frame of a drone, with its own random draws; arguments and errors as for `Air.broadcast`."""
         if not 0 <= sender < self._n:
             raise ValueError(f"sender is {sender}, must be in [0, {self._n - 1}]")
         if not 1 <= payload_bytes <= MAX_GROUP_PAYLOAD_BYTES:

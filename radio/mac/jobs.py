@@ -54,7 +54,7 @@ class AirJob:
         self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = self.need_s = 0.0
 
     def demand(self, exchanges: Exchanges, tries: float = 1.0) -> None:
-        """Set what the whole job asks of the medium, each frame sent `tries` times; `remaining` stays."""
+        """Set the load that the whole job puts on the medium, each frame sent `tries` times; `remaining` stays."""
         self.count = count = exchanges.count * tries
         self.ppdu_s = ppdu_s = exchanges.ppdu_s * tries
         self.clean_s = clean_s = exchanges.clean_s * tries

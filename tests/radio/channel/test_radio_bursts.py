@@ -58,7 +58,7 @@ def test_a_step_may_last_many_frames_or_less_than_one() -> None:
 
 
 @given(p=st.floats(0.0, 1.0), r=st.floats(0.01, 1.0), u=st.lists(st.floats(0.0, 0.999), min_size=1, max_size=30))
-def test_a_walk_obeys_its_luck(p: float, r: float, u: list[float]) -> None:
+def test_a_walk_obeys_its_draws(p: float, r: float, u: list[float]) -> None:
     bad = False
     for step, state in enumerate(walk(np.array(False), np.array(u), p, r)):
         bad = (u[step] >= r) if bad else (u[step] < p)
