@@ -53,13 +53,13 @@ def release_of(code: str) -> str:
     return code.partition("+")[0]
 
 
-def user_code(scenario: Scenario, policy: Callable[..., object] | None = None) -> dict[str, str]:
+def user_code(scenario: Scenario, policy: str | Callable[..., object] | None = None) -> dict[str, str]:
     """The user's own code that a sortie runs: every Python file that the scenario names, and every module that such a
     file imports from outside the standard library and installed packages.
 
     Args:
         scenario: whose policies and fusion may be in files.
-        policy: a callable that decides in place of the scenario's policy.
+        policy: a name, `file.py:function` or a callable that decides in place of the scenario's policy.
 
     Returns:
         16 hex digits of SHA-256 by path; a callable that is in no file stands under its name with the digest of its
@@ -67,7 +67,9 @@ def user_code(scenario: Scenario, policy: Callable[..., object] | None = None) -
     """
     named = [Path(name) for name in named_files(scenario.model_dump(mode="json")) if name.endswith(".py")]
     found = {}
-    if policy is not None:
+    if isinstance(policy, str):
+        named += [Path(policy.rpartition(":")[0])] if ":" in policy else []
+    elif policy is not None:
         function = inspect.unwrap(policy.func if isinstance(policy, functools.partial) else policy)
         function = function if inspect.isroutine(function) else type(function)
         home = str(getattr(function, "__module__", "")).partition(".")[0]

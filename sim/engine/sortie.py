@@ -35,7 +35,7 @@ from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
-from sortie.sim.identity import code_version
+from sortie.sim.identity import code_version, user_code
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
 KEY_ID = 1
@@ -84,10 +84,12 @@ def run_sortie(
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
+    code = user_code(scenario, policy)  # as it is now: a file may be edited while the sortie flies
     parts = build(scenario, policies, seed, replication, detector_of)
     _fly(parts, progress, observer)
     record = _collect(parts, name, seed, replication)
-    return dataclasses.replace(record, wall={"wall_s": time.perf_counter() - begin_s, **record.wall})
+    wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
+    return dataclasses.replace(record, user_code=code, wall=wall)
 
 
 @dataclass(frozen=True)

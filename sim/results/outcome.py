@@ -46,6 +46,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "seed": record.seed,
         "replication": record.replication,
         "version": record.version,
+        "user_code": dict(record.user_code),
         "fingerprint": record.fingerprint,
         "duration_s": scenario.duration_s,
         "frame_s": scenario.frame_s,

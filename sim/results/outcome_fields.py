@@ -101,7 +101,10 @@ class Outcome(TypedDict):
     policy: Annotated[str, "The policy flown."]
     seed: Annotated[int, "Of every random draw."]
     replication: Annotated[int, "Which draw of a campaign."]
-    version: Annotated[str, "Of this project."]
+    version: Annotated[
+        str, "The code that made the record: release, plus sign, digest of the package and its libraries."
+    ]
+    user_code: Annotated[dict[str, str], "Digest of each file of the user's own code that the sortie ran."]
     fingerprint: Annotated[str, "SHA-256 over the record's values; equal inputs give equal fingerprints."]
     duration_s: Annotated[float, "Length of the sortie."]
     frame_s: Annotated[float, "From one frame to the next."]
@@ -167,6 +170,7 @@ def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bo
         "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
         "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
         "phases": tuple(map(str, range(phases))),
+        "user_code": (),  # digests are no numbers
     }
 
 

@@ -115,6 +115,8 @@ class SortieRecord:
     """Counts that are no table: context bytes, medium utilisation, ..."""
     calibration: str | None = None
     """Which fit a surrogate detector is of; None with any other."""
+    user_code: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the user's own code, as `sortie.sim.identity.user_code`; no part of the fingerprint."""
     wall: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
 

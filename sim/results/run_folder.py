@@ -65,6 +65,7 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
             "replication": record.replication,
             "version": record.version,
             "calibration": record.calibration,
+            "user_code": dict(record.user_code),
             "totals": dict(record.totals),
             "wall": dict(record.wall),
         }

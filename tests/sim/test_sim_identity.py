@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sim_examples import example
 
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.registry import resolve
 from sortie.sim import identity
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
@@ -59,6 +62,43 @@ def test_the_record_and_the_outcome_name_the_code(monkeypatch: pytest.MonkeyPatc
     record = run_sortie(example("duration_s=1", "perception.detector=none"))
     assert record.version == identity.code_version() == outcome(record)["version"]
     assert record.version.startswith(f"{identity.RELEASE}+")
+
+
+MINE = "from helper import PEERS\n\n\ndef decide(view):\n    return []\n"
+
+
+def test_the_users_own_code_is_named_with_a_digest_of_each_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "helper.py").write_text("PEERS = 2\n")
+    scenario = example("duration_s=1", "perception.detector=none")
+    by_name = run_sortie(example("duration_s=1", "policy.name='mine.py:decide'", "policy.params={}")).user_code
+    assert set(by_name) == {"mine.py", "helper.py"}
+    assert (
+        run_sortie(scenario, "mine.py:decide").user_code
+        == by_name
+        == outcome(run_sortie(scenario, "mine.py:decide"))["user_code"]
+    )
+    (tmp_path / "helper.py").write_text("PEERS = 3\n")
+    after = run_sortie(scenario, "mine.py:decide").user_code
+    assert (after["mine.py"], after["helper.py"] != by_name["helper.py"]) == (by_name["mine.py"], True)
+    assert run_sortie(scenario).user_code == {}
+
+
+def quiet(view: FleetView) -> list[Directive]:
+    return []
+
+
+def test_a_callables_file_counts_and_one_without_a_file_by_its_source() -> None:
+    scenario = example("duration_s=1", "perception.detector=none")
+    (name,) = (n for n in identity.user_code(scenario, quiet) if n.endswith("test_sim_identity.py"))
+    assert identity.user_code(scenario, quiet)[name] == identity.file_digest(Path(__file__))[:16]
+    space: dict[str, Any] = {"__name__": "typed_in"}
+    exec("def decide(view):\n    return []\n", space)  # noqa: S102 - as it is typed into an interpreter
+    assert list(identity.user_code(scenario, space["decide"])) == ["decide"]
+    assert identity.user_code(scenario, resolve("worked")) == {}
 
 
 def test_a_change_of_code_that_changes_no_value_leaves_the_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
