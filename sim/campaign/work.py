@@ -66,13 +66,16 @@ def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]
     begin_s = time.perf_counter()
     if code_version() != code:
         raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
-    _set_up()
-    return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):  # sums in one order: a matrix product on two threads may round differently than on one
+        return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
 
 
 def fly_in_worker(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
     """`fly_batch`, in a process that is the campaign's alone."""
     collect_rarely()
+    keep_freed()  # dask's nanny has its workers give back every 64 KiB, which costs a third of a run
     return fly_batch(code, tasks)
 
 
@@ -136,13 +139,3 @@ def _check_file(path: str, digest: str) -> None:
         raise OtherCodeError(f"{path}: cannot be read by this worker: {error.strerror}") from None
     if not same:
         raise OtherCodeError(f"{path}: is not the file that the campaign was begun with")
-
-
-@functools.cache
-def _set_up() -> None:
-    """Sums in one order: a matrix product on two threads may round differently than on one. And freed memory stays: dask's
-    nanny has its workers give back every 64 KiB, which costs a third of a run."""
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
-    keep_freed()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import gc
 import json
 import re
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from threadpoolctl import threadpool_info
 
 import sortie
 from sortie import _api, _run
@@ -170,6 +172,18 @@ def test_a_campaign_gives_its_rows_and_goes_on(tmp_path: Path) -> None:
     assert done.rows.num_rows == 4
     assert {row["policy"] for row in done.rows.to_pylist()} == {"worked", "silence"}
     assert sortie.campaign(tmp_path / "tiny.yaml", out=tmp_path / "c").flown == 0
+
+
+def test_a_campaign_in_this_process_leaves_it_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(CAMPAIGN)
+
+    def state() -> list[object]:
+        return [gc.isenabled(), gc.get_threshold(), [pool["num_threads"] for pool in threadpool_info()]]
+
+    sortie.fly("track_target", SHORT)  # libraries are loaded
+    before = state()
+    sortie.campaign(tmp_path / "tiny.yaml", out=tmp_path / "c")
+    assert state() == before
 
 
 def test_a_folder_is_checked_whole(tmp_path: Path) -> None:

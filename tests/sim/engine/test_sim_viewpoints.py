@@ -161,7 +161,7 @@ def test_a_fleet_in_which_a_trace_flies_holds_its_slots(tmp_path: Path) -> None:
 def test_a_wish_out_of_bounds_stops_the_sortie_with_its_drone_and_bound() -> None:
     far = looks_from(lambda view: Reposition(5000.0, 0.0))(lambda view: share(view))
     with pytest.raises(
-        PolicyError, match=r"reposition of drone \d: 50\d\d\.\d m from where it is, must be at most 200 m"
+        PolicyError, match=r"reposition of drone \d: 50\d\d\.\d m from the drone, must be at most 200 m"
     ):
         run_sortie(example(), far)
     broken = looks_from(lambda view: view.nothing)(lambda view: share(view))
