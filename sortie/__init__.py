@@ -15,7 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sortie._api import Campaign, Comparison, campaign, check, compare, env, fly, load, open_run
+    from sortie._api import CampaignResult, Comparison, campaign, check, compare, env, fly, load, open_run
     from sortie._run import Run
     from sortie.policies.contract import (
         Descriptor,
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "load", "fly", "compare", "campaign", "check", "env", "open_run",
-    "Run", "Comparison", "Campaign", "Scenario",
+    "Run", "Comparison", "CampaignResult", "Scenario",
     "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition", "looks_from",
     "SortieError", "ScenarioError", "PolicyError", "RunError",
     "__version__",
 ]  # fmt: skip
 
 _HOMES = {
-    "sortie._api": ("load", "fly", "compare", "campaign", "check", "env", "open_run", "Comparison", "Campaign"),
+    "sortie._api": ("load", "fly", "compare", "campaign", "check", "env", "open_run", "Comparison", "CampaignResult"),
     "sortie._run": ("Run",),
     "sortie.policies.contract": (
         "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition",

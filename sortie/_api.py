@@ -199,7 +199,7 @@ def compare(
 
 
 @dataclass(frozen=True, eq=False)
-class Campaign:
+class CampaignResult:
     """What is finished of a campaign; made by `sortie.campaign`."""
 
     path: Path
@@ -241,7 +241,7 @@ def campaign(
     resume: bool = False,
     retry_failed: bool = False,
     progress: Callable[[Any], None] | None = None,
-) -> Campaign:
+) -> CampaignResult:
     """Fly a campaign: many sorties over what its file varies. Interrupted at any moment, the same call goes on.
 
     Args:
@@ -281,7 +281,7 @@ def campaign(
         with open_engine(count, scheduler) as engine:
             watch = (lambda p: None) if progress is None else progress
             done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch)
-    return Campaign(folder, done.finished, done.failed, done.flown, done.seconds)
+    return CampaignResult(folder, done.finished, done.failed, done.flown, done.seconds)
 
 
 def campaign_folder(name: str) -> Path:

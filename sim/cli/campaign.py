@@ -116,7 +116,7 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
 
 
-def _in_words(done: sortie.Campaign) -> str:
+def _in_words(done: sortie.CampaignResult) -> str:
     failed = f", [red]{done.failed} failed[/red]" if done.failed else ""
     speed = (
         f"; {done.flown} of them now, {60 * done.flown / done.seconds:.1f} a minute"
