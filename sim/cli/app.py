@@ -1,4 +1,4 @@
-"""The `sortie` command: its commands, each in a file of this folder, and what a user can mend told in one line."""
+"""The `sortie` command: one file of this folder a command or group. An error that a user can put right is one line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from sortie.sim.process import collect_rarely
 
 
 class _Commands(TyperGroup):
-    """Says that a command was interrupted, before typer ends it without a word."""
+    """Prints that a command was interrupted; typer alone ends it silently."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -52,7 +52,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Fly drone fleets that share what they see, and tell what they saw and what it cost.",
+    help="Fly drone fleets that share what they see. Print what they saw and what sharing cost.",
 )
 app.add_typer(bench.app, name="bench")
 app.add_typer(recording.app, name="recording")

@@ -1,4 +1,4 @@
-"""`sortie bench`: make the benchmark's scenes, look at a frame, verify the files, count what is in them."""
+"""`sortie bench`: make the benchmark's scenes, draw a frame, verify the files, count what the scenes contain."""
 
 from __future__ import annotations
 
@@ -45,14 +45,18 @@ def make(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder of benchmarks; each has its own folder in it.")] = Path(
         "runs/bench"
     ),
-    seed: Annotated[int, typer.Option(help="Another seed is another benchmark.", min=0)] = 0,
-    split: Annotated[list[SplitName] | None, typer.Option(help="Only this split; may be given again.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the benchmark; another seed makes other scenes.", min=0)] = 0,
+    split: Annotated[
+        list[SplitName] | None, typer.Option(help="Make only this split. Repeat the option for several.")
+    ] = None,
     range_: Annotated[RangeName, typer.Option("--range", help="How far the grids reach, ± metres.")] = RangeName.full,
     density: Annotated[DensityName, typer.Option(help="How many cars.")] = DensityName.default,
-    scenes: Annotated[int | None, typer.Option(help="Only the first so many scenes of each split.", min=1)] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
+    scenes: Annotated[
+        int | None, typer.Option(help="Make only this many scenes of each split, from the first.", min=1)
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per core.", min=1)] = None,
 ) -> None:
-    """Render the splits; what is there already is kept, and a run that was cut off goes on where it was."""
+    """Render the splits. Finished scenes are kept, and an interrupted run continues."""
     from sortie.perception.benchmark.dataset import SIZES, Benchmark, make_split
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
@@ -71,10 +75,10 @@ def make(
 @app.command()
 def show(
     folder: FolderArgument,
-    split: Annotated[SplitName, typer.Argument(help="Its split.")],
+    split: Annotated[SplitName, typer.Argument(help="The split.")],
     index: Annotated[int, typer.Argument(help="The scene's number in the split.", min=0)],
     frame: Annotated[int, typer.Option(help="The frame's number in the scene.", min=0)] = 0,
-    out_file: Annotated[Path | None, typer.Option("--out", help="The PNG; left out, beside the splits.")] = None,
+    out_file: Annotated[Path | None, typer.Option("--out", help="The PNG file; default: beside the splits.")] = None,
 ) -> None:
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
     with user_errors():
@@ -94,7 +98,7 @@ def show(
 
 @app.command()
 def verify(folder: FolderArgument) -> None:
-    """Hold every file against the manifest; exit code 1 if one is missing or holds other data."""
+    """Compare every file with the manifest. Exit code 1 if one is missing or differs."""
     with user_errors(), stages() as report:
         from sortie.perception.benchmark.dataset import Benchmark
 
@@ -115,7 +119,7 @@ def survey(
     range_: Annotated[RangeName, typer.Option("--range", help="How far the grids reach, ± metres.")] = RangeName.full,
     scenes: Annotated[int, typer.Option(help="How many scenes of each split.", min=1)] = 12,
 ) -> None:
-    """Count what the scenes hold, by split and style: cars, who can see them, houses. Nothing is rendered."""
+    """Count cars, visible cars and houses by split and style. Nothing is rendered."""
     from sortie.perception.benchmark.dataset import SIZES, Benchmark
     from sortie.perception.benchmark.survey import by_style
     from sortie.perception.benchmark.survey import survey as survey_scene
@@ -139,13 +143,15 @@ def survey(
 
 @app.command()
 def difficulty(
-    weights: Annotated[Path | None, typer.Option(help="A safetensors file; left out, the shipped weights.")] = None,
-    scenes: Annotated[int, typer.Option(help="How many scenes each row is measured on.", min=2)] = 12,
-    store: Annotated[Path, typer.Option(help="Where finished scenes are kept.")] = Path("runs/difficulty"),
-    readme: Annotated[Path | None, typer.Option(help="Put the table between this README's markers.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes; left out, one a core.", min=1)] = None,
+    weights: Annotated[Path | None, typer.Option(help="A safetensors file; default: the shipped weights.")] = None,
+    scenes: Annotated[int, typer.Option(help="Number of scenes that each row is measured on.", min=2)] = 12,
+    store: Annotated[Path, typer.Option(help="Folder for finished scenes.")] = Path("runs/difficulty"),
+    readme: Annotated[
+        Path | None, typer.Option(help="Write the table between the markers of this Markdown file.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per core.", min=1)] = None,
 ) -> None:
-    """Measure what each parameter of the difficulty does to AP; a run that was cut off goes on where it was."""
+    """Measure how each parameter of the difficulty changes AP. An interrupted run continues."""
     with user_errors(), stages() as report:
         from sortie.perception.evaluation.difficulty_effects import measure, table, write_table
         from sortie.perception.network.detector import SHIPPED_WEIGHTS

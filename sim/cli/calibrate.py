@@ -1,4 +1,4 @@
-"""`sortie calibrate`: the surrogate from the torch detector's own runs, and both side by side on whole sorties."""
+"""`sortie calibrate`: fit the surrogate to the torch detector, and compare both on whole sorties."""
 
 from __future__ import annotations
 
@@ -24,24 +24,31 @@ if TYPE_CHECKING:
 
 def calibrate(
     out_file: Annotated[
-        Path, typer.Option("--out", help="Where the calibration goes (safetensors); its card lies beside.")
+        Path, typer.Option("--out", help="File for the calibration (safetensors); its card is written beside it.")
     ] = Path("runs/calibrate/surrogate.safetensors"),
-    weights: Annotated[Path | None, typer.Option(help="The detector's weights; left out, the shipped ones.")] = None,
-    scenes: Annotated[int, typer.Option(help="Scenes to fit to.", min=2)] = 44,
-    held_out: Annotated[int, typer.Option(help="Scenes to be judged on.", min=2)] = 14,
-    seed: Annotated[int, typer.Option(help="Seed of scenes and fits.", min=0)] = 0,
-    work: Annotated[Path, typer.Option(help="Keeps the detector's answers; what is there is not asked again.")] = Path(
-        "runs/calibrate"
-    ),
+    weights: Annotated[Path | None, typer.Option(help="The detector's weights; default: the shipped ones.")] = None,
+    scenes: Annotated[int, typer.Option(help="Number of scenes to fit to.", min=2)] = 44,
+    held_out: Annotated[int, typer.Option(help="Number of held-out scenes for the evaluation.", min=2)] = 14,
+    seed: Annotated[int, typer.Option(help="Seed of the scenes and fits.", min=0)] = 0,
+    work: Annotated[
+        Path, typer.Option(help="Folder for the detector's results; those that exist are not computed again.")
+    ] = Path("runs/calibrate"),
     fly: Annotated[
-        str | None, typer.Option(help="Then fly this scenario or set of conditions by both detectors, side by side.")
+        str | None,
+        typer.Option(help="Afterwards fly this scenario or set of conditions with both detectors and compare them."),
     ] = None,
-    made: Annotated[Path | None, typer.Option(help="Take this calibration and make none; with --fly.")] = None,
-    policies: Annotated[str, typer.Option(help="Comma-separated: under which.")] = "silence,all-4,boxes",
-    rate_hz: Annotated[float, typer.Option(help="How often those sorties are scored.", min=0.05, max=10)] = 0.5,
-    towns: Annotated[int, typer.Option(help="In how many towns each of them is flown.", min=1, max=1000)] = 1,
+    made: Annotated[Path | None, typer.Option(help="With --fly: use this calibration instead of fitting one.")] = None,
+    policies: Annotated[
+        str, typer.Option(help="With --fly: the policies, separated by commas.")
+    ] = "silence,all-4,boxes",
+    rate_hz: Annotated[
+        float, typer.Option(help="With --fly: how often those sorties are scored.", min=0.05, max=10)
+    ] = 0.5,
+    towns: Annotated[
+        int, typer.Option(help="With --fly: in how many towns each of them is flown.", min=1, max=1000)
+    ] = 1,
 ) -> None:
-    """Fit the surrogate to the torch detector's own runs and judge it on held-out scenes; goes on where it was cut off."""
+    """Fit the surrogate to the torch detector and evaluate it on held-out scenes. An interrupted run continues."""
     from sortie.perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
 
     chosen = [p.strip() for p in policies.split(",")]

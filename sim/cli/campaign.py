@@ -1,4 +1,4 @@
-"""`sortie campaign`: fly thousands of sorties, go on where it stopped, report what they came to."""
+"""`sortie campaign`: fly thousands of sorties, continue an interrupted campaign, write its report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ class _RunIsMeant(TyperGroup):
 
 
 app = typer.Typer(
-    cls=_RunIsMeant, no_args_is_help=True, help="Monte Carlo: `sortie campaign FILE` flies it, `report DIR` tells it."
+    cls=_RunIsMeant,
+    no_args_is_help=True,
+    help="Monte Carlo: `sortie campaign FILE` flies a campaign, `sortie campaign report DIR` writes its report.",
 )
 
 
@@ -40,17 +42,20 @@ app = typer.Typer(
 def run(
     campaign: Annotated[str, typer.Argument(help="A campaign file, or a library campaign's name.")],
     workers: Annotated[
-        int | None, typer.Option(help="Worker processes; 0 flies in this one; left out, one a core.", min=0)
+        int | None,
+        typer.Option(help="Number of worker processes; 0 flies in this process; default: one per core.", min=0),
     ] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Join a running dask cluster: tcp://host:8786.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Use a running dask cluster: tcp://host:8786.")] = None,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="The campaign's folder; left out, runs/campaign-NAME.")
+        Path | None, typer.Option("--out", help="The campaign's folder; default: runs/campaign-NAME.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Only go on; an error if there is nothing.")] = False,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Fly runs that failed once more.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Only continue a campaign; fail if the folder has none.")
+    ] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Fly failed runs again.")] = False,
     report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
-    """Fly a campaign; interrupted at any moment, the same command goes on and ends with the same table."""
+    """Fly a campaign. After an interruption the same command continues it; the table is the same in the end."""
     folder = out_dir
     try:
         from sortie._api import campaign_folder
@@ -81,12 +86,12 @@ def run(
 
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
-    """Write report.md and its figures from what is finished."""
+    """Write report.md and its figures from the finished runs."""
     with user_errors():
         from sortie.sim.campaign.report import write_report
 
         path = write_report(folder)
-    out.print(f"told in [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
+    out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
 
 
 def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
@@ -128,7 +133,7 @@ def _in_words(done: sortie.CampaignResult) -> str:
 
 @contextmanager
 def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
-    """A bar with throughput and time left; silent without a terminal."""
+    """A progress bar with throughput and time left. It prints nothing without a terminal."""
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("starting", total=None)

@@ -1,4 +1,4 @@
-"""`sortie check`: scenarios against their own expectations."""
+"""`sortie check`: compare scenarios with their own expectations."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def check(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario files, names or folders; all: the whole library.")],
     set_: SetOption = None,
     update: Annotated[
-        bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing.")
+        bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing with it.")
     ] = False,
 ) -> None:
-    """Fly scenarios and hold their outcomes against their own expectations; exit code 1 if one fails."""
+    """Fly scenarios and compare their outcomes with their own expectations. Exit code 1 if one fails."""
     from sortie.sim.check.checking import flights
     from sortie.sim.check.discovery import scenario_files
 

@@ -1,4 +1,4 @@
-"""`sortie compare`: policies side by side, on a scenario or over a set of conditions."""
+"""`sortie compare`: several policies on one scenario, or over a set of conditions."""
 
 from __future__ import annotations
 
@@ -26,23 +26,25 @@ def compare(
     scenario: ScenarioArgument,
     policies: Annotated[
         str,
-        typer.Option(help="Comma-separated, as in worked,best-2(rho=0.1),silence; all: every one, over conditions."),
+        typer.Option(
+            help="Policies separated by commas: worked,best-2(rho=0.1),silence. With conditions, all: every policy."
+        ),
     ],
     seed: SeedOption = None,
     set_: SetOption = None,
     own_fusion: Annotated[
-        bool, typer.Option("--own-fusion", help="Prior methods fly with the fusion they were published with.")
+        bool, typer.Option("--own-fusion", help="Fly each prior method with the fusion that it was published with.")
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
-    recording: Annotated[Path | None, typer.Option(help="Save all of them side by side as a Rerun recording.")] = None,
+    recording: Annotated[Path | None, typer.Option(help="Save all sorties side by side as a Rerun recording.")] = None,
     readme: Annotated[
-        Path | None, typer.Option(help="A Markdown file whose section between the comparison's markers is replaced.")
+        Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")
     ] = None,
     by_torch: Annotated[
-        bool, typer.Option("--by-torch", help="Conditions flown by the surrogate are scored by the torch detector.")
+        bool, typer.Option("--by-torch", help="With conditions: fly with the surrogate, score with the torch detector.")
     ] = False,
 ) -> None:
-    """Fly a scenario, or a set of conditions, under several policies, same seed and draws, and print them side by side."""
+    """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison."""
     conditions = load_conditions(scenario)
     if conditions is not None:
         refuse({"seed": seed, "own-fusion": own_fusion or None, "recording": recording, "readme": readme})

@@ -116,19 +116,21 @@ def _figures(title: str, *columns: str) -> Table:
 
 
 def learn(
-    conditions: Annotated[int, typer.Option(help="How many training conditions are drawn and flown.", min=8)] = 100,
-    seed: Annotated[int, typer.Option(help="Of the training conditions.", min=0)] = 0,
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
+    conditions: Annotated[int, typer.Option(help="Number of training conditions.", min=8)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the training conditions.", min=0)] = 0,
+    workers: Annotated[int, typer.Option(help="Number of processes.", min=1)] = 1,
     by_torch: Annotated[
         bool,
-        typer.Option("--by-torch", help="The torch detector scores what the surrogate flies; half an hour a core."),
+        typer.Option(
+            "--by-torch", help="Score with the torch detector what the surrogate flies; half an hour on one core."
+        ),
     ] = False,
     out_file: Annotated[
         Path,
-        typer.Option("--out", help="Where the fit is kept; policies/catalogue/learned.json is the one that flies."),
+        typer.Option("--out", help="File for the fit; `learned` flies with policies/catalogue/learned.json."),
     ] = Path("runs/learned.json"),
 ) -> None:
-    """Fit the policy `learned`: fly every arm in drawn conditions, and regress AP on what a policy sees."""
+    """Fit the policy `learned`: fly every choice in random conditions, and regress AP on what a policy sees."""
     from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     ensure_files(out_file)

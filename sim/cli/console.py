@@ -1,4 +1,4 @@
-"""What the commands share: where they print, and progress bars."""
+"""Consoles and progress bars that the commands share."""
 
 from __future__ import annotations
 

@@ -21,19 +21,22 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 def export(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     mcap: Annotated[
-        bool, typer.Option("--mcap", help="A ROS 2 bag: a folder with metadata.yaml and one .mcap.")
+        bool, typer.Option("--mcap", help="Write a ROS 2 bag: a folder with metadata.yaml and one .mcap file.")
     ] = False,
     tlog: Annotated[
-        bool, typer.Option("--tlog", help="A MAVLink telemetry log: one file, a system id a drone.")
+        bool, typer.Option("--tlog", help="Write a MAVLink telemetry log: one file, one system id per drone.")
     ] = False,
-    out_path: Annotated[Path | None, typer.Option("--out", help="Where to; left out, in the run's folder.")] = None,
-    begin: Annotated[str, typer.Option(help="When the sortie began, ISO 8601, UTC unless it says otherwise.")] = BEGIN,
+    out_path: Annotated[Path | None, typer.Option("--out", help="Output path; default: in the run's folder.")] = None,
+    begin: Annotated[str, typer.Option(help="Start time of the sortie, ISO 8601; UTC without a zone.")] = BEGIN,
     origin: Annotated[
         str | None,
-        typer.Option(help="LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0), for --tlog; left out, a field in Zurich."),
+        typer.Option(help="With --tlog: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: a field in Zurich."),
     ] = None,
     key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Sign --tlog's frames with this file's 32 B or 64 hex digits.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="With --tlog: sign the frames with the key in this file (32 bytes or 64 hex digits)."
+        ),
     ] = None,
 ) -> None:
     """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, or as a log for ground stations."""

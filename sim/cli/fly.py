@@ -1,4 +1,4 @@
-"""`sortie fly`: one sortie, or one run of a campaign again."""
+"""`sortie fly`: fly one sortie, or one run of a campaign again."""
 
 from __future__ import annotations
 
@@ -23,36 +23,47 @@ from sortie.sim.results import run_folder
 
 def fly(
     scenario: Annotated[
-        str | None, typer.Argument(help="A scenario file, or a library scenario's name; none with --from-campaign.")
+        str | None,
+        typer.Argument(help="A scenario file or a library scenario's name; leave it out with --from-campaign."),
     ] = None,
     policy: PolicyOption = None,
     seed: SeedOption = None,
     set_: SetOption = None,
     replication: Annotated[
-        int | None, typer.Option(help="Another draw of everything random, as sortie check's replications.", min=0)
+        int | None,
+        typer.Option(help="Number of the repetition; each has other random draws under the same seed.", min=0),
     ] = None,
-    out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; left out, under runs/.")] = None,
-    live: Annotated[bool, typer.Option("--live", help="Stream to a Rerun viewer while it flies.")] = False,
-    view_: Annotated[bool, typer.Option("--view", help="Open the recording afterwards.")] = False,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; default: below runs/.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show the sortie in a Rerun viewer while it flies.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Open the recording in the viewer afterwards.")] = False,
     mavlink: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Be MAVLink vehicles while it flies: udpout:127.0.0.1:14550")
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Publish each drone as a MAVLink vehicle while it flies: udpout:127.0.0.1:14550"
+        ),
     ] = None,
     pace: Annotated[
         float,
-        typer.Option(help="Simulated seconds in one of the wall's, with --mavlink; 0: as fast as it goes.", min=0),
+        typer.Option(help="With --mavlink: simulated seconds per wall-clock second; 0: as fast as possible.", min=0),
     ] = 1.0,
     mavlink_key: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Sign what --mavlink sends with this file's 32 B or 64 hex digits."),
+        typer.Option(
+            metavar="FILE", help="With --mavlink: sign messages with the key in this file (32 bytes or 64 hex digits)."
+        ),
     ] = None,
-    recording: Annotated[bool, typer.Option(help="Save sortie.rrd.")] = True,
-    profile: Annotated[bool, typer.Option("--profile", help="Tell where the wall time went.")] = False,
+    recording: Annotated[bool, typer.Option(help="Save the Rerun recording, sortie.rrd.")] = True,
+    profile: Annotated[bool, typer.Option("--profile", help="Print how the wall-clock time was spent.")] = False,
     campaign: Annotated[
-        Path | None, typer.Option("--from-campaign", metavar="DIR", help="Fly one run of a campaign again; see --run.")
+        Path | None,
+        typer.Option("--from-campaign", metavar="DIR", help="Fly one run of this campaign again; name it with --run."),
     ] = None,
-    run: Annotated[int | None, typer.Option("--run", help="Its number, as in the table's column `run`.", min=0)] = None,
+    run: Annotated[
+        int | None,
+        typer.Option("--run", help="With --from-campaign: the run's number, from the table's column `run`.", min=0),
+    ] = None,
 ) -> None:
-    """Fly one sortie, print its outcome, and keep the run."""
+    """Fly one sortie, print its outcome and save the run."""
     if campaign is not None or run is not None:
         flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
     else:
@@ -77,7 +88,7 @@ def fly(
 
 
 def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) -> Watchers:
-    """Who watches a sortie while it flies; imported here, since a viewer costs a third of a second."""
+    """The observers of a sortie. They are imported here because a viewer takes a third of a second to load."""
     if key is not None and mavlink is None:
         raise RunError("--mavlink-key without --mavlink: there is nothing to sign")
     watchers: list[Watcher] = []

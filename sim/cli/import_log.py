@@ -28,27 +28,27 @@ LONGEST_S = 7200.0
 LEAST_SOC = 0.001
 """What a flight's charge is held at least at: an estimate of nothing left grounds a drone, and it flew on."""
 LOWEST_M = 2.0
-"""Where the flight's lowest point is put above the flat ground of the simulator's town, unless told."""
+"""Default height of the flight's lowest point above the flat ground of the simulator's town."""
 
 
 def import_log(
     log: Annotated[Path, typer.Argument(help="ArduPilot's .bin, MAVLink telemetry (.tlog) or PX4's .ulg.")],
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="The folder of trace and scenario; left out, named after the log.")
+        Path | None, typer.Option("--out", help="Folder for the trace and the scenario; default: named after the log.")
     ] = None,
-    rate: Annotated[float, typer.Option(help="Rows a second of the trace.", min=0.1, max=1000)] = 10.0,
-    from_s: Annotated[float, typer.Option("--from", help="Begin, seconds of the log.", min=0)] = 0.0,
+    rate: Annotated[float, typer.Option(help="Rows per second in the trace.", min=0.1, max=1000)] = 10.0,
+    from_s: Annotated[float, typer.Option("--from", help="Start, in seconds of the log.", min=0)] = 0.0,
     until_s: Annotated[
-        float | None, typer.Option("--until", help="End, seconds of the log; left out, its end.", min=0)
+        float | None, typer.Option("--until", help="End, in seconds of the log; default: its end.", min=0)
     ] = None,
     lift: Annotated[
         float | None,
-        typer.Option(help="Metres added to every height; left out, the lowest point flies at 2 m.", min=-1e4, max=1e4),
+        typer.Option(help="Metres added to every height; default: the lowest point is at 2 m.", min=-1e4, max=1e4),
     ] = None,
 ) -> None:
     """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it as one drone.
 
-    Gaps, restarts, damaged and missing messages are told and survived; gaps are empty cells of the trace.
+    Gaps, restarts, damaged and missing messages are reported and skipped. Gaps are empty cells of the trace.
     """
     from sortie.fleet.logs.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
     from sortie.fleet.logs.logtrace import context_trace, write_trace
@@ -70,13 +70,13 @@ def import_log(
         if "z_m" in columns:
             columns["z_m"] += LOWEST_M - float(np.nanmin(columns["z_m"])) if lift is None else lift
     text = scenario_text(slug(log), columns, flight.parameters, folder / TRACE, f"{flight.kind} log {log.name!r}")
-    loads(text, str(folder / SCENARIO))  # what a log makes impossible is told before anything is written
+    loads(text, str(folder / SCENARIO))  # an impossible log is refused before anything is written
     with replacing(folder) as new, user_errors():
         write_trace(new / TRACE, columns)
         write_text(new / SCENARIO, text)
     rows = len(columns["t_s"])
     out.print(
-        f"{flight.kind}, {flight.duration_s:.1f} s; {rows} rows at {rate:g} Hz of {told(columns)}", soft_wrap=True
+        f"{flight.kind}, {flight.duration_s:.1f} s; {rows} rows at {rate:g} Hz of {described(columns)}", soft_wrap=True
     )
     for problem in flight.problems:
         out.print(f"  [yellow]{problem}[/yellow]", soft_wrap=True)
@@ -97,7 +97,7 @@ def slug(log: Path) -> str:
     return re.sub(r"[^a-z0-9]+", "_", log.stem.lower()).strip("_")[:64] or "flight"
 
 
-def told(columns: Mapping[str, Array]) -> str:
+def described(columns: Mapping[str, Array]) -> str:
     """What a trace has, in words."""
     names = {
         "x_m": "position", "qx": "attitude", "vx_mps": "velocity", "soc": "charge", "voltage_v": "voltage",
@@ -122,7 +122,7 @@ def scenario_text(
     if "soc" in columns:
         battery.append("landing_soc: 0")
     return f"""# A real flight, {MADE} from the {source}.
-# The trace holds {told(columns)}; what it lacks is the models'.
+# The trace holds {described(columns)}; what it lacks is the models'.
 
 name: {name}
 duration_s: {columns["t_s"][-1]:g}

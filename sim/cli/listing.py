@@ -15,10 +15,13 @@ from sortie.sim.cli.console import out
 
 def list_(
     what: Annotated[
-        str, typer.Argument(help="policies, scenarios, campaigns, detectors, fusions or schema (JSON Schema).")
+        str,
+        typer.Argument(
+            help="What to list: policies, scenarios, campaigns, detectors, fusions or schema (JSON Schema)."
+        ),
     ],
 ) -> None:
-    """List what there is."""
+    """List policies, scenarios and other names that commands take."""
     if what == "policies":
         for name, function in POLICIES.items():
             defaults = ", ".join(f"{k}={v}" for k, v in parameters(function).items())

@@ -1,4 +1,4 @@
-"""`sortie live`: the context plane in real time over DDS, a process a drone."""
+"""`sortie live`: the context plane in real time over DDS, one process per drone."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ SHOWN = 20
 
 
 def live(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")] = "paper_replay",
+    scenario: Annotated[str, typer.Argument(help="A scenario file or a library scenario's name.")] = "paper_replay",
     policy: Annotated[
         str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
     ] = None,
-    begin: Annotated[float, typer.Option(help="The scenario's time at which the fleet begins, s.", min=0)] = 0.0,
+    begin: Annotated[float, typer.Option(help="Time of the scenario at which the flight begins, s.", min=0)] = 0.0,
     duration: Annotated[
-        float | None, typer.Option(help="How long it flies, s; left out, to the scenario's end.")
+        float | None, typer.Option(help="Length of the flight, s; default: to the scenario's end.")
     ] = None,
-    loss: Annotated[float, typer.Option(help="Share of descriptors that are lost on their way.", min=0, max=1)] = 0.0,
+    loss: Annotated[float, typer.Option(help="Share of descriptors that are dropped, 0 to 1.", min=0, max=1)] = 0.0,
     kill: Annotated[
-        str | None, typer.Option(metavar="DRONE@SECONDS", help="Kill a drone's process at the scenario's time: 2@70")
+        str | None, typer.Option(metavar="DRONE@SECONDS", help="Kill a drone's process at a time of the scenario: 2@70")
     ] = None,
     domain: Annotated[
-        int | None, typer.Option(help="DDS domain; left out, ROS_DOMAIN_ID or 0.", min=0, max=MAX_DOMAIN)
+        int | None, typer.Option(help="DDS domain; default: ROS_DOMAIN_ID, or 0.", min=0, max=MAX_DOMAIN)
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
     ] = None,
-    out_file: Annotated[Path | None, typer.Option("--out", help="Write everything measured as JSON here.")] = None,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write all measurements to this JSON file.")] = None,
 ) -> None:
     """Run the context plane in real time over DDS: one process a drone, with publisher, policy node and gate.
 

@@ -1,4 +1,4 @@
-"""What several commands ask for: a scenario, what to override of it, a policy, a seed."""
+"""Arguments that several commands take: scenario, overrides, policy, seed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.console import err
 from sortie.sim.policy_text import policy_overrides
 
-ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file, or a library scenario's name.")]
+ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file or a library scenario's name.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.battery.initial_soc=0.5")
 ]
 SeedOption = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Seed of every random draw; left out, the scenario's.", min=0, max=2**63 - 1),
+    typer.Option(metavar="N", help="Seed of every random draw; default: the scenario's.", min=0, max=2**63 - 1),
 ]
 PolicyOption = Annotated[
     str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
@@ -25,7 +25,7 @@ PolicyOption = Annotated[
 
 
 def loaded(scenario: str, set_: list[str] | None, policy: str | None) -> Scenario:
-    """The scenario with `--set` and the policy put in; another policy than its own starts from its own defaults."""
+    """The scenario with `--set` and `--policy` applied. A policy other than its own starts from the policy's defaults."""
     overrides = list(set_ or [])
     own = load(scenario, overrides)
     if policy is None:

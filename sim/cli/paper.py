@@ -28,33 +28,35 @@ COLOURS = {ClaimVerdict.REPRODUCED: "green", ClaimVerdict.NOT_REPRODUCED: "yello
 def paper(
     context: typer.Context,
     frames: Annotated[
-        int | None, typer.Option(help="Only so many frames of the test split, each of a scene of its own.", min=2)
+        int | None, typer.Option(help="Use only this many frames of the test split; each is of another scene.", min=2)
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
-    weights: Annotated[Path | None, typer.Option(help="A weights file; left out, the shipped one.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="A weights file; default: the shipped one.")] = None,
     unsent: Annotated[
-        str, typer.Option(help="What unsent cells count as: zero (the paper), masked, or both.")
+        str, typer.Option(help="How unsent cells enter the fusion: zero (the paper), masked, or both.")
     ] = "both",
-    cells_by: Annotated[str, typer.Option(help="What ranks cells: confidence or norm.")] = "confidence",
+    cells_by: Annotated[str, typer.Option(help="How cells are ranked: confidence or norm.")] = "confidence",
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     scenes: Annotated[bool, typer.Option("--by-scene", help="Resample whole scenes instead of frames.")] = False,
-    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
+    ] = None,
     out_dir: Annotated[Path, typer.Option("--out", help="The report's folder.")] = Path("runs/paper"),
     work: Annotated[
-        Path, typer.Option(help="Keeps the benchmark (bench/) and finished frames (harness/) between runs.")
+        Path, typer.Option(help="Folder that keeps the benchmark and finished frames between runs.")
     ] = Path("runs"),
-    against: Annotated[
-        Path | None, typer.Option(help="Another report's folder: tell which verdicts differ from its.")
-    ] = None,
+    against: Annotated[Path | None, typer.Option(help="Folder of another report: print which verdicts differ.")] = None,
     live: Annotated[
         Path | None,
-        typer.Option(help="What `sortie live --out` wrote: processor time and data plane of real processes."),
+        typer.Option(help="Output of `sortie live --out`, for processor time and data plane of real processes."),
     ] = None,
-    readme: Annotated[Path | None, typer.Option(help="Write this file's results section anew.")] = None,
+    readme: Annotated[
+        Path | None, typer.Option(help="Write the table of claims between the markers of this Markdown file.")
+    ] = None,
     frame: Annotated[
-        int | None, typer.Option(help="Only open this frame in Rerun, as in the paper's data figure.", min=0)
+        int | None, typer.Option(help="Draw only this frame in Rerun, as in the paper's data figure.", min=0)
     ] = None,
-    ego: Annotated[int, typer.Option(help="With --frame: whose peers' cells.", min=0)] = 0,
+    ego: Annotated[int, typer.Option(help="With --frame: the ego, whose peers' cells are shown.", min=0)] = 0,
     show: Annotated[bool, typer.Option("--view", help="With --frame: open the viewer.")] = False,
 ) -> None:
     """The paper's Evaluation, claim by claim: its value, ours, and a verdict by rule.

@@ -1,4 +1,4 @@
-"""`sortie recording`: look at a recording of another model, evaluate it in the harness, make one of UAV3D's files."""
+"""`sortie recording`: show a recording of another model, evaluate it, or make one from UAV3D's files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RecordingArgument = Annotated[Path, typer.Argument(help="An npz file or a Zarr f
 
 @app.command()
 def show(path: RecordingArgument) -> None:
-    """Check a recording and say what it holds."""
+    """Check a recording and print its contents."""
     rec = open_recording(path)
     c, h, w = rec.grid
     out.print(f"{len(rec)} frames of {rec.drones} drones in {len(set(rec.scene.tolist()))} scenes", soft_wrap=True)
@@ -32,14 +32,16 @@ def show(path: RecordingArgument) -> None:
 @app.command()
 def evaluate(
     path: RecordingArgument,
-    fusion: Annotated[str | None, typer.Option(help="path/to/file.py:function; left out, boxes by cell.")] = None,
+    fusion: Annotated[
+        str | None, typer.Option(help="Your fusion, path/to/file.py:function; default: boxes by cell.")
+    ] = None,
     conditions: Annotated[
-        str | None, typer.Option(help="Labels separated by spaces, as in 'single best-2@0.02 all-4@1'.")
+        str | None, typer.Option(help="Ways of sharing, separated by spaces: 'single best-2@0.02 all-4@1'.")
     ] = None,
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
 ) -> None:
-    """AP and bytes of a recording under ways of sharing; without --fusion the object-level stand-in says what arrives."""
+    """AP and bytes of a recording under several ways of sharing. Without --fusion, boxes arrive with their cells."""
     from sortie.perception.evaluation.condition import Sharing
     from sortie.perception.evaluation.matched import FLOOR
     from sortie.perception.recordings.instrument import evaluate_recording
@@ -75,7 +77,7 @@ def from_uav3d(
     out_path: Annotated[Path, typer.Option("--out", help="An npz file, or a new Zarr folder.")],
     split: Annotated[str, typer.Option(help="train or val.")] = "val",
 ) -> None:
-    """Scenes, times, poses and cars of a UAV3D split as a recording; detections are yours to add."""
+    """Make a recording from a UAV3D split: scenes, times, poses and cars. Add detections yourself."""
     from sortie.perception.recordings.uav3d import convert
 
     convert(root, split, out_path)

@@ -1,4 +1,4 @@
-"""`sortie study`: train, measure and tell the study of why the flip exists."""
+"""`sortie study`: train, measure and report the study of why the flip exists."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from sortie.perception.study.measure import StudyRow
 
 study = typer.Typer(
-    no_args_is_help=True, help="Why the flip exists: networks named beforehand, trained, measured, told."
+    no_args_is_help=True, help="The study of why the flip exists: train its networks, measure them, write the report."
 )
 TABLE, REPORT = "study.parquet", "README.md"
-WorkOption = Annotated[Path, typer.Option("--work", help="Weights, checkpoints and finished frames.")]
+WorkOption = Annotated[Path, typer.Option("--work", help="Folder for weights, checkpoints and finished frames.")]
 BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
 
 
 @study.command("train")
 def study_train(
-    jobs: Annotated[list[str] | None, typer.Argument(help="Networks, as in dropout-1; left out, all of them.")] = None,
+    jobs: Annotated[list[str] | None, typer.Argument(help="Networks, for example dropout-1; default: all.")] = None,
     work: WorkOption = Path("runs/study"),
     bench_dir: BenchOption = Path("runs/bench"),
 ) -> None:
-    """Train the networks that have no weights yet, one after the other; each goes on from its checkpoint."""
+    """Train the networks that have no weights yet, one after the other. Each continues from its checkpoint."""
     from sortie.perception.study.plan import read_plan
     from sortie.perception.study.run import SHIPPED, train_job
 
@@ -49,8 +49,10 @@ def study_train(
 def study_run(
     work: WorkOption = Path("runs/study"),
     bench_dir: BenchOption = Path("runs/bench"),
-    frames: Annotated[int, typer.Option(help="So many frames of the test split, its first.", min=2)] = 80,
-    workers: Annotated[int | None, typer.Option(help="Frames side by side; left out, one a core.", min=1)] = None,
+    frames: Annotated[int, typer.Option(help="Use this many frames of the test split, from the first.", min=2)] = 80,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
+    ] = None,
 ) -> None:
     """Measure every network that has weights, and write the rows."""
     from sortie.perception.study.measure import StudyRow, to_table
@@ -69,7 +71,7 @@ def study_run(
         raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
     path = work / TABLE
     _write_table(to_table(rows), path)
-    out.print(f"kept in [bold]{path}[/bold], tell it with: sortie study report {path}")
+    out.print(f"kept in [bold]{path}[/bold], write the report with: sortie study report {path}")
 
 
 @study.command("report")
@@ -79,10 +81,10 @@ def study_report(
         "docs/study"
     ),
     readme: Annotated[
-        Path | None, typer.Option(help="A Markdown file whose section between the study's markers is replaced.")
+        Path | None, typer.Option(help="Write the study's sentences between the markers of this Markdown file.")
     ] = None,
 ) -> None:
-    """Tell the study: a Markdown report with figures, the rows beside it, and the README's sentences."""
+    """Write the study's report as Markdown with figures, and its rows as Parquet."""
     from sortie.perception.evaluation import figures as common
     from sortie.perception.study import figures, report
     from sortie.perception.study.measure import to_table

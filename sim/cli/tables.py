@@ -1,4 +1,4 @@
-"""Outcomes for people: the terminal tables of the command line."""
+"""The terminal tables of the command line."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
 
 
 def training_table(result: Any) -> Table:
-    """What training came to."""
+    """The result of a training run."""
     table = Table(title="training", show_header=False)
     for name in result.__slots__ if hasattr(result, "__slots__") else vars(result):
         table.add_row(name, str(getattr(result, name)))

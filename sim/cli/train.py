@@ -35,14 +35,18 @@ class Range(StrEnum):
 
 def train(
     out_file: Annotated[
-        Path, typer.Option("--out", help="Where the weights go (safetensors); their card lies beside.")
+        Path, typer.Option("--out", help="File for the weights (safetensors); their card is written beside it.")
     ] = Path("runs/train/disconet.safetensors"),
     steps: Annotated[int, typer.Option(help="Optimiser steps of four fleet-frames.", min=1)] = 500,
-    scenes: Annotated[int, typer.Option(help="The first so many scenes of the train split.", min=1, max=100)] = 100,
+    scenes: Annotated[
+        int, typer.Option(help="Number of scenes of the train split, from the first.", min=1, max=100)
+    ] = 100,
     seed: Annotated[int, typer.Option(help="Seed of weights and batches.", min=0)] = 0,
     peak_lr: Annotated[float, typer.Option(help="The cycle's highest learning rate.")] = 2.5e-3,
-    cell_dropout: Annotated[float, typer.Option(help="Part of the links whose cells are thinned.", min=0, max=1)] = 0.0,
-    unsent: Annotated[Unsent, typer.Option(help="What a dropped cell counts as in training.")] = Unsent.masked,
+    cell_dropout: Annotated[
+        float, typer.Option(help="Share of the links whose cells are randomly dropped, 0 to 1.", min=0, max=1)
+    ] = 0.0,
+    unsent: Annotated[Unsent, typer.Option(help="How a dropped cell enters the fusion in training.")] = Unsent.masked,
     fusion: Annotated[str, typer.Option(help="Fusion method, see `sortie list fusions`.")] = "disconet",
     exchange: Annotated[
         ExchangeForm, typer.Option(help="Features after or before the last ReLU.")
@@ -51,12 +55,12 @@ def train(
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
-    warm_start: Annotated[Path | None, typer.Option(help="Begin from these weights, as far as they fit.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Stop after this much wall time.", min=0.1)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda; left out, cuda where there is one.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = True,
+    warm_start: Annotated[Path | None, typer.Option(help="Start from these weights, where their shapes fit.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this many minutes.", min=0.1)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; default: cuda where available.")] = None,
+    resume: Annotated[bool, typer.Option(help="Continue from the last checkpoint.")] = True,
 ) -> None:
-    """Train the detector on the benchmark's train split; a run that was cut off goes on where it was.
+    """Train the detector on the benchmark's train split. An interrupted run continues.
 
     Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
     """

@@ -1,4 +1,4 @@
-"""`sortie verify`: hold a policy to the plane's contract, prove its invariants, keep what breaks them.
+"""`sortie verify`: test a policy against the plane's contract, prove its invariants, save counterexamples.
 
 `sortie overhead`: what the plane costs, in bytes and in time, by the size of the fleet.
 """
@@ -39,13 +39,15 @@ def verify(
     policy: Annotated[str, typer.Argument(help="A policy's name, name(key=value), or path/to/file.py:function.")],
     invariants: Annotated[
         Path | None,
-        typer.Option(help="A file of invariants, one a line; left out, those of the policy's file or its promises."),
+        typer.Option(
+            help="A file of invariants, one per line; default: those in the policy's file, or those that a registered policy promises."
+        ),
     ] = None,
-    drones: Annotated[int, typer.Option(help="Proofs search fleets of 1 to so many.", min=1, max=5)] = 3,
-    views: Annotated[int, typer.Option(help="The kit tries so many drawn views.", min=10)] = VIEWS,
-    out_dir: Annotated[Path, typer.Option("--out", help="Where counterexamples are kept.")] = Path("runs/verify"),
+    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=5)] = 3,
+    views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder for counterexamples.")] = Path("runs/verify"),
 ) -> None:
-    """Try a policy on drawn views, prove its properties, and keep a counterexample of each that fails.
+    """Try a policy on random views, prove its properties, and save a counterexample of each that fails.
 
     Exit code 1 if a rule fails or a property is refuted. A counterexample is a view as JSON, and a scenario that
     shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
@@ -65,11 +67,11 @@ def verify(
 
 
 def overhead(
-    policies: Annotated[str, typer.Option(help="Comma-separated names.")] = "worked",
-    drones: Annotated[str, typer.Option(help="Comma-separated sizes of the fleet.")] = "5,25,100",
-    seconds: Annotated[float, typer.Option(help="Length of each flight, without a detector.", min=1)] = SECONDS,
+    policies: Annotated[str, typer.Option(help="Policies, separated by commas.")] = "worked",
+    drones: Annotated[str, typer.Option(help="Fleet sizes, separated by commas.")] = "5,25,100",
+    seconds: Annotated[float, typer.Option(help="Length of each flight, s, without a detector.", min=1)] = SECONDS,
 ) -> None:
-    """What the plane costs: context bytes against data bytes, and CPU time of a decision, by the size of the fleet."""
+    """Measure the cost of the context plane by fleet size: context and data bytes, and CPU time of a decision."""
     try:
         sizes = [int(n) for n in drones.split(",")]
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`sortie view`: a run in the Rerun viewer, or a picture of it."""
+"""`sortie view`: open a run in the Rerun viewer, or save a picture of it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from sortie.sim.results import run_folder
 def view(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     picture: Annotated[
-        Path | None, typer.Option(help="Save a picture of the viewer here and open none; needs no screen.")
+        Path | None, typer.Option(help="Save a picture of the viewer here instead of opening it; needs no screen.")
     ] = None,
-    at_s: Annotated[float, typer.Option("--at", help="The picture's simulated time, s.", min=0)] = 0.0,
+    at_s: Annotated[
+        float, typer.Option("--at", help="With --picture: the simulated time that it shows, s.", min=0)
+    ] = 0.0,
 ) -> None:
-    """Open a run's recording in the Rerun viewer; it is made anew if it is missing."""
+    """Open a run's recording in the Rerun viewer. A missing recording is made again."""
     from sortie.sim.playback.recording import save_rrd
     from sortie.sim.playback.viewer import open_viewer
 
