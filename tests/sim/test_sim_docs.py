@@ -81,6 +81,28 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+ROOM_PAGES = [page for page in PAGES if page.name == "README.md" and page.parent.name not in ("docs", "guide")]
+NOT_OURS = {
+    "mavlogdump.py",
+    "my_policy.py",
+    "policy.py",
+    "file.py",
+    "mine.py",
+    "path/to/file.py",
+    "fusion.py",
+    "my_fusion.py",
+}
+"""Programs of others, and names that stand for a user's file."""
+
+
+@pytest.mark.parametrize("page", ROOM_PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_a_file_that_a_page_names_is_there(page: Path) -> None:
+    """From the page's folder, from the root, or, for a bare name, anywhere below the page's folder."""
+    for name in set(re.findall(r"`([\w/]+\.py)`", page.read_text("utf-8"))) - NOT_OURS:
+        places = [page.parent / name, ROOT / name, *(page.parent.rglob(name) if "/" not in name else ())]
+        assert any(place.is_file() for place in places), f"{page.relative_to(ROOT)}: {name}"
+
+
 def commands_in(page: Path) -> list[str]:
     """Every `sortie …` of a page: on a line of its own in an example, or as code within a sentence."""
     text = page.read_text("utf-8")
