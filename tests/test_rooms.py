@@ -31,7 +31,7 @@ HOMES = {
     "torch": ("perception/*",),
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/mavlink.py",),
-    "yaml": ("scenarios/reading/load.py", "scenarios/reading/top_keys.py"),
+    "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
     "distributed": ("sim/campaign/engine.py",),
     "dask": ("sim/campaign/engine.py",),
     "SALib": ("sim/campaign/*",),
@@ -177,7 +177,7 @@ def test_every_package_at_the_root_is_a_room() -> None:
         (
             "scenarios/reading/nodes.py",
             "import yaml",
-            "yaml is at home in scenarios/reading/load.py, scenarios/reading/top_keys.py",
+            "yaml is at home in scenarios/reading/strict_yaml.py, scenarios/reading/top_keys.py",
         ),
         ("perception/recordings/uav3d.py", "import pickle", "pickle is not used: it runs what it reads"),
         ("perception/recordings/unpickle.py", "import dill", "dill is not used: it runs what it reads"),

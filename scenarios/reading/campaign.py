@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.reading.files import found_beside
-from sortie.scenarios.reading.load import campaigns, condition_sets, library, load, read, read_scalar, tree, validated
+from sortie.scenarios.reading.load import campaigns, condition_sets, library, load, read, tree, validated
 from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
+from sortie.scenarios.reading.strict_yaml import read_scalar
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,

@@ -15,6 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import sortie.scenarios.reading.load as loader
+from sortie.scenarios.reading import strict_yaml
 from sortie.scenarios.reading.load import ScenarioError, dump, library, load, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 
@@ -43,7 +44,7 @@ def expected_of(path: Path) -> str:
 def test_a_broken_scenario_gives_its_one_line(path: Path, parser: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if PARSERS[parser] is None:
         pytest.skip("PyYAML without libyaml")
-    monkeypatch.setattr(loader, "_Parser", PARSERS[parser])
+    monkeypatch.setattr(strict_yaml, "_Parser", PARSERS[parser])
     with pytest.raises(ScenarioError) as caught:
         load(path)
     said, expected = str(caught.value).removeprefix(f"{path.parent}/"), expected_of(path)
