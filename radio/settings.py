@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from sortie.radio.rates import STANDARDS, StandardName
 
+AntennaName = Literal["isotropic", "dipole"]
+PathLossName = Literal["log_distance", "free_space", "two_ray"]
+RateControlName = Literal["ideal", "minstrel"]
 _CHOICES = {
     "standard": tuple(STANDARDS),
-    "antenna": ("isotropic", "dipole"),
-    "path_loss": ("log_distance", "free_space", "two_ray"),
-    "rate_control": ("ideal", "minstrel"),
+    "antenna": get_args(AntennaName),
+    "path_loss": get_args(PathLossName),
+    "rate_control": get_args(RateControlName),
 }
 
 
@@ -51,8 +54,8 @@ class AirSettings:
     tx_power_dbm: float = 20.0
     """Transmit power, antenna gains included."""
     noise_figure_db: float = 7.0
-    antenna: Literal["isotropic", "dipole"] = "isotropic"
-    path_loss: Literal["log_distance", "free_space", "two_ray"] = "log_distance"
+    antenna: AntennaName = "isotropic"
+    path_loss: PathLossName = "log_distance"
     path_loss_exponent: float = 2.1
     """Exponent of `log_distance` beyond 1 m."""
     ground_roughness_m: float = 0.05
@@ -65,7 +68,7 @@ class AirSettings:
     rician_k_db: float = 12.0
     group_rate_mbps: float = 6.0
     """Basic rate of group-addressed frames."""
-    rate_control: Literal["ideal", "minstrel"] = "ideal"
+    rate_control: RateControlName = "ideal"
     """`ideal` picks the rate by the SNR of the frame before, `minstrel` by statistics of acknowledged frames."""
     retry_limit: int = 7
     """MAC retries of a unicast frame."""
