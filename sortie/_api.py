@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import operator
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sortie._run import Run
+from sortie._run import Run, as_path
 from sortie.policies.contract import Policy, PolicyError
 from sortie.scenarios.reading import load as reading
 from sortie.scenarios.reading.load import Overrides
@@ -55,7 +56,11 @@ def load(scenario: ScenarioLike, overrides: Overrides = ()) -> Scenario:
         >>> sortie.load({"name": "mine", "duration_s": 5}).frames
         50
     """
-    if isinstance(overrides, str) or not isinstance(overrides, Mapping | Sequence):
+    if (
+        isinstance(overrides, str)
+        or not isinstance(overrides, Mapping | Sequence)
+        or (not isinstance(overrides, Mapping) and not all(isinstance(entry, str) for entry in overrides))
+    ):
         raise ScenarioError(f"overrides: {overrides!r}, must be a map or a list: {{'fleet.drones': 3}}")
     if isinstance(scenario, str | os.PathLike):
         return reading.load(os.fspath(scenario), overrides)
@@ -108,8 +113,10 @@ def fly(
     from sortie.sim.engine.sortie import run_sortie
 
     chosen, function = _with_policy(load(scenario, overrides), policy)
-    _ensure_seed("seed", seed)
-    _ensure_seed("replication", replication)
+    seed, replication = _whole("seed", seed), _whole("replication", replication) or 0
+    _ensure_callable("progress", progress)
+    if observer is not None and not all(callable(getattr(observer, name, None)) for name in ("begin", "second")):
+        raise ScenarioError(f"observer: {observer!r}, must have the methods begin and second")
     record = run_sortie(chosen, function, seed, replication=replication, progress=progress, observer=observer)
     return Run(record)
 
@@ -127,7 +134,7 @@ def open_run(path: str | Path) -> Run:
     """
     from sortie.sim.results import run_folder
 
-    folder = _path("path", path)
+    folder = as_path("path", path)
     return Run(run_folder.load(folder), folder)
 
 
@@ -165,7 +172,7 @@ def compare(
 
     Args:
         scenario, overrides: as `sortie.load` takes them.
-        policies: two or more; gains are over the first.
+        policies: one or more; gains are over the first.
         seeds: None flies the scenario's own seed alone. The interval then covers the instants of that one flight. With
             several seeds it covers flights.
         progress: called with the policy's label, the seed and the simulated time (s).
@@ -187,12 +194,13 @@ def compare(
     flown = [Contender(_label(policy), *_with_policy(base, policy)) for policy in policies]
     labels = [contender.label for contender in flown]
     if not flown or len(set(labels)) < len(labels):
-        raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once")
+        how = "; give functions of one name, such as lambdas, a __name__ of their own"
+        raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
     if seeds is not None and not isinstance(seeds, Iterable):
         raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds: range({seeds!r})")
     chosen = [base.seed] if seeds is None else list(seeds)
-    for seed in chosen:
-        _ensure_seed("seeds", seed)
+    chosen = [_whole("seeds", seed) or 0 for seed in chosen]
+    _ensure_callable("progress", progress)
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
     return Comparison(*compare_policies(flown, chosen, progress=progress))
@@ -272,8 +280,9 @@ def campaign(
         raise RunError("workers and scheduler: name one of them")
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 0):
         raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
-    study = load_campaign(_path("campaign", campaign))
-    folder = campaign_folder(study.campaign.campaign) if out is None else _path("out", out)
+    _ensure_callable("progress", progress)
+    study = load_campaign(as_path("campaign", campaign))
+    folder = campaign_folder(study.campaign.campaign) if out is None else as_path("out", out)
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     with user_errors():
         plan = make_plan(study)
@@ -321,7 +330,7 @@ def check(
     from sortie.sim.check.discovery import scenario_files
 
     chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
-    names = [name for one in chosen for name in scenario_files(_path("scenarios", one))]
+    names = [name for one in chosen for name in scenario_files(as_path("scenarios", one))]
     for name in names:
         reading.load(name, overrides)  # all of them, before the first one flies
     return tuple(check_scenario(name, overrides, update=update, progress=progress) for name in names)
@@ -371,12 +380,15 @@ def _label(policy: PolicyLike) -> str:
     return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
 
 
-def _path(name: str, value: str | os.PathLike[str]) -> Path:
-    if not isinstance(value, str | os.PathLike):
-        raise RunError(f"{name}: {value!r}, must be a path")
-    return Path(value)
-
-
-def _ensure_seed(name: str, value: object) -> None:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED):
+def _whole(name: str, value: Any) -> int | None:
+    """A seed or a replication as Python's own whole number, also from numpy's; None stays."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not hasattr(value, "__index__") or not 0 <= operator.index(value) <= MAX_SEED:
         raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^63 - 1")
+    return operator.index(value)
+
+
+def _ensure_callable(name: str, value: object) -> None:
+    if value is not None and not callable(value):
+        raise ScenarioError(f"{name}: {value!r}, must be a function, or None")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -107,7 +109,7 @@ class Run:
 
             save_rrd(self.record, folder / run_folder.RECORDING)
 
-        place = Path(path)
+        place = as_path("path", path)
         run_folder.save(self.record, place, add_recording if recording else None)
         return place
 
@@ -119,7 +121,7 @@ class Run:
         """
         from sortie.sim.results.report import save_page
 
-        place = Path(path)
+        place = as_path("path", path)
         save_page(self.record, place)
         return place
 
@@ -142,7 +144,7 @@ class Run:
         """
         from sortie.sim.playback.picture import take_picture
 
-        place = Path(path)
+        place = as_path("path", path)
         with tempfile.TemporaryDirectory() as made:
             take_picture(self._recording(Path(made)), place, at_s)
         return place
@@ -158,6 +160,17 @@ class Run:
 
     def __repr__(self) -> str:
         return f"<Run of {self.scenario.name} under {self.policy}, seed {self.seed}, {self.scenario.duration_s:g} s>"
+
+
+def as_path(name: str, value: object) -> Path:
+    """A path that a user gave for an argument.
+
+    Raises:
+        RunError: it is no path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise RunError(f"{name}: {value!r}, must be a path")
+    return Path(value)
 
 
 def _numbers(prefix: str, value: Any) -> list[tuple[str, float]]:

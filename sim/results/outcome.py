@@ -1,6 +1,6 @@
 """The outcome of a sortie: the values of outcome.json, computed from the record.
 
-Everything here is computed from the record's tables; the README of this room lists every field.
+Everything here is computed from the record's tables; `outcome.md` beside this file lists every field.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from threadpoolctl import threadpool_info
@@ -118,6 +119,13 @@ def test_metrics_are_the_outcomes_numbers_by_dotted_name() -> None:
 )
 def test_a_policy_is_a_name_with_parameters_or_a_callable(policy: object, name: str) -> None:
     assert sortie.fly("track_target", SHORT, policy=policy).policy == name  # type: ignore[arg-type]
+
+
+def test_a_seed_may_be_numpys() -> None:
+    assert (
+        sortie.fly("track_target", SHORT, seed=np.int64(7)).fingerprint
+        == sortie.fly("track_target", SHORT, seed=7).fingerprint
+    )  # type: ignore[arg-type]
 
 
 def test_a_policy_flies_from_a_file(tmp_path: Path) -> None:
@@ -231,6 +239,11 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "policies as text": (lambda: sortie.compare("track_target", "worked"), sortie.PolicyError, "policies: 'worked', must be a list of policies: ['worked', 'silence']"),
     "a policy twice": (lambda: sortie.compare("track_target", ["worked", "worked"]), sortie.PolicyError, "policies: worked, worked, must be one or more, each named once"),
     "a seed twice": (lambda: sortie.compare("track_target", ["worked"], seeds=[1, 1]), sortie.ScenarioError, "seeds: [1, 1], must be one or more, each named once"),
+    "a list of pairs for overrides": (lambda: sortie.load("track_target", [("fleet.drones", 3)]), sortie.ScenarioError, "overrides: [('fleet.drones', 3)], must be a map or a list"),  # type: ignore[list-item]
+    "a progress that is no function": (lambda: sortie.fly("track_target", SHORT, progress=True), sortie.ScenarioError, "progress: True, must be a function, or None"),  # type: ignore[arg-type]
+    "an observer that is none": (lambda: sortie.fly("track_target", SHORT, observer=print), sortie.ScenarioError, "must have the methods begin and second"),  # type: ignore[arg-type]
+    "a run saved nowhere": (lambda: sortie.fly("track_target", SHORT).save(None), sortie.RunError, "path: None, must be a path"),  # type: ignore[arg-type]
+    "two policies of one name": (lambda: sortie.compare("track_target", [lambda view: [], lambda view: []]), sortie.PolicyError, "give functions of one name, such as lambdas, a __name__ of their own"),
     "a number of seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=3), sortie.ScenarioError, "seeds: 3, must be a list of seeds: range(3)"),  # type: ignore[arg-type]
     "no run": (lambda: sortie.open_run("nowhere"), sortie.RunError, "nowhere: no run there (outcome.json is missing)"),
     "a number for a path": (lambda: sortie.open_run(7), sortie.RunError, "path: 7, must be a path"),  # type: ignore[arg-type]
