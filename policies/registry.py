@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
 import math
@@ -72,7 +73,9 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
         raise PolicyError(f"policy file {name!r} without its function, must be {name}:function")
     function = _from_file(name) if ":" in name else POLICIES.get(name)
     if function is None:
-        raise PolicyError(f"unknown policy {name!r}, known: {', '.join(POLICIES)}, or path/to/file.py:function")
+        near = difflib.get_close_matches(name, POLICIES, 1)
+        hint = f", did you mean {near[0]}?" if near else ","
+        raise PolicyError(f"unknown policy {name!r}{hint} known: {', '.join(POLICIES)}, or path/to/file.py:function")
     known = parameters(function)
     for key, value in (params or {}).items():
         if key not in known:

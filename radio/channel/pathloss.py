@@ -70,8 +70,8 @@ def path_loss_db(
     """Path loss by the model of the settings, dB; arguments as for `two_ray_loss_db`."""
     if settings.path_loss == "two_ray":
         return two_ray_loss_db(distance_m, height_a_m, height_b_m, settings.carrier_ghz, settings.ground_roughness_m)
-    exponent = 2.0 if settings.path_loss == "free_space" else settings.path_loss_exponent
-    return log_distance_loss_db(distance_m, settings.carrier_ghz, exponent)
+    exponents = {"free_space": 2.0, "log_distance": settings.path_loss_exponent}
+    return log_distance_loss_db(distance_m, settings.carrier_ghz, exponents[settings.path_loss])
 
 
 def range_m(settings: AirSettings, loss_db: float) -> float:

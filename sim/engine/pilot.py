@@ -213,7 +213,7 @@ class Pilot:
         except Exception as error:
             what = f"raises {describe_error(error)}"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
-        if not isinstance(answer, (list, Sequence)):  # a list, as nearly always, is told at once
+        if type(answer) is not list and (isinstance(answer, Directive) or not isinstance(answer, Sequence)):
             what = f"returns {type(answer).__name__}, must be a sequence of directives"
             raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
         return answer

@@ -311,7 +311,7 @@ def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
             "best-2(k=1)", '"best-2(k=1, rho=0.5)"',
             "9: policies.1: best-2(k=1, rho=0.5) has its own policy.params.rho, which is varied; leave it out here",
         ),
-        ("best-2(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', known: worked, "),
+        ("best-2(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', did you mean worst-2? known: worked, "),
         ("best-2(k=1)", "best-2(q=1)", "9: policies.1: policy 'best-2' has no parameter 'q', it has: k, rho"),
         ("best-2(k=1)", "best-2(k)", "9: policies.1: --set policy.params.k: must be key.path=value"),
         ("policies: [worked, best-2(k=1)]", "set: {policy.name: wirkt}", "3: base: unknown policy 'wirkt', known: "),
