@@ -123,7 +123,7 @@ def test_something_else_than_a_directive_is_refused() -> None:
 
 
 def test_registry_errors_name_what_there_is(tmp_path) -> None:
-    with pytest.raises(PolicyError, match="unknown policy 'best', known: worked, all-4"):
+    with pytest.raises(PolicyError, match=r"unknown policy 'best', did you mean best-2\? known: worked, all-4"):
         resolve("best")
     with pytest.raises(PolicyError, match="policy 'worked' has no parameter 'k', it has: rho"):
         resolve("worked", {"k": 3})
