@@ -217,7 +217,10 @@ def test_a_run_that_another_replaces_is_told(
     ("arguments", "message"),
     [
         (("fly", "nowhere.yaml"), "nowhere.yaml"),
-        (("fly", "example.yaml", "--policy", "wrst-2"), "unknown policy 'wrst-2', did you mean worst-2? known: worked, all-4"),
+        (
+            ("fly", "example.yaml", "--policy", "wrst-2"),
+            "unknown policy 'wrst-2', did you mean worst-2? known: worked, all-4",
+        ),
         (("fly", "example.yaml", "--policy", "all-4(rho=0.1"), "the bracket is not closed"),
         (("fly", "example.yaml", "--policy", "silence(rho=0.1)"), "policy 'silence' has no parameter 'rho'"),
         (("fly", "example.yaml", "--policy", "no/such.py:decide"), "policy file 'no/such.py' not found"),
