@@ -29,7 +29,12 @@ def scenario_files(place: str | Path) -> list[str]:
 
 
 def is_scenario(path: Path) -> bool:
-    """Whether a file is a scenario to check. Most YAML files of other projects are ruled out by two words."""
+    """Whether a file is a scenario to check. Most YAML files of other projects are ruled out by two words.
+
+    The copy of a scenario in a run's folder says what was flown there; it is not to be flown again.
+    """
+    if path.with_name("record.json").is_file() and path.with_name("outcome.json").is_file():
+        return False
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES)

@@ -206,6 +206,14 @@ def test_a_folder_is_checked_whole(tmp_path: Path) -> None:
     assert (len(a.failed), len(b.failed)) == (0, 1)
 
 
+def test_the_copy_in_a_runs_folder_is_no_scenario_to_check(tmp_path: Path) -> None:
+    """It would fly again, shortened or not, whenever someone runs pytest beside a folder of runs."""
+    sortie.fly("track_target", {"duration_s": 1, "perception.detector": "none"}).save(tmp_path / "a", recording=False)
+    assert "expect" in (tmp_path / "a/scenario.yaml").read_text()
+    with pytest.raises(sortie.RunError, match="no scenario below it expects anything"):
+        sortie.check(tmp_path)
+
+
 def test_the_environment_steps() -> None:
     env = sortie.env("track_target", SURROGATE)
     env.reset(seed=1)
