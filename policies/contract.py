@@ -17,7 +17,8 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from sortie.scenarios.disc import Disc as Disc  # policies import it from here
+from sortie.scenarios.disc import AGENT_IDS as AGENT_IDS  # policies import this and the next two from here
+from sortie.scenarios.disc import Disc as Disc
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.representation import Representation as Representation
 
@@ -26,8 +27,6 @@ COVERAGE_CELLS = 16
 COVERAGE_CELL_M = 12.8
 """Side of a coverage cell; cells lie on the world's lattice of this pitch."""
 COVERAGE_BYTES = COVERAGE_CELLS**2 // 4
-AGENT_IDS = 256
-"""How many ids there are: an id is a byte. Rankings break ties by `(id - first) % AGENT_IDS`."""
 FEATURE_CELLS = 64 * 64
 """The cells of a drone's feature map, of which ρ is a share."""
 FEATURE_CELL_BYTES = 80 * 2

@@ -26,6 +26,9 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "best-2": baselines.best_k,
     "worst-2": baselines.worst_k,
     "random-2": baselines.random_k,
+    "best-2-receivers": baselines.best_k_receivers,
+    "worst-2-receivers": baselines.worst_k_receivers,
+    "random-2-receivers": baselines.random_k_receivers,
     "silence": baselines.silence,
     "boxes": adaptive.boxes,
     "deputies": deputies,
@@ -52,6 +55,8 @@ class Bound(NamedTuple):
 
 BOUNDS: dict[str, Bound] = {
     "rho": Bound("a number in [0, 1]", 0, 1),
+    "received_budget": Bound("a number in [0, 1]", 0, 1),
+    "sent_budget": Bound("a number in [0, 1]", 0, 1),
     "k": Bound("a whole number from 0 on", 0, whole=True),
     "salt": Bound("a whole number", whole=True),
     "rounds": Bound("a whole number from 1 on", 1, whole=True),
@@ -127,6 +132,18 @@ def parameters(function: Callable[..., object]) -> dict[str, object]:
     """The policy's keyword-only parameters and their defaults."""
     signature = inspect.signature(function)
     return {p.name: p.default for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
+
+
+def within_budget(policy: Callable[..., object], budget: float) -> dict[str, float]:
+    """The parameter that keeps a policy within a budget, whichever of the three it has; none if it has none of them.
+
+    Args:
+        policy: a policy, or a partial of one.
+        budget: feature cells of the fleet, as a share of full sharing. It is what each ego receives, or each drone sends;
+            with `rho` it is an upper limit, since every link carries that share of a map.
+    """
+    known = parameters(policy)
+    return {name: budget for name in ("received_budget", "sent_budget", "rho") if name in known}
 
 
 def _file_of(reference: str) -> tuple[Path, str]:

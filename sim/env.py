@@ -32,10 +32,10 @@ from sortie.sim.results.outcome import matched
 from sortie.sim.results.record import SortieRecord
 
 RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)
-BUDGETS = (0.02, 0.1, 0.25, 1.0)
+RHOS = (0.02, 0.1, 0.25, 1.0)
 RATES_HZ = (2.0, 5.0, 10.0)
-CHOICES = (len(RUNGS), len(BUDGETS), len(RATES_HZ), 2)
-"""Choices of an action for each link: representation, feature budget, rate, and whether it is confined to the region."""
+CHOICES = (len(RUNGS), len(RHOS), len(RATES_HZ), 2)
+"""Choices of an action for each link: representation, ρ (the share of the feature cells), rate, and whether it is confined to the region."""
 ROW = 24
 """Numbers of one drone in an observation; `_row` says which."""
 LIMIT = 10.0
@@ -55,7 +55,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     |---|---|
     | agents | `drone_0` …; one that lands or is lost terminates, at the scenario's end all are truncated |
     | observation | float32 [N, 24]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
-    | action | for each other drone by ascending id: rung, budget, rate, region (`CHOICES`) |
+    | action | for each other drone by ascending id: rung, ρ, rate, region (`CHOICES`) |
     | reward | AP@0.5 of the drone's own fusions in the step (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
     """
 
@@ -258,8 +258,8 @@ class _Flight:
             if action is None or me is None:
                 directives.append(Directive(view.ego, peer, reason="no action yet"))
                 continue
-            rung, budget, rate, confined = (int(c) for c in action[peer - (peer > view.ego)])
-            rho = BUDGETS[budget] if RUNGS[rung] == Representation.FEATURES else 0.0
+            rung, cells, rate, confined = (int(c) for c in action[peer - (peer > view.ego)])
+            rho = RHOS[cells] if RUNGS[rung] == Representation.FEATURES else 0.0
             roi = me.region if confined else None
             directives.append(Directive(view.ego, peer, RUNGS[rung], rho, roi, RATES_HZ[rate], reason="action"))
         return directives

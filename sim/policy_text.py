@@ -1,4 +1,4 @@
-"""A policy as people name it, `best-2(rho=0.1)`, as the `--set` overrides that make it the scenario's own."""
+"""A policy as people name it, `best-2(received_budget=0.1)`, as the `--set` overrides that make it the scenario's own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def policy_overrides(text: str, own: str) -> list[str]:
     name, bracket, rest = text.partition("(")
     name = name.strip()
     if bracket and not rest.endswith(")"):
-        raise PolicyError(f"policy {text!r}: the bracket is not closed, as in best-2(rho=0.1)")
+        raise PolicyError(f"policy {text!r}: the bracket is not closed, as in best-2(received_budget=0.1)")
     overrides = [f"policy.name={name}"]
     if bracket or name != own:
         overrides.append("policy.params={}")

@@ -103,7 +103,7 @@ def fly(
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "none"}
-        >>> sortie.fly("track_target", short, policy="best-2(rho=0.1)").policy
+        >>> sortie.fly("track_target", short, policy="best-2(received_budget=0.1)").policy
         'best-2'
         >>> def quiet(view):
         ...     return [sortie.Directive(view.ego, peer, reason="quiet") for peer in view.peers]

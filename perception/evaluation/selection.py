@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sortie.perception.budget import CELLS, Bools, index_bytes, payload_bytes, ranking, roi_mask
 from sortie.perception.evaluation.condition import Allocation, Sharing
 from sortie.perception.geometry import FULL, Geometry
-from sortie.scenarios.disc import Disc
+from sortie.scenarios.disc import Disc, disc_overlap, rank_by_overlap
 from sortie.scenarios.streams import stream
 
 FOOTPRINT_M = 60.0 * math.tan(math.radians(35.0))
@@ -22,29 +22,18 @@ Floats = NDArray[np.float64]
 
 
 def footprint_overlap(xy_m: Floats, radius_m: Floats) -> Floats:
-    """[d, d]: the part of drone i's footprint that drone j's covers too, 0 … 1, from positions [d, 2] and radii [d].
-
-    Footprints are discs; the common part of two discs is a lens of two circular segments.
-    """
-    xy_m, radius_m = np.asarray(xy_m, np.float64), np.asarray(radius_m, np.float64)
-    d = np.hypot(*(xy_m[:, None] - xy_m[None]).transpose(2, 0, 1))
-    a, b = np.broadcast_arrays(radius_m[:, None], radius_m[None])
-    apart = np.maximum(d, 1e-12)
-    x = np.clip((d * d + a * a - b * b) / (2 * apart * a), -1, 1)
-    y = np.clip((d * d + b * b - a * a) / (2 * apart * b), -1, 1)
-    kite = np.sqrt(np.maximum((a + b - d) * (d + a - b) * (d - a + b) * (d + a + b), 0.0)) / 2
-    lens = a * a * np.arccos(x) + b * b * np.arccos(y) - kite
-    area = np.where(d >= a + b, 0.0, np.where(d <= np.abs(a - b), np.pi * np.minimum(a, b) ** 2, lens))
-    return np.asarray(np.clip(area / (np.pi * a * a), 0.0, 1.0))
+    """[d, d]: the share of drone i's footprint that drone j's covers, 0 … 1, from positions [d, 2] and radii [d]."""
+    at = list(zip(xy_m.tolist(), radius_m.tolist(), strict=True))
+    return np.array([[disc_overlap(math.dist(p, q), r, s) for q, s in at] for p, r in at])
 
 
 def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] = (), seed: int = 0) -> tuple[int, ...]:
-    """The peers that share with `ego`, most overlapping first.
+    """The peers that share with `ego`: all of them by ascending id, or the chosen ones, most overlapping first.
 
     Args:
         condition: gives the rule for `peers`.
         ego: the receiver.
-        overlap: [d] of each drone's footprint with the ego's; equal ones go by the lower id.
+        overlap: [d] the share of the ego's footprint that each drone's covers.
         key: names the frame, so that random peers are its own whatever else is evaluated.
         seed: of the random peers.
 
@@ -54,7 +43,9 @@ def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] =
     others = [i for i in range(len(overlap)) if i != ego]
     if condition.k > len(others) or (condition.rule == "all" and condition.k != len(others)):
         raise ValueError(f"peers is {condition.peers!r}, must fit a fleet with {len(others)} peers")
-    ranked = sorted(others, key=lambda i: (-overlap[i], i))
+    if condition.rule == "all":
+        return tuple(others)
+    ranked = rank_by_overlap(ego, {i: float(overlap[i]) for i in others})
     if condition.rule == "worst":
         ranked = ranked[len(ranked) - condition.k :]
     elif condition.rule == "random":
@@ -68,7 +59,7 @@ def allocate(total: int, overlap: Sequence[float], allocation: Allocation, most:
 
     Quotas are equal or proportional to `overlap`; a peer whose quota passes `most` sends all and the rest is parted
     anew among the others (alike, where none of those overlaps). Quotas are rounded down, and the cells that are left
-    over go one each by the largest fraction; equal fractions by more overlap, then by place in the list.
+    over go one each by the largest fraction, and equal fractions by place in the list.
     """
     k = len(overlap)
     share = [Fraction(float(o)) if allocation == "overlap" else Fraction(1) for o in overlap]
@@ -84,7 +75,7 @@ def allocate(total: int, overlap: Sequence[float], allocation: Allocation, most:
             for i in open_:
                 out[i] = math.floor(quota[i])
             spare = left - sum(out[i] for i in open_)
-            for i in sorted(open_, key=lambda i: (out[i] - quota[i], -overlap[i], i))[:spare]:
+            for i in sorted(open_, key=lambda i: (out[i] - quota[i], i))[:spare]:
                 out[i] += 1
             return out
         for i in full:

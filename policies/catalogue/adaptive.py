@@ -4,8 +4,8 @@ Each decision chooses an arm, which is a way to spend the budget: how many peers
 whether maps hold everything or the mission region alone. `adaptive` chooses by rules that read mission, coverage,
 budget and links. `learned` chooses by a linear model that was fitted on simulated sorties (`sortie learn`).
 
-`rho` is what a drone sends over all its links, as a fraction of full sharing, as for the fixed policies. At equal `rho`
-no arm sends more bytes than they do.
+`sent_budget` is the number of cells that a drone sends over all its links, as a share of full sharing. At the same
+number, no arm sends more bytes than a fixed policy.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ FEW = 8 / FEATURE_CELLS
 """Share of a map. A link that would carry less gets boxes."""
 
 
-def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
+def spend(view: FleetView, arm: Arm, sent_budget: float, why: str) -> list[Directive]:
     """The directives of an arm. The chosen peers share the budget evenly, as far as the air carries it.
 
     Args:
         view: the fleet's latest descriptors.
         arm: how to spend.
-        rho: the budget, 0 … 1 of full sharing over all links.
+        sent_budget: cells that the drone sends over all its links, as a share of full sharing, 0 … 1.
         why: the reason; the arm's text is added.
     """
     me = view.me
@@ -77,7 +77,7 @@ def spend(view: FleetView, arm: Arm, rho: float, why: str) -> list[Directive]:
         return []
     ego, peers = view.ego, view.peers
     chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
-    per_link = min(1.0, rho * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
+    per_link = min(1.0, sent_budget * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
     roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
     reason = f"{why}: {arm.text}"
     directives = []
@@ -103,15 +103,15 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
     return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
 
 
-def arm(view: FleetView, *, index: int = 0, rho: float = 0.25) -> list[Directive]:
+def arm(view: FleetView, *, index: int = 0, sent_budget: float = 0.25) -> list[Directive]:
     """Always the same arm, for `sortie learn` and comparisons."""
-    return spend(view, ARMS[index % len(ARMS)], rho, "fixed arm")
+    return spend(view, ARMS[index % len(ARMS)], sent_budget, "fixed arm")
 
 
 FEATURES = ("log10 of the budget", "tracking a region", "mean overlap of peers", "log10 of 1 + mean goodput", "charge")
 
 
-def features(view: FleetView, rho: float) -> tuple[float, ...]:
+def features(view: FleetView, sent_budget: float) -> tuple[float, ...]:
     """The inputs of the learned policy, in the order of `FEATURES`: budget, mission, coverage, links, battery."""
     me = view.me
     if me is None:
@@ -120,15 +120,15 @@ def features(view: FleetView, rho: float) -> tuple[float, ...]:
     overlap = sum(footprint_overlap(me, view.descriptors[p]) for p in peers) / len(peers) if peers else 0.0
     goodput_mbps = sum(me.goodput_to(p) for p in peers) / len(peers) if peers else 0.0
     tracking = me.task_phase == TaskPhase.TRACK and me.region is not None
-    return log10(max(rho, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
+    return log10(max(sent_budget, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
 
 
-def boxes(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
-    """Boxes to every peer, whatever the context and the budget: the cheapest way of sharing."""
-    return spend(view, BOXES, rho, "fixed")
+def boxes(view: FleetView) -> list[Directive]:
+    """Boxes to every peer, whatever the context: the cheapest way of sharing."""
+    return spend(view, BOXES, 0.0, "fixed")
 
 
-def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """Rules over mission, coverage, budget and links: feature cells of a tracked region that it sees, otherwise boxes.
 
     A region is small, so even a small budget carries its important cells, and maps of them find more than boxes. Of the
@@ -139,22 +139,22 @@ def adaptive(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
     if me is None:
         return []
     if me.task_phase != TaskPhase.TRACK or me.region is None:
-        return spend(view, BOXES, rho, "no region")
+        return spend(view, BOXES, sent_budget, "no region")
     if not sees(me, me.region):
-        return spend(view, BOXES, rho, "a region out of sight")
-    through = min(rho, carried(me, view.peers))
+        return spend(view, BOXES, sent_budget, "a region out of sight")
+    through = min(sent_budget, carried(me, view.peers))
     if through < FEW:
-        return spend(view, BOXES, rho, f"a region, budget and links {through:.2g} < {FEW:.2g}")
-    return spend(view, MAPS, rho, "a region")
+        return spend(view, BOXES, sent_budget, f"a region, budget and links {through:.2g} < {FEW:.2g}")
+    return spend(view, MAPS, sent_budget, "a region")
 
 
-def learned(view: FleetView, *, rho: float = 0.25) -> list[Directive]:
+def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
-    seen = features(view, rho)
+    seen = features(view, sent_budget)
     z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
     gains = [w[0] + sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
     best = max(range(len(ARMS)), key=lambda k: gains[k])
-    return spend(view, ARMS[best], rho, "learned")
+    return spend(view, ARMS[best], sent_budget, "learned")
 
 
 class Model(NamedTuple):

@@ -38,6 +38,6 @@ def over_region(view: FleetView) -> Reposition | None:
 
 
 @looks_from(over_region)
-def vantage(view: FleetView, *, rho: float = 0.25) -> Sequence[Directive]:
+def vantage(view: FleetView, *, received_budget: float = 0.25) -> Sequence[Directive]:
     """Features to every peer, from places around the mission region."""
-    return everyone(view, rho=rho)
+    return everyone(view, received_budget=received_budget)

@@ -20,7 +20,7 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
 
     Args:
         view: the fleet's latest descriptors.
-        rho: budget of the features rung as a fraction of all cells (the paper's table has full features).
+        rho: the share of the drone's feature cells sent on each link that carries features (the paper's table: all).
 
     Returns:
         One directive per peer in the view.
@@ -38,7 +38,7 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     if roi is not None:
         why += f", track: ROI {roi.radius_m:.0f} m"
     ego, chosen = view.ego, peers_by_overlap(view)[:TOP_PEERS]
-    budget = rho if rung == FEATURES else 0.0
+    link_rho = rho if rung == FEATURES else 0.0
     directives = []
     for peer in view.peers:
         if peer not in chosen:
@@ -48,5 +48,5 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
             low = min(rung, DETECTIONS)
             directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
         else:
-            directives.append(Directive(ego, peer, rung, budget, roi, rate_hz, reason=why))
+            directives.append(Directive(ego, peer, rung, link_rho, roi, rate_hz, reason=why))
     return directives

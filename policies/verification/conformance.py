@@ -10,9 +10,9 @@ fails has the smallest failing view that was found.
 from __future__ import annotations
 
 import contextlib
-import inspect
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +29,7 @@ from sortie.policies.contract import (
     check_reposition,
     find_wrong_type,
 )
-from sortie.policies.registry import viewpoint_of
+from sortie.policies.registry import parameters, viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.views import draw_view, draw_views, shrink
 
@@ -66,7 +66,7 @@ def conform(
     """Check a policy against every rule of the kit.
 
     Args:
-        policy: any callable of the contract; a keyword parameter `rho` is its budget.
+        policy: any callable of the contract. The keyword parameters `rho`, `sent_budget` and `received_budget` limit its cells.
         views: the views to test it on; without them, the first `count` views of `seed`.
         seed: of the drawn views.
         count: how many.
@@ -263,17 +263,31 @@ def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str 
 
 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
-    parameter = inspect.signature(policy).parameters.get("rho")
-    if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
-        _decide(policy, view)
-        return None
-    takes_rho: Callable[..., Any] = policy
-    for rho in BUDGETS:
-        bound = partial(takes_rho, rho=rho)
-        spent, allowed = sum(d.rho for d in _decide(bound, view)), rho * len(view.peers)
-        if not spent <= allowed * (1 + _ROUNDING):
-            return f"rho={rho:g}: its links add up to {spent:g} maps, {rho:g} of full sharing is {allowed:g}"
+    """The fleet, each drone deciding on this view, keeps every budget that the policy takes (`_SPENT`)."""
+    takes: Callable[..., Any] = policy
+    for name in parameters(policy).keys() & _SPENT.keys():
+        whose, full_maps = _SPENT[name]
+        for budget in BUDGETS:
+            bound = partial(takes, **{name: budget})
+            maps: Counter[str] = Counter()
+            for ego in view.descriptors:
+                for d in _decide(bound, view._replace(ego=ego)):
+                    maps[whose(d)] += d.rho  # type: ignore[assignment]  # a counter of maps, not whole ones
+            allowed = budget * (len(view.peers) if full_maps else 1)
+            for who, spent in maps.items():
+                if not spent <= allowed * (1 + _ROUNDING):
+                    return f"{name}={budget:g}: {who} {spent:g} maps, at most {allowed:g} is allowed"
+    _decide(policy, view)
     return None
+
+
+_SPENT: dict[str, tuple[Callable[[Directive], str], bool]] = {
+    "rho": (lambda d: f"link {d.source}→{d.destination} carries", False),
+    "sent_budget": (lambda d: f"drone {d.source} sends", True),
+    "received_budget": (lambda d: f"drone {d.destination} receives", True),
+}
+"""Parameters that limit feature cells: who spends a directive's cells, and whether the limit is a share of full sharing
+(N − 1 maps) or of one map."""
 
 
 def _viewpoint_keeps_rules(policy: Policy, view: FleetView) -> str | None:
@@ -327,7 +341,7 @@ RULES: dict[str, Rule] = {
     "budget kept": _keeps_budget,
     "viewpoint kept": _viewpoint_keeps_rules,
 }
-"""The kit's rules by name. A policy without a parameter `rho` always keeps `budget kept`."""
+"""The kit's rules by name. A policy without a parameter of `_SPENT` always keeps `budget kept`."""
 
 
 def _decides_in_time(policy: Policy) -> Check:

@@ -71,7 +71,7 @@ def _link(scope: Scope) -> Directive:
 
 DECISIONS: dict[str, Word] = {
     "representation": _decided("the rung: none, tracks, detections, features or raw", lambda d: d.representation),
-    "rho": _decided("budget, 0 … 1", lambda d: d.rho),
+    "rho": _decided("share of the sender's feature cells, 0 … 1", lambda d: d.rho),
     "rate_hz": _decided("rate, Hz", lambda d: d.rate_hz),
     "deadline_s": _decided("deadline, s", lambda d: d.deadline_s),
     "fusion_weight": _decided("weight at the receiver, 0 … 1", lambda d: d.fusion_weight),

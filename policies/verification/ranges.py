@@ -9,8 +9,9 @@ from functools import lru_cache
 from typing import Any, NoReturn
 
 from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, TaskPhase
-from sortie.policies.geometry import circle_overlap, peers_by_overlap
+from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
+from sortie.scenarios.disc import disc_overlap
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8
@@ -56,7 +57,7 @@ class FleetOfRanges:
             low, high = path.ranges.get(axis, (usual, usual))
             return usual if low <= usual <= high else _round_within(low, high)
 
-        order = path.picks.get("order by overlap", self.peers)
+        order = path.picks.get(_order_of(self.ego), self.peers)
         places = _places(self.ego, order)
         descriptors = {}
         for i in self.heard:
@@ -160,23 +161,25 @@ class DescriptorOfRanges:
 
     @property
     def position_m(self) -> tuple[float, float, float]:
-        self._only_for_order("position_m")
-        order = self._system.path.pick("order by overlap", _orders(self._system.peers))
-        return _places(self._system.ego, order)[self.agent_id]
+        receiver = self._only_for_order("position_m")
+        peers = tuple(i for i in self._system.heard if i != receiver)
+        order = self._system.path.pick(_order_of(receiver), _orders(peers))
+        return _places(receiver, order)[self.agent_id]
 
     @property
     def footprint_radius_m(self) -> float:
         self._only_for_order("footprint_radius_m")
         return _FOOTPRINT_M
 
-    def _only_for_order(self, field: str) -> None:
-        """Geometry may only be read through `peers_by_overlap` of the ego, so that a policy sees the order of peers alone."""
+    def _only_for_order(self, field: str) -> int:
+        """The drone whose peers are ranked. Geometry may only be read through `peers_by_overlap`, for the order alone.
+
+        The orders of two receivers are searched as if they were independent. Some pairs of orders have no geometry.
+        """
         frame = sys._getframe(2)
         while frame is not None:
             if frame.f_code is peers_by_overlap.__code__:
-                if getattr(frame.f_locals.get("view"), "ego", None) == self._system.ego:
-                    return
-                break
+                return int(frame.f_locals["of"])
             frame = frame.f_back  # type: ignore[assignment]
         self._system.path.refuse(f"reads {field} without peers_by_overlap")
 
@@ -228,6 +231,10 @@ for _method in {n for n, of in vars(int).items() if n.startswith("__") and calla
     setattr(_Flags, _method, _by_value(_method))  # where Python looks for operators
 
 
+def _order_of(receiver: int) -> str:
+    return f"peers of drone {receiver} by overlap"
+
+
 def _flag(bit: int, agent_id: int) -> str:
     return f"novelty flag {bit} of drone {agent_id}"
 
@@ -270,7 +277,7 @@ def _places(ego: int, order: tuple[int, ...]) -> dict[int, tuple[float, float, f
         near_m, far_m = 0.0, 2 * _FOOTPRINT_M
         for _ in range(40):
             middle_m = (near_m + far_m) / 2
-            if circle_overlap(middle_m, _FOOTPRINT_M, _FOOTPRINT_M) > wanted:
+            if disc_overlap(middle_m, _FOOTPRINT_M, _FOOTPRINT_M) > wanted:
                 near_m = middle_m
             else:
                 far_m = middle_m

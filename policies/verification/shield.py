@@ -228,7 +228,7 @@ def _changed(before: Directive, wanted: dict[str, float], region: Disc | None) -
         else:
             changed[word] = value
     if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
-        changed["rho"] = 0.0  # only features have a budget of cells
+        changed["rho"] = 0.0  # only features have cells
     return before._replace(**changed)
 
 

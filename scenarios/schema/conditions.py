@@ -18,7 +18,11 @@ class Condition(Section):
     """One condition."""
 
     name: str = Field(pattern=r"^[a-z0-9_]+$", max_length=64, description="Short name.")
-    rho: float = Field(gt=0, le=1, description="The budget: what a drone sends over all its links, of full sharing.")
+    budget: float = Field(
+        gt=0,
+        le=1,
+        description="Feature cells that the fleet may send a frame, as a share of full sharing (each drone's whole map to each other drone). A policy gets it as its received_budget (an ego's), its sent_budget (a drone's) or its rho (a link's), whichever it has.",
+    )
     metric: Literal["full_scene", "mission"] = Field(
         "full_scene", description="The AP that counts: everywhere, or in the mission disc."
     )

@@ -27,7 +27,7 @@ def compare(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies separated by commas: worked,best-2(rho=0.1),silence. With conditions, all: every policy."
+            help="Policies separated by commas: worked,best-2(received_budget=0.1),silence. With conditions, all: every policy."
         ),
     ],
     seed: SeedOption = None,

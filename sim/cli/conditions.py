@@ -99,11 +99,11 @@ def _by_condition(
         few = [rest.pop(0)]
         while rest and sum(max(len(p), 5) + 2 for p in (*few, rest[0])) <= left:
             few.append(rest.pop(0))
-        table = _figures("AP@0.5; of the mission where the fleet tracks", "condition", "rho", *few)
+        table = _figures("AP@0.5; of the mission where the fleet tracks", "condition", "budget", *few)
         for c in conditions.conditions:
             best = max(at[p, c.name] for p in policies)
             figures = ((number(at[p, c.name]), at[p, c.name] == best) for p in few)
-            table.add_row(c.name, f"{c.rho:g}", *(f"[bold]{a}[/bold]" if is_ else a for a, is_ in figures))
+            table.add_row(c.name, f"{c.budget:g}", *(f"[bold]{a}[/bold]" if is_ else a for a, is_ in figures))
         yield table
 
 
@@ -144,15 +144,15 @@ def learn(
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
         table.add_row(arm.text, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
     out.print(table)
-    table = Table("over the first arm, AP points", *(f"rho {rho:g}" for rho in BUDGETS))
+    table = Table("over the first arm, AP points", *(f"budget {b:g}" for b in BUDGETS))
     for k, arm in enumerate(ARMS[1:], start=1):
         found = gains(lessons, k)
         for phase in ("search", "track"):
-            cells = (found.get((phase, rho)) for rho in BUDGETS)
+            cells = (found.get((phase, b)) for b in BUDGETS)
             table.add_row(
                 f"{arm.text}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
             )
     out.print(table)
-    enough = ", ".join(f"{name} {rho:.3f}" for name, rho in thresholds(lessons).items())
+    enough = ", ".join(f"{name} {budget:.3f}" for name, budget in thresholds(lessons).items())
     out.print(f"maps find more than boxes from a budget of: {enough}")
     out.print(f"kept in [bold]{out_file}[/bold]")

@@ -126,7 +126,7 @@ def _section(policy: str) -> PolicySection:
     """`name(key=value, …)` as a scenario's section, parsed and checked as one is."""
     name, bracket, rest = policy.partition("(")
     if bracket and not rest.endswith(")"):
-        raise RunError(f"policy {policy!r}: the bracket is not closed, as in best-2(rho=0.1)")
+        raise RunError(f"policy {policy!r}: the bracket is not closed, as in best-2(received_budget=0.1)")
     params = [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
     return loads("name: verify", overrides=[f"policy.name={name.strip()}", *params]).policy
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from sortie.perception.detectors import make_detector
 from sortie.perception.metrics.ap import average_precision
-from sortie.policies.registry import POLICIES, parameters, resolve
+from sortie.policies.registry import POLICIES, resolve, within_budget
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
@@ -60,7 +59,7 @@ def fly_all(
     progress: Callable[[str, int], None] | None = None,
     detector_of: DetectorMaker = make_detector,
 ) -> list[Cell]:
-    """Every policy in every condition; the budget goes to every policy that takes one.
+    """Every policy in every condition, within the condition's budget (`Condition.budget`).
 
     Args:
         progress: called with the policy and how many of its conditions are flown.
@@ -88,10 +87,8 @@ def fly_all(
 def scenario_of(conditions: ConditionSet, condition: Condition, policy: str) -> Scenario:
     """A condition's scenario under a policy, within the condition's budget."""
     scenario = load(conditions.base, [*conditions.set, *condition.set, f"policy.name={policy}", "policy.params={}"])
-    function = resolve(policy)
-    inner = function.func if isinstance(function, functools.partial) else function
-    budget = {"rho": condition.rho} if "rho" in parameters(inner) else {}
-    return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"params": budget})})
+    params = within_budget(resolve(policy), condition.budget)
+    return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"params": params})})
 
 
 def _fly(

@@ -68,7 +68,9 @@ def flights(
     """
     conditions = load_conditions(name)
     if conditions is None:
-        conditions = ConditionSet(base=name, seeds=(load(name).seed,), conditions=(Condition(name="sortie", rho=1.0),))
+        conditions = ConditionSet(
+            base=name, seeds=(load(name).seed,), conditions=(Condition(name="sortie", budget=1.0),)
+        )
         planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
     else:
         planned = [[(p, scenario_of(conditions, c, p)) for p in policies] for c in conditions.conditions]

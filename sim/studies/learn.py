@@ -54,9 +54,9 @@ class Lesson:
 
 
 def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
-    """Training condition `number` of a seed: a scenario and its budget."""
+    """Training condition `number` of a seed: a scenario and its budget (`sent_budget` of the arms)."""
     rng = stream(seed, number, (), "learn.context")
-    rho = float(rng.choice(BUDGETS))
+    budget = float(rng.choice(BUDGETS))
     tracking = bool(rng.random() < 0.5)
     region = f", region: {{radius_m: {rng.choice(RADII_M)}}}"
     phase = f"{{at_s: 0, phase: {'track' if tracking else 'search'}{region if tracking else ''}}}"
@@ -74,12 +74,12 @@ def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
         f"seed={int(rng.integers(1, 10**6))}",
         *LINKS[int(rng.integers(len(LINKS)))],
     ]
-    return load("track_target", sets), rho
+    return load("track_target", sets), budget
 
 
 def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
     """Fly every arm in a training condition; `by_torch`: scored by the torch detector, at fewer moments."""
-    scenario, rho = draw_condition(seed, number)
+    scenario, budget = draw_condition(seed, number)
     detector_of: DetectorMaker = make_detector
     if by_torch:
         perception = scenario.perception.model_copy(update={"sample_rate_hz": TORCH_RATE_HZ})
@@ -91,14 +91,14 @@ def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
 
         def decide(view: FleetView, index: int = index, arm: object = arm) -> list[Directive]:
             if index == 0:
-                seen.append(features(view, rho))
-            return spend(view, ARMS[index], rho, "lesson")
+                seen.append(features(view, budget))
+            return spend(view, ARMS[index], budget, "lesson")
 
         record = run_sortie(scenario, decide, detector_of=detector_of)
         frames = list(matched(record, mission=mission).values())
         aps.append(average_precision(frames))
     settled = np.mean(seen[len(seen) // 2 :], axis=0)
-    about = f"rho {rho:g}, {'track' if mission else 'search'}, {scenario.fleet.formation.shape}"
+    about = f"budget {budget:g}, {'track' if mission else 'search'}, {scenario.fleet.formation.shape}"
     return Lesson(tuple(float(x) for x in settled), tuple(float(a) for a in aps), about)
 
 
@@ -140,16 +140,16 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
     """AP of an arm over the first by phase and budget: mean, its standard error, and how many conditions."""
     gains: dict[tuple[str, float], tuple[float, float, int]] = {}
     for phase in ("search", "track"):
-        for rho in BUDGETS:
+        for budget in BUDGETS:
             gained = np.array(
                 [
                     lesson.ap[arm] - lesson.ap[0]
                     for lesson in lessons
-                    if (lesson.features[1] > 0.5) == (phase == "track") and np.isclose(10 ** lesson.features[0], rho)
+                    if (lesson.features[1] > 0.5) == (phase == "track") and np.isclose(10 ** lesson.features[0], budget)
                 ]
             )
             if len(gained):
-                gains[phase, rho] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
+                gains[phase, budget] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
     return gains
 
 
@@ -166,9 +166,9 @@ def thresholds(lessons: list[Lesson]) -> dict[str, float]:
 
 
 def _falls_through_zero(lessons: list[Lesson]) -> float:
-    rho = np.array([10 ** s.features[0] for s in lessons])
+    budget = np.array([10 ** s.features[0] for s in lessons])
     gain = np.array([s.ap[-1] - s.ap[0] for s in lessons])
-    flown = [(b, float(gain[np.isclose(rho, b)].mean())) for b in BUDGETS if np.isclose(rho, b).any()]
+    flown = [(b, float(gain[np.isclose(budget, b)].mean())) for b in BUDGETS if np.isclose(budget, b).any()]
     for (a, up), (b, down) in itertools.pairwise(flown):
         if up > 0 >= down:
             return float(a * (b / a) ** (up / (up - down)))

@@ -36,7 +36,7 @@ vary:
   fleet.formation.spacing_m: {kind: grid, values: [20, 40]}
 sample: {count: 6}
 replications: 2
-policies: [worked, "best-2(rho=0.1)"]
+policies: [worked, "best-2(received_budget=0.1)"]
 metrics: [bytes.data_sent, energy_j.total]
 seed: 5
 """

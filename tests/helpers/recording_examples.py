@@ -17,17 +17,19 @@ from sortie.sim.engine.world import route_bounds
 REACH_M = 45.0
 
 
-def record_flight(scenario: Scenario, path: Path, *, lower: float = 0.0, features: bool = True) -> Path:
+def record_flight(scenario: Scenario, path: Path, *, lower: float = 0.0, features: bool = True, every: int = 1) -> Path:
     """A model that finds every car within 45 m, better the nearer, recorded along the scenario's own flight.
 
-    Features: channel 0 holds the score of the car centred in a cell, the others nothing.
+    Features: channel 0 holds the score of the car centred in a cell, the others nothing. `every`: of so many frames
+    one is recorded.
     """
     motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
     scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
     pose = np.concatenate([motion.position_m[..., :2], motion.yaw_rad[..., None]], axis=-1)
     est = np.concatenate([motion.est_position_m[..., :2], motion.est_yaw_rad[..., None]], axis=-1)
+    pose, est, times_s = pose[::every], est[::every], motion.time_s[::every]
     boxes, truth = [], []
-    for f, t_s in enumerate(motion.time_s):
+    for f, t_s in enumerate(times_s):
         cars = scene.cars_at(float(t_s))
         table = np.stack([cars.x_m, cars.y_m, cars.length_m, cars.width_m, cars.yaw_rad, np.ones(len(cars))], axis=1)
         truth.append(table[:, :5])
@@ -40,7 +42,7 @@ def record_flight(scenario: Scenario, path: Path, *, lower: float = 0.0, feature
         boxes.append(seen)
     maps = [np.stack([score_map(b) for b in frame]) for frame in boxes] if features else None
     return write_recording(
-        path, t_s=motion.time_s, pose=pose, est_pose=est, boxes=boxes, truth=truth, cell_m=3.2, features=maps
+        path, t_s=times_s, pose=pose, est_pose=est, boxes=boxes, truth=truth, cell_m=3.2, features=maps
     )
 
 

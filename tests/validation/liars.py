@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.reading.load import library, load
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
@@ -17,7 +18,7 @@ from sortie.sim.results.record import SortieRecord
 from sortie.sim.studies.compare import pair_up
 
 SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
-RHO = 0.1
+BUDGET = 0.1
 """Of a map on each link: five drones' links of it fit into the channel."""
 POLICIES = ("worked", "who2com", "deputies")
 LIES = (("coverage", "much"), ("coverage", "little"), ("goodput", "little"), ("battery", "much"))
@@ -77,7 +78,7 @@ def _flown(policy: str, seed: int, duration_s: float, trust: str, *more: str) ->
         SCENARIO,
         [
             "expect=[]", "expect_decisions=[]", "fleet.formation.shape=line", "mission.phases=[{at_s: 0, phase: search}]",
-            f"policy.name={policy}", f"policy.params={{rho: {RHO}}}", f"duration_s={duration_s:g}",
+            f"policy.name={policy}", f"policy.params={within_budget(resolve(policy), BUDGET)}", f"duration_s={duration_s:g}",
             "perception.detector=surrogate", f"context.trust={trust}", *more,
         ],
     )  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 
 from sortie.fleet.coverage import footprint_radius_m
 from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.choreography import EVENT
@@ -23,7 +24,7 @@ from sortie.sim.results.record import SortieRecord
 from sortie.sim.studies.compare import pair_up
 from sortie.sim.studies.conditions import paired_interval
 
-SCENARIO, RHO, RADIUS_M = "track_target", 0.1, 32.0
+SCENARIO, BUDGET, RADIUS_M = "track_target", 0.1, 32.0
 STAYS, MOVES = "all-4", "vantage"
 TRACKING_FROM_S = 5.0
 MISSIONS: dict[str, tuple[str, ...]] = {
@@ -121,7 +122,7 @@ def scenario_of(policy: str, seed: int, duration_s: float, mission: str) -> Scen
             "fleet.airframe.power_model=momentum", f"perception.scene.seed={1000 + seed}",
             f"fleet.route.waypoints_m=[[-150, 0], [{2 * half_m - 150:g}, 0]]",
             f"mission.phases=[{{at_s: 0, phase: search}}, {{at_s: {TRACKING_FROM_S:g}, phase: track, region: {{radius_m: {RADIUS_M:g}}}}}]",
-            f"policy.name={policy}", f"policy.params={{rho: {RHO}}}", *MISSIONS[mission],
+            f"policy.name={policy}", f"policy.params={within_budget(resolve(policy), BUDGET)}", *MISSIONS[mission],
         ],
     )  # fmt: skip
 

@@ -28,7 +28,9 @@ def test_a_smaller_form_sends_the_bytes_that_it_should() -> None:
 
 def test_ages_count_in_the_descriptors_own_period() -> None:
     """At 2 Hz a descriptor of half a second ago is as fresh as one of a tenth at 10 Hz: no link is degraded."""
-    record = run_sortie(example("context.publish_every=5", "policy.name=all-4", "policy.params={rho: 0.02}"))
+    record = run_sortie(
+        example("context.publish_every=5", "policy.name=all-4", "policy.params={received_budget: 0.02}")
+    )
     assert set(record.tables["directives"]["link"].to_pylist()) == {"fresh"}
     assert max(record.tables["ages"]["age_s"].to_pylist()) > 0.4
     drones = record.tables["transmissions"]

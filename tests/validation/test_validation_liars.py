@@ -9,6 +9,7 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
+from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.policy_text import policy_overrides
@@ -23,7 +24,7 @@ def lie(about: str = "coverage", claim: str = "much", until_s: str = "") -> str:
 
 
 def flown(*overrides: str, policy: str = "who2com") -> SortieRecord:
-    settings = (f"policy.name={policy}", "policy.params={rho: 0.05}", SEARCH)
+    settings = (f"policy.name={policy}", f"policy.params={within_budget(resolve(policy), 0.05)}", SEARCH)
     return run_sortie(example(*settings, *overrides))
 
 
@@ -94,7 +95,9 @@ def test_honest_fleets_doubt_nobody_at_any_rate_of_the_plane(rate_hz: float) -> 
     """A claim that is a second old says nothing of what came since."""
     asked = ["perception.detector=none", "duration_s=20", f"context.rate_hz={rate_hz}", "fleet.drones=4"]
     for seed in (1, 2, 3):
-        record = run_sortie(load("track_target", [*asked, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        record = run_sortie(
+            load("track_target", [*asked, *policy_overrides("all-4(received_budget=0.02)", "worked")]), None, seed
+        )
         assert record.tables["transmissions"].num_rows > 50
         assert outcome(record)["distrusted_by"] == {}
 
@@ -104,7 +107,9 @@ def test_honest_fleets_doubt_nobody_at_the_edge_of_range() -> None:
     weak = ["radio.tx_power_dbm=-8", "fleet.formation.spacing_m=60", "perception.detector=none", "duration_s=20"]
     lost = 0
     for seed in (1, 2):
-        record = run_sortie(load("track_target", [*weak, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        record = run_sortie(
+            load("track_target", [*weak, *policy_overrides("all-4(received_budget=0.02)", "worked")]), None, seed
+        )
         lost += record.tables["transmissions"]["status"].to_pylist().count("lost")
         assert outcome(record)["distrusted_by"] == {}
     assert lost > 100
@@ -114,7 +119,9 @@ def test_who_claims_more_than_a_full_channel_carries_is_found_out() -> None:
     """There a payload is on its way whenever a claim is made; none of them could make it true."""
     full = ["radio.bandwidth_mhz=20", "perception.detector=none", "duration_s=30"]
     much = "events=[{kind: lie, at_s: 5, drone: 2, about: goodput, claim: much}]"
-    record = run_sortie(load("track_target", [*full, much, *policy_overrides("all-4(rho=0.1)", "worked")]), None, 1)
+    record = run_sortie(
+        load("track_target", [*full, much, *policy_overrides("all-4(received_budget=0.1)", "worked")]), None, 1
+    )
     assert outcome(record)["distrusted_by"] == {"2": 4}
 
 
@@ -124,7 +131,9 @@ def test_honest_fleets_doubt_nobody_where_slow_descriptors_are_lost() -> None:
     asked = ["perception.detector=none", "duration_s=60", "events=[]", "fleet.formation.shape=line", *slow]
     lost = 0
     for seed in range(1, 7):
-        record = run_sortie(load("track_target", [*asked, *policy_overrides("all-4(rho=0.02)", "worked")]), None, seed)
+        record = run_sortie(
+            load("track_target", [*asked, *policy_overrides("all-4(received_budget=0.02)", "worked")]), None, seed
+        )
         lost += sum(age_s > 20 for age_s in record.tables["ages"]["age_s"].to_pylist())
         assert outcome(record)["distrusted_by"] == {}
     assert lost > 100

@@ -39,7 +39,7 @@ fleet: {route: {waypoints_m: [[-240, 0], [80, 0]]}}
 mission:
   target: {waypoints_m: [[-240, -1.75], [80, -1.75]]}
   phases: [{at_s: 0, phase: search}]
-policy: {name: all-4, params: {rho: 0.1}, dwell_s: 0}
+policy: {name: all-4, params: {received_budget: 0.1}, dwell_s: 0}
 """
 FLOWN = (0.05, 0.28)
 """Good to bad and bad to good over steps of 1 s, of a real flight's states (FACTS: 0.044–0.059, 0.19–0.38)."""
@@ -126,7 +126,7 @@ def crowded(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
     for rho in (0.1, 0.25, 1.0):
         for framing in ("sample", "tiles"):
             scenario = fleet(
-                "perception.detector=surrogate", f"policy.params={{rho: {rho}}}", f"radio.framing={framing}"
+                "perception.detector=surrogate", f"policy.params={{received_budget: {rho}}}", f"radio.framing={framing}"
             )
             found.append({"rho": rho, "framing": framing, **shared(scenario, seeds)})
     return found
@@ -146,7 +146,7 @@ def staleness(seeds: tuple[int, ...], duration_s: int) -> list[dict[str, Any]]:
     }
     found = []
     for name, settings in cases.items():
-        scenario = fleet("perception.detector=none", f"duration_s={duration_s}", "policy.params={rho: 0.02}", *settings)
+        scenario = fleet("perception.detector=none", f"duration_s={duration_s}", "policy.params={received_budget: 0.02}", *settings)
         ages, mean_s, states = [], [], {"degraded": 0, "detached": 0}
         for seed in seeds:
             record = run_sortie(scenario, seed=seed)
@@ -200,7 +200,7 @@ def relayed(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
     for hops in (1, 2, 4):
         scenario = fleet(
             "perception.detector=surrogate", "fleet.formation={shape: line, spacing_m: 120}", "radio.tx_power_dbm=15",
-            "policy.params={rho: 0.02}", f"radio.relay_max_hops={hops}", "context.detached_after_periods=100",
+            "policy.params={received_budget: 0.02}", f"radio.relay_max_hops={hops}", "context.detached_after_periods=100",
             "context.degraded_after_periods=50",
         )  # fmt: skip
         records = [run_sortie(scenario, seed=seed) for seed in seeds]

@@ -18,12 +18,12 @@ def rungs(directives: list[a.Directive]) -> list[Representation]:
 
 
 @pytest.mark.parametrize("arm", a.ARMS)
-@pytest.mark.parametrize("rho", [0.005, 0.1, 1.0])
-def test_no_arm_spends_more_than_the_budget(arm: a.Arm, rho: float) -> None:
-    directives = a.spend(fleet_of(5), arm, rho, "test")
-    assert sum(d.rho for d in directives) <= rho * 4 + 1e-9
-    if arm.peers > 0 and rho <= 0.25:
-        assert sum(d.rho for d in directives) == pytest.approx(rho * 4), "and all of it"
+@pytest.mark.parametrize("budget", [0.005, 0.1, 1.0])
+def test_no_arm_spends_more_than_the_budget(arm: a.Arm, budget: float) -> None:
+    directives = a.spend(fleet_of(5), arm, budget, "test")
+    assert sum(d.rho for d in directives) <= budget * 4 + 1e-9
+    if arm.peers > 0 and budget <= 0.25:
+        assert sum(d.rho for d in directives) == pytest.approx(budget * 4), "and all of it"
 
 
 def test_arms_by_hand() -> None:
@@ -57,7 +57,7 @@ def test_no_more_is_sent_than_the_air_carries() -> None:
 def test_maps_to_all_are_what_the_fixed_policy_sends(goodput: float) -> None:
     """An unmeasured link (goodput 0) is not a weak one: waiting for a measure would cost the climb of a rung."""
     view = fleet_of(5, goodput=goodput)
-    assert a.spend(view, a.MAPS, 0.1, "") == everyone(view, rho=0.1)
+    assert a.spend(view, a.MAPS, 0.125, "") == everyone(view, received_budget=0.125)
 
 
 def seeing(view: FleetView, state: Coverage = Coverage.WELL) -> FleetView:
@@ -66,46 +66,51 @@ def seeing(view: FleetView, state: Coverage = Coverage.WELL) -> FleetView:
     return view._replace(descriptors={i: d._replace(coverage_grid=grid) for i, d in view.descriptors.items()})
 
 
-@pytest.mark.parametrize("rho", [0.004, 0.05, 1.0])
-def test_a_region_is_worth_its_cells_and_the_rest_boxes(rho: float) -> None:
-    searching = a.adaptive(fleet_of(5, phase=TaskPhase.SEARCH, goodput=1000.0), rho=rho)
+@pytest.mark.parametrize("budget", [0.004, 0.05, 1.0])
+def test_a_region_is_worth_its_cells_and_the_rest_boxes(budget: float) -> None:
+    searching = a.adaptive(fleet_of(5, phase=TaskPhase.SEARCH, goodput=1000.0), sent_budget=budget)
     assert rungs(searching) == [BOXES] * 4
     view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
-    tracking = a.adaptive(view, rho=rho)
+    tracking = a.adaptive(view, sent_budget=budget)
     assert rungs(tracking) == [FEATURES] * 4
     assert {d.roi for d in tracking} == {view.descriptors[0].region}
-    assert sum(d.rho for d in tracking) == pytest.approx(4 * rho, rel=0.01) or rho == 1.0, "as far as the air carries"
+    assert sum(d.rho for d in tracking) == pytest.approx(4 * budget, rel=0.01) or budget == 1.0, (
+        "as far as the air carries"
+    )
 
 
 def test_hardly_any_cells_are_worth_less_than_boxes() -> None:
     view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
-    assert rungs(a.adaptive(view, rho=0.0019)) == [BOXES] * 4
-    assert rungs(a.adaptive(view, rho=0.002)) == [FEATURES] * 4
+    assert rungs(a.adaptive(view, sent_budget=0.0019)) == [BOXES] * 4
+    assert rungs(a.adaptive(view, sent_budget=0.002)) == [FEATURES] * 4
     weak = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=0.5))  # carries 0.001 of a map a link
-    assert rungs(a.adaptive(weak, rho=0.2)) == [BOXES] * 4
+    assert rungs(a.adaptive(weak, sent_budget=0.2)) == [BOXES] * 4
 
 
 def test_who_sees_nothing_of_the_region_sends_boxes() -> None:
     for state, expected in ((Coverage.UNSEEN, BOXES), (Coverage.POOR, FEATURES)):
         view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0), state)
-        assert rungs(a.adaptive(view, rho=0.2)) == [expected] * 4
+        assert rungs(a.adaptive(view, sent_budget=0.2)) == [expected] * 4
     view = seeing(fleet_of(5, phase=TaskPhase.TRACK, goodput=1000.0))
     me = view.descriptors[0]
     for away_m, expected in ((60.0, FEATURES), (500.0, BOXES)):
         x_m, y_m, _ = me.position_m
         there = me._replace(region=Disc(x_m + away_m, y_m, 20.0))
-        assert rungs(a.adaptive(view._replace(descriptors={**view.descriptors, 0: there}), rho=0.2)) == [expected] * 4
+        assert (
+            rungs(a.adaptive(view._replace(descriptors={**view.descriptors, 0: there}), sent_budget=0.2))
+            == [expected] * 4
+        )
 
 
 def test_the_learned_policy_takes_the_arm_of_the_highest_prediction() -> None:
     model = a.read_model(a.LEARNED)
     for phase in (TaskPhase.SEARCH, TaskPhase.TRACK):
-        for rho in (0.005, 0.02, 0.1, 0.4, 1.0):
+        for budget in (0.005, 0.02, 0.1, 0.4, 1.0):
             view = fleet_of(5, phase=phase)
-            z = (np.array(a.features(view, rho)) - model.mean) / model.scale
+            z = (np.array(a.features(view, budget)) - model.mean) / model.scale
             predicted = np.array(model.weights) @ np.concatenate([[1.0], z])
-            expected = a.spend(view, a.ARMS[int(np.argmax(predicted))], rho, "learned")
-            assert a.learned(view, rho=rho) == expected
+            expected = a.spend(view, a.ARMS[int(np.argmax(predicted))], budget, "learned")
+            assert a.learned(view, sent_budget=budget) == expected
 
 
 def test_what_the_learned_policy_reads() -> None:

@@ -68,7 +68,7 @@ def test_a_policy_and_its_viewpoint_share_the_parameters_that_both_name() -> Non
 
     @looks_from(look)
     def decide(view: FleetView, *, far_m: float = 1.0, rho: float = 1.0) -> list[Directive]:
-        return everyone(view, rho=rho)
+        return everyone(view, received_budget=rho)
 
     def asked(policy: Callable[..., object]) -> Reposition | None:
         found = viewpoint_of(policy)  # type: ignore[arg-type]

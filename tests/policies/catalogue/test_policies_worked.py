@@ -15,7 +15,7 @@ from sortie.policies.contract import (
     TaskPhase,
     check_directives,
 )
-from sortie.policies.geometry import circle_overlap, peers_by_overlap
+from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import parameters, resolve
 
 
@@ -75,20 +75,6 @@ def test_drones_in_one_place_do_not_all_choose_the_same_peers() -> None:
     here = {i: d._replace(position_m=(0.0, 0.0, 60.0)) for i, d in view.descriptors.items()}
     chosen = {i: peers_by_overlap(FleetView(i, 0.1, here, view.age_s))[:2] for i in here}
     assert chosen == {0: [1, 2], 1: [2, 3], 2: [3, 4], 3: [4, 0], 4: [0, 1]}
-
-
-@pytest.mark.parametrize(
-    ("distance", "expected"),
-    [(0.0, 1.0), (84.0, 0.0), (100.0, 0.0), (42.0, 2 / 3 - 3**0.5 / (2 * 3.141592653589793))],
-)
-def test_circle_overlap_closed_forms(distance: float, expected: float) -> None:
-    """Equal circles one radius apart share 2/3 − √3/(2π) of their area."""
-    assert circle_overlap(distance, 42.0, 42.0) == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_circle_within_another_is_covered() -> None:
-    assert circle_overlap(5.0, 10.0, 42.0) == 1.0
-    assert circle_overlap(5.0, 0.0, 42.0) == 0.0
 
 
 # --- the contract and the registry ---------------------------------------------------------------

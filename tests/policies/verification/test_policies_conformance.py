@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 from policies_examples import fleet_of
 
+from sortie.perception.budget import cells_in
 from sortie.policies.contract import PolicyError, Representation, check_directives
 from sortie.policies.registry import BOUNDS, POLICIES, parameters, resolve
 from sortie.policies.verification.conformance import conform, failing
@@ -24,18 +26,39 @@ def test_a_policy_keeps_the_contract(name: str) -> None:
     )
 
 
+@pytest.mark.parametrize("budget", [0.02, 0.05, 0.1, 0.25, 1.0])
 @pytest.mark.parametrize("name", ["all-4", "best-2", "worst-2", "random-2"])
-@pytest.mark.parametrize("rho", [0.02, 0.05, 0.1, 0.25, 1.0])
-def test_fixed_policies_spend_the_same_budget(name: str, rho: float) -> None:
-    """Matched bytes: what a drone sends over all its links is ρ of full sharing, up to a full map a link."""
-    view = fleet_of(5)
-    directives = [d for d in POLICIES[name](view, rho=rho) if d.representation == Representation.FEATURES]
-    spent = math.fsum(d.rho for d in directives)
-    assert spent == pytest.approx(min(rho * 4, len(directives)))
+def test_every_receiver_gets_its_whole_budget(name: str, budget: float) -> None:
+    """Matched bytes: what all drones together send to an ego is the budget's share of full sharing, to the cell."""
+    view, cells = fleet_of(5), Counter[int]()
+    links = Counter[int]()
+    for ego in view.descriptors:
+        for d in POLICIES[name](view._replace(ego=ego), received_budget=budget):
+            if d.representation == Representation.FEATURES:
+                cells[d.destination] += cells_in(d.rho)
+                links[d.destination] += 1
+    most = 4 if name == "all-4" else 2
+    assert set(links.values()) == {most}
+    assert set(cells.values()) == {min(int(budget * 4 * 4096), most * 4096)}
 
 
-def chosen(name: str, **params: object) -> list[int]:
-    return [d.destination for d in POLICIES[name](fleet_of(5), **params) if d.representation != Representation.NONE]
+@pytest.mark.parametrize("budget", [0.02, 0.05, 0.1, 0.25, 1.0])
+@pytest.mark.parametrize("name", ["best-2-receivers", "worst-2-receivers", "random-2-receivers"])
+def test_every_sender_spends_its_whole_budget(name: str, budget: float) -> None:
+    """Matched bytes: what a drone sends over all its links is the budget's share of full sharing, up to a full map a link."""
+    directives = POLICIES[name](fleet_of(5), sent_budget=budget)
+    spent = math.fsum(d.rho for d in directives if d.representation == Representation.FEATURES)
+    assert spent == pytest.approx(min(budget * 4, 2))
+
+
+def receivers(name: str, sender: int = 0, **params: object) -> list[int]:
+    """To whom a drone of a line sends; drone 0 is at one end."""
+    view = fleet_of(5)._replace(ego=sender)
+    return [d.destination for d in POLICIES[name](view, **params) if d.representation != Representation.NONE]
+
+
+def senders(name: str, receiver: int, **params: object) -> set[int]:
+    return {i for i in range(5) if i != receiver and receiver in receivers(name, i, **params)}
 
 
 @pytest.mark.parametrize(
@@ -48,9 +71,9 @@ def chosen(name: str, **params: object) -> list[int]:
         ("where2comm", {"rounds": 0}, "where2comm: rounds is 0, must be a whole number from 1 on"),
         ("where2comm", {"rounds": True}, "where2comm: rounds is True, must be a whole number from 1 on"),
         ("worked", {"rho": 2}, "worked: rho is 2, must be a number in [0, 1]"),
-        ("all-4", {"rho": "0.1"}, "all-4: rho is '0.1', must be a number in [0, 1]"),
-        ("adaptive", {"rho": math.nan}, "adaptive: rho is nan, must be a number in [0, 1]"),
-        ("vantage", {"rho": -0.1}, "vantage: rho is -0.1, must be a number in [0, 1]"),
+        ("all-4", {"received_budget": "0.1"}, "all-4: received_budget is '0.1', must be a number in [0, 1]"),
+        ("adaptive", {"sent_budget": math.nan}, "adaptive: sent_budget is nan, must be a number in [0, 1]"),
+        ("vantage", {"received_budget": -0.1}, "vantage: received_budget is -0.1, must be a number in [0, 1]"),
         ("hydracollab", {"threshold": 1.5}, "hydracollab: threshold is 1.5, must be a number in [0, 1]"),
         ("when2com", {"sharpness": math.inf}, "when2com: sharpness is inf, must be a number in [0, 100]"),
         ("syncnet", {"trusted_for_s": 0.0}, "syncnet: trusted_for_s is 0.0, must be a number in [0.001, 3600]"),
@@ -79,17 +102,27 @@ def test_what_a_file_declares_is_its_own_to_bound(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text("def decide(view, *, rho='much', k=-1):\n    return []\n\ngreatest = max\n")
     assert not resolve(f"{path}:decide", {"rho": "more", "k": -2})(fleet_of(1))
-    assert resolve("best-2", {"rho": np.float32(0.5), "k": np.int64(3)})(fleet_of(5))[0].rho == pytest.approx(2 / 3)
+    assert resolve("best-2", {"received_budget": np.float32(0.5), "k": np.int64(3)})(fleet_of(5))[
+        0
+    ].rho == pytest.approx(2 / 3, abs=1e-3)
     with pytest.raises(PolicyError, match=r"'greatest' names no parameters, must be a Python function$"):
         resolve(f"{path}:greatest")
 
 
-def test_best_and_worst_choose_by_overlap() -> None:
-    assert chosen("best-2") == [1, 2]
-    assert chosen("worst-2") == [3, 4]
-    assert chosen("all-4") == [1, 2, 3, 4]
-    assert chosen("silence") == []
-    assert len(chosen("random-2")) == 2
-    assert {tuple(chosen("random-2", salt=s)) for s in range(40)} == {
+def test_the_receiver_chooses_its_senders() -> None:
+    """Each receiver of a line has the two nearest, or the two farthest, senders."""
+    assert [senders("best-2", r) for r in range(5)] == [{1, 2}, {0, 2}, {1, 3}, {2, 4}, {2, 3}]
+    assert [senders("worst-2", r) for r in (0, 4)] == [{3, 4}, {0, 1}]
+    assert [senders("all-4", r) for r in range(5)] == [set(range(5)) - {r} for r in range(5)]
+    assert {frozenset(senders("random-2", 0, salt=s)) for s in range(40)} == {
+        frozenset((a, b)) for a in range(1, 5) for b in range(a + 1, 5)
+    }
+
+
+def test_the_sender_chooses_its_receivers() -> None:
+    assert receivers("best-2-receivers") == [1, 2]
+    assert receivers("worst-2-receivers") == [3, 4]
+    assert receivers("silence") == []
+    assert {tuple(receivers("random-2-receivers", salt=s)) for s in range(40)} == {
         (a, b) for a in range(1, 5) for b in range(a + 1, 5)
     }

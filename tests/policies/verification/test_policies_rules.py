@@ -53,7 +53,7 @@ def share(view: FleetView, rate_hz: float = 10.0) -> list[Directive]:
 # --- what a decision costs -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["worked", "all-4", "best-2", "silence"])
+@pytest.mark.parametrize("name", ["worked", "all-4", "best-2-receivers", "silence"])
 def test_cost_grows_no_faster_than_the_fleet(name: str) -> None:
     """Calls, not time: a crowded host counts the same."""
 

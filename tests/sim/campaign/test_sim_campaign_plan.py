@@ -67,7 +67,7 @@ def test_a_linspace_over_whole_numbers_gives_whole_numbers(tmp_path: Path) -> No
     [
         ("seed: 5", "seed: 6"),
         ("low: 0.2", "low: 0.21"),
-        ("rho=0.1", "rho=0.11"),
+        ("received_budget=0.1", "received_budget=0.11"),
         ("energy_j.total", "energy_j.rotor"),
     ],
 )
@@ -76,7 +76,7 @@ def test_whatever_reaches_the_worker_changes_the_key(tmp_path: Path, old: str, n
     changed = [before.key(run) != after.key(run) for run in range(before.runs)]
     assert any(changed)
     assert before.digest != after.digest
-    if "rho" in old:
+    if "budget" in old:
         assert changed == [False, True] * 24  # the other policy's runs are what they were
 
 
@@ -268,7 +268,7 @@ def test_a_metric_that_only_some_runs_have_is_kept(tmp_path: Path) -> None:
         "descriptor_drops.forged, ap50.mission, drones.0.airborne"
     )
     text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
-    text = text.replace("bytes.data_sent", names).replace('"best-2(rho=0.1)"', "silence")
+    text = text.replace("bytes.data_sent", names).replace('"best-2(received_budget=0.1)"', "silence")
     assert "battery.3" in plan(tmp_path, text, base).campaign.metrics
     with pytest.raises(RunError, match="phases has no '1', it has 0 … 0"):  # if no run is that long
         plan(
@@ -286,7 +286,7 @@ def test_the_number_of_a_metric_is_null_where_a_run_has_none() -> None:
 
 BUDGETS = CAMPAIGN.replace(
     "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", "policy.params.rho: {kind: grid, values: [0.1, 0.2]}"
-).replace('"best-2(rho=0.1)"', "best-2(k=1)")
+).replace('"best-2(received_budget=0.1)"', "deputies(k=1)")
 
 
 def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
         at = p.at(run)
         policy, rho = unpack(p.task(run))[0].policy, (0.1, 0.2)[at.cell % 2]
         assert p.varied(at.cell)["policy.params.rho"] == rho
-        assert policy.name == ("worked", "best-2")[at.policy]
+        assert policy.name == ("worked", "deputies")[at.policy]
         assert policy.params == ({"rho": rho}, {"k": 1, "rho": rho})[at.policy]
         assert policy.dwell_s == 2
     assert p.key(0) != p.key(4)  # the next grid point, not the next replication
@@ -305,16 +305,16 @@ def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("best-2(k=1)", "silence", "6: vary.policy.params.rho: policy 'silence' has no parameter 'rho', it has: none"),
+        ("deputies(k=1)", "silence", "6: vary.policy.params.rho: policy 'silence' has no parameter 'rho', it has: none"),
         ("params.rho:", "params.roh:", "6: vary.policy.params.roh: policy 'worked' has no parameter 'roh', it has: rho"),
         (
-            "best-2(k=1)", '"best-2(k=1, rho=0.5)"',
-            "9: policies.1: best-2(k=1, rho=0.5) has its own policy.params.rho, which is varied; leave it out here",
+            "deputies(k=1)", '"deputies(k=1, rho=0.5)"',
+            "9: policies.1: deputies(k=1, rho=0.5) has its own policy.params.rho, which is varied; leave it out here",
         ),
-        ("best-2(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', did you mean worst-2? known: worked, "),
-        ("best-2(k=1)", "best-2(q=1)", "9: policies.1: policy 'best-2' has no parameter 'q', it has: k, rho"),
-        ("best-2(k=1)", "best-2(k)", "9: policies.1: --set policy.params.k: must be key.path=value"),
-        ("policies: [worked, best-2(k=1)]", "set: {policy.name: wirkt}", "3: base: unknown policy 'wirkt', known: "),
+        ("deputies(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', did you mean worst-2? known: worked, "),
+        ("deputies(k=1)", "deputies(q=1)", "9: policies.1: policy 'deputies' has no parameter 'q', it has: k, rho"),
+        ("deputies(k=1)", "deputies(k)", "9: policies.1: --set policy.params.k: must be key.path=value"),
+        ("policies: [worked, deputies(k=1)]", "set: {policy.name: wirkt}", "3: base: unknown policy 'wirkt', known: "),
     ],
 )  # fmt: skip
 def test_a_policy_that_cannot_fly_is_told_at_its_line(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -73,11 +73,15 @@ def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
     rows = rows_of(tmp_path, text, value)
     assert winner(rows, "bytes.data_sent") == "worked"
     (found,) = other_winners(rows, "bytes.data_sent")
-    assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", True)
+    assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(received_budget=0.1)", True)
     assert found.part.startswith("0.2")
     made = rule(rows, "bytes.data_sent")
     assert made is not None
-    assert (made.field, made.below, made.above) == ("fleet.battery.initial_soc", "best-2(rho=0.1)", "worked")
+    assert (made.field, made.below, made.above) == (
+        "fleet.battery.initial_soc",
+        "best-2(received_budget=0.1)",
+        "worked",
+    )
     assert made.threshold == pytest.approx(0.4, abs=0.03)
     assert made.gain.low > 0
 
@@ -163,7 +167,7 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     assert text == write_report(folder).read_text()
     for part in (
         "48 of 48 runs: 6 draws at 2 grid points, 2 replications, 2 policies on the same draws; 1 failed.",
-        "- run 3 (best-2(rho=0.1), seed ",
+        "- run 3 (best-2(received_budget=0.1), seed ",
         "ValueError: planted",
         f"sortie fly --from-campaign {folder} --run 3",
         "## Metrics by policy",
@@ -235,7 +239,7 @@ def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
     made = rule(rows_of(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}"), value), "bytes.data_sent")
     assert made is not None
     assert (made.field, made.threshold, made.below, made.above) == (
-        "fleet.formation.spacing_m", 30.0, "worked", "best-2(rho=0.1)",
+        "fleet.formation.spacing_m", 30.0, "worked", "best-2(received_budget=0.1)",
     )  # fmt: skip
     assert made.gain.mean == pytest.approx(1.0, abs=0.01)
     assert made.gain.count == 40, "draws, not cells"

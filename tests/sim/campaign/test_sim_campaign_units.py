@@ -87,7 +87,7 @@ def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path
     rows = read_rows(folder)
     assert rows.by_unit("bytes.data_sent").mean(axis=0).tolist() == [0.0, 1.0]
     assert winner(rows, "bytes.data_sent") == "worked"
-    said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(rho=0.1) 2): policies are"
+    said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(received_budget=0.1) 2): policies are"
     assert said in write_report(folder).read_text()
 
 
@@ -107,4 +107,4 @@ def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> 
 
     run_campaign(p, folder, Broken())  # type: ignore[arg-type]
     assert np.isnan(read_rows(folder).by_unit("bytes.data_sent")).tolist() == [[False, True]] * 6
-    assert "No run of best-2(rho=0.1) finished." in write_report(folder).read_text()
+    assert "No run of best-2(received_budget=0.1) finished." in write_report(folder).read_text()

@@ -196,7 +196,16 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     kept = json.loads((tmp_path / "runs" / "example-worked-seed1" / "outcome.json").read_text())
     assert max(kept["battery"].values()) < 0.5
     again = sortie(
-        "fly", scenario, "--policy", "best-2(rho=0.1)", "--seed", "7", "--no-recording", "--out", "here", cwd=tmp_path
+        "fly",
+        scenario,
+        "--policy",
+        "best-2(received_budget=0.1)",
+        "--seed",
+        "7",
+        "--no-recording",
+        "--out",
+        "here",
+        cwd=tmp_path,
     )
     assert again.returncode == 0, again.stderr
     kept = json.loads((tmp_path / "here" / "outcome.json").read_text())
@@ -221,7 +230,7 @@ def test_a_run_that_another_replaces_is_told(
             ("fly", "example.yaml", "--policy", "wrst-2"),
             "unknown policy 'wrst-2', did you mean worst-2? known: worked, all-4",
         ),
-        (("fly", "example.yaml", "--policy", "all-4(rho=0.1"), "the bracket is not closed"),
+        (("fly", "example.yaml", "--policy", "all-4(received_budget=0.1"), "the bracket is not closed"),
         (("fly", "example.yaml", "--policy", "silence(rho=0.1)"), "policy 'silence' has no parameter 'rho'"),
         (("fly", "example.yaml", "--policy", "no/such.py:decide"), "policy file 'no/such.py' not found"),
         (("fly", "example.yaml", "--set", "fleet.batery.initial_soc=0.5"), "did you mean battery?"),
@@ -300,22 +309,22 @@ def test_check_passes_with_code_0(scenario: Path) -> None:
 def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("# Mine\n\n<!-- compare:begin -->old<!-- compare:end -->\n\nSee below.\n")
     done = sortie(
-        "compare", scenario, "--policies", "worked,all-4(rho=0.1),silence", "--out", "c.json", "--readme", "README.md",
+        "compare", scenario, "--policies", "worked,all-4(received_budget=0.1),silence", "--out", "c.json", "--readme", "README.md",
         cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     readme = (tmp_path / "README.md").read_text()
     assert readme.startswith("# Mine\n\n<!-- compare:begin -->\n")
     assert readme.endswith("<!-- compare:end -->\n\nSee below.\n")
-    assert "| | worked | all-4(rho=0.1) | silence |" in readme
+    assert "| | worked | all-4(received_budget=0.1) | silence |" in readme
     assert "- **silence**: sent nothing" in readme
     assert "accuracy" not in readme  # no detector flew
     assert "old" not in readme
     assert "sent nothing; every drone saw with its own eyes only" in done.stdout
     kept = json.loads((tmp_path / "c.json").read_text())
-    assert list(kept) == ["worked", "all-4(rho=0.1)", "silence"]
+    assert list(kept) == ["worked", "all-4(received_budget=0.1)", "silence"]
     assert kept["silence"]["bytes"]["data_sent"] == 0
-    assert kept["all-4(rho=0.1)"]["bytes"]["data_sent"] > 0
+    assert kept["all-4(received_budget=0.1)"]["bytes"]["data_sent"] > 0
 
 
 @pytest.mark.parametrize(

@@ -101,9 +101,18 @@ def test_a_domain_out_of_range_is_one_line(
 def test_a_comparison_in_a_readme_says_how_it_was_made(scenario: Path, tmp_path: Path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text("<!-- compare:begin --><!-- compare:end -->")
-    made = ("--policies", "silence,all-4(rho=0.1)", "--seed", 3, "--set", "duration_s=1", "--set", "fleet.drones=2")
+    made = (
+        "--policies",
+        "silence,all-4(received_budget=0.1)",
+        "--seed",
+        3,
+        "--set",
+        "duration_s=1",
+        "--set",
+        "fleet.drones=2",
+    )
     assert command("compare", scenario, *made, "--readme", readme, "--recording", tmp_path / "new" / "c.rrd") == 0
-    said = f"sortie compare {scenario} --policies 'silence,all-4(rho=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
+    said = f"sortie compare {scenario} --policies 'silence,all-4(received_budget=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
     assert f"`{said}`: 1 s, 2 drones, seed 3." in readme.read_text()
     assert (tmp_path / "new" / "c.rrd").is_file()
 

@@ -34,14 +34,14 @@ CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
 TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20, cycles: 10, payload_kg: 0.1}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
-HEAVY = ("policy.name=all-4", "policy.params={rho: 0.4}")  # fills the medium
+HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
 FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
 ASIDE = "mission.target.waypoints_m=[[-60, 60], [200, 60]]"
-LOOKS = ("policy.name=vantage", "policy.params={rho: 0.02}", ASIDE, "fleet.formation.spacing_m=14")
+LOOKS = ("policy.name=vantage", "policy.params={received_budget: 0.02}", ASIDE, "fleet.formation.spacing_m=14")
 SHARP = (*LOOKS, "fleet.viewpoints.acceleration_mps2=5", "fleet.viewpoints.reach_m=30")  # speed binds, not acceleration
 FAST = (*LOOKS, "fleet.viewpoints.speed_mps=15", "fleet.viewpoints.acceleration_mps2=5")
 FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
@@ -81,7 +81,7 @@ def nearer(view):
 
 @looks_from(nearer)
 def decide(view):
-    return everyone(view, rho=0.02)
+    return everyone(view, received_budget=0.02)
 """
 """Everybody asks to be half as far from drone 0."""
 TIRED_VIEW = [tired(0), tired(1)]
@@ -177,7 +177,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "radio.heartbeat_s": ("0.05", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
     "radio.nack_delay_s": ("0.02", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
     "context.rate_hz": ("5", ()),
-    "context.degraded_after_periods": ("5", (LOST, "policy.name=all-4", "policy.params={rho: 0.02}")),
+    "context.degraded_after_periods": ("5", (LOST, "policy.name=all-4", "policy.params={received_budget: 0.02}")),
     "context.detached_after_periods": ("15", (LOST,)),
     "context.authentication": ("false", ()),
     "context.publish_every": ("2", ()),
@@ -187,15 +187,15 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "context.trust": ("false", (LIE,)),
     "perception.detector": ("torch", ("duration_s=4",)),
     "perception.compute_delay_s": ("0.05", ()),
-    "policy.name": ("worst-2", ()),
+    "policy.name": ("deputies", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),
-    "policy.hysteresis": ("3", ("policy.name=adaptive", FAR)),
+    "policy.hysteresis": ("3", ("policy.name=adaptive", "policy.params={}", FAR)),
     "policy.changes.at_s": ("3", (AT_2,)),
     "policy.changes.phase": ("search", (IN_TRACK,)),
     "policy.changes.command": ("b", (TOLD, TELL)),
     "policy.changes.name": ("best-2", (AT_2,)),
-    "policy.changes.params": ("{rho: 0.1}", (AT_2,)),
+    "policy.changes.params": ("{received_budget: 0.1}", (AT_2,)),
     "policy.commands.at_s": ("2.5", (TOLD, TELL)),
     "policy.commands.command": ("b", (TOLD, TELL)),
     "policy.commands.drones": ("[1]", (TOLD, TELL)),
@@ -233,7 +233,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.motion_compensation": ("false", ("perception.fusion_delay_s=0.042",)),
     "perception.score_threshold": ("0.5", ()),
     "perception.cells_by": ("norm", ()),
-    "perception.join": ("average", ("policy.name=boxes",)),
+    "perception.join": ("average", ("policy.name=boxes", "policy.params={}")),
     "perception.unsent_cells": ("zero", ()),
     "perception.scene.seed": ("8", ()),
     "perception.scene.style": ("suburb", ()),

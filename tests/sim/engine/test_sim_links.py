@@ -14,7 +14,12 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
-LOSSY = ("policy.name=all-4", "policy.params={rho: 0.1}", "radio.retry_limit=0", "radio.bursts.loss_good=0.05")
+LOSSY = (
+    "policy.name=all-4",
+    "policy.params={received_budget: 0.1}",
+    "radio.retry_limit=0",
+    "radio.bursts.loss_good=0.05",
+)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +47,7 @@ def test_parts_are_fused_where_samples_are_lost(tiled: SortieRecord) -> None:
 
 
 def test_a_payload_that_its_deadline_cuts_short_has_missed_it(tiled: SortieRecord) -> None:
-    record = run_sortie(example("policy.name=all-4", "policy.params={rho: 1.0}", "radio.framing=tiles"))
+    record = run_sortie(example("policy.name=all-4", "policy.params={received_budget: 1.0}", "radio.framing=tiles"))
     result = outcome(record)
     fates = result["payload_fates"]
     cut = sum(fates.get(f"partial/{r}", 0) for r in ("replaced", "deadline_in_service", "deadline_queued"))

@@ -26,7 +26,7 @@ def silent() -> SortieRecord:
 
 def test_cooperation_beats_single_drones_and_the_interval_says_so() -> None:
     """Full maps over a medium that is wide enough for them: sharing every cell gains over silence."""
-    wide = ("policy.params={rho: 0.25}",)
+    wide = ("policy.params={received_budget: 0.25}",)
     rows, _ = compare([Contender("silence", scenario("silence")), Contender("all-4", scenario("all-4", *wide))], [1])
     gain, low, high = rows[1].gain["full_scene"] or (0.0, 0.0, 0.0)
     assert low > 0.0, f"gain {gain:.3f} [{low:.3f}, {high:.3f}]"
@@ -48,7 +48,7 @@ def test_a_cut_fleet_sees_like_a_silent_one(silent: SortieRecord) -> None:
 
 
 def test_what_is_fused_was_delivered_in_time_and_is_the_freshest() -> None:
-    record = run_sortie(scenario("best-2", "policy.params={rho: 0.2}"))
+    record = run_sortie(scenario("best-2", "policy.params={received_budget: 0.2}"))
     delivered = [t for t in record.tables["transmissions"].to_pylist() if t["status"] == "delivered"]
     checked = 0
     for fusion in record.tables["fusions"].to_pylist():

@@ -150,7 +150,7 @@ def test_full_sharing_does_not_fit_into_the_channel(full_sharing: SortieRecord) 
 
 
 def test_a_small_budget_fits() -> None:
-    o = outcome(run_sortie(example("policy.name=all-4", "policy.params={rho: 0.02}")))
+    o = outcome(run_sortie(example("policy.name=all-4", "policy.params={received_budget: 0.02}")))
     assert o["deadline_miss_rate"] == 0.0
     assert o["bytes"]["data_delivered"] > 0.99 * (o["bytes"]["data_sent"] - o["bytes"]["data_in_flight"])
 
@@ -198,7 +198,11 @@ def test_the_papers_three_transitions() -> None:
 
 def test_a_lost_drone_degrades_and_detaches() -> None:
     record = run_sortie(
-        example("events=[{kind: drone_lost, drone: 2, at_s: 3.0}]", "policy.name=all-4", "policy.params={rho: 0.02}")
+        example(
+            "events=[{kind: drone_lost, drone: 2, at_s: 3.0}]",
+            "policy.name=all-4",
+            "policy.params={received_budget: 0.02}",
+        )
     )
     rows = decisions(record, drone=0, peer=2)
     degraded = next(r for r in rows if r["link"] == "degraded")

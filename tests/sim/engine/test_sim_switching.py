@@ -62,9 +62,9 @@ def test_a_change_to_the_same_decisions_changes_no_payload(base: SortieRecord, t
 
 
 def test_no_frame_is_lost_or_sent_twice_at_a_change() -> None:
-    to_two = "policy.changes=[{at_s: 3.05, name: best-2, params: {rho: 0.02}}]"
+    to_two = "policy.changes=[{at_s: 3.05, name: best-2, params: {received_budget: 0.02}}]"
     searching = "mission.phases=[{at_s: 0, phase: search}]"
-    record = run_sortie(example("policy.name=all-4", "policy.params={rho: 0.02}", to_two, searching))
+    record = run_sortie(example("policy.name=all-4", "policy.params={received_budget: 0.02}", to_two, searching))
     after = {(r["drone"], r["peer"]) for r in rows(record, "transmissions") if r["captured_s"] > 4.0}
     assert 0 < len(after) < 20
     for link, captured_s in links(record).items():
@@ -97,16 +97,16 @@ def test_of_two_changes_at_once_the_later_in_the_list_stays(first: str, second: 
 
 
 def test_a_change_by_phase_is_each_drones_own_and_in_the_audit() -> None:
-    record = run_sortie(example("policy.changes=[{phase: track, name: best-2, params: {rho: 0.1}}]"))
+    record = run_sortie(example("policy.changes=[{phase: track, name: best-2, params: {received_budget: 0.1}}]"))
     told = rows(record, "events", kind="policy")
     assert [r["drone"] for r in sorted(told, key=lambda r: r["drone"])] == [0, 1, 2, 3, 4]
-    assert {r["text"] for r in told} == {"worked(rho=0.25) → best-2(rho=0.1): phase track"}
+    assert {r["text"] for r in told} == {"worked(rho=0.25) → best-2(received_budget=0.1): phase track"}
     at_s = {r["drone"]: r["t_s"] for r in told}
     assert all(3.0 <= t_s < 3.02 for t_s in at_s.values()), "at the drone's own first decision of the phase"
     for r in record.tables["directives"].to_pylist():
-        assert r["policy"] == ("best-2(rho=0.1)" if r["t_s"] >= at_s[r["drone"]] else "worked(rho=0.25)")
+        assert r["policy"] == ("best-2(received_budget=0.1)" if r["t_s"] >= at_s[r["drone"]] else "worked(rho=0.25)")
     decisions = outcome(record)["policies"]["decisions"]
-    assert decisions == {"worked(rho=0.25)": 5 * 30, "best-2(rho=0.1)": 5 * 30}
+    assert decisions == {"worked(rho=0.25)": 5 * 30, "best-2(received_budget=0.1)": 5 * 30}
 
 
 def test_a_command_reaches_whom_it_names() -> None:

@@ -41,7 +41,7 @@ SCRIPT = VALIDATION / "repositions.py"
 
 
 def share(view: FleetView) -> list[Directive]:
-    return everyone(view, rho=0.02)
+    return everyone(view, received_budget=0.02)
 
 
 def never(view: FleetView) -> Reposition | None:
@@ -131,7 +131,7 @@ def test_drones_return_to_their_slots_when_the_policy_changes() -> None:
         "duration_s=45",
         "fleet.viewpoints.reach_m=8",
         "policy.name=vantage",
-        "policy.params={rho: 0.02}",
+        "policy.params={received_budget: 0.02}",
     )
     stays = flown_m(run_sortie(example(*settings, "policy.name=all-4")))
     moves = flown_m(run_sortie(example(*settings, "policy.changes=[{at_s: 20, name: silence}]")))

@@ -193,7 +193,9 @@ def flown() -> Flown:
         try:
             assert peer.stdout is not None
             assert peer.stdout.readline() == "listening\n"
-            scenario = example("fleet.drones=3", "policy={name: all-4, params: {rho: 0.02}, dwell_s: 0.3}")
+            scenario = example(
+                "fleet.drones=3", "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
+            )
             result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
             told, _ = peer.communicate(timeout=60)
         finally:
@@ -220,9 +222,9 @@ def test_the_fleet_shares_with_a_peer_that_was_on_no_roster(flown: Flown) -> Non
     assert Representation.FEATURES in {o["representation"] for o in orders}
     assert orders[-1]["representation"] == Representation.NONE  # it fell silent and was detached
     shared = [o for o in orders if o["representation"] == Representation.FEATURES]
-    assert {round(o["rho"], 6) for o in shared} == {0.02}
+    assert {round(o["rho"], 6) for o in shared} == {0.03125}
     assert len(set(flown.peer["payload_bytes"])) == 1
-    assert 82 * 160 < flown.peer["payload_bytes"][0] < 83 * 160 + 600
+    assert 128 * 160 < flown.peer["payload_bytes"][0] < 129 * 160 + 600
 
 
 def test_what_cannot_be_a_drone_is_refused(flown: Flown) -> None:
@@ -284,7 +286,7 @@ def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path) -> None
     scenario.write_text(BASE)
     done = CliRunner().invoke(
         app,
-        ["live", str(scenario), "--set", "fleet.drones=2", "--policy", "all-4(rho=0.02)", "--duration", "2", "--begin", "1",
+        ["live", str(scenario), "--set", "fleet.drones=2", "--policy", "all-4(received_budget=0.02)", "--duration", "2", "--begin", "1",
          "--loss", "0.5", "--domain", str(DOMAIN), "--out", str(told)],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -294,7 +296,7 @@ def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path) -> None
     for drone in result["each"]:
         came = drone["heard"] + drone["dropped_by_loss"]
         assert abs(drone["dropped_by_loss"] - came / 2) < 4 * (came / 4) ** 0.5  # four standard deviations
-    assert result["policy"] == "all-4(rho=0.02)"
+    assert result["policy"] == "all-4(received_budget=0.02)"
     assert {row["health"] for row in result["health"]} >= {"fresh"}
 
 
@@ -307,7 +309,9 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
 
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
-        changing = "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {rho: 0.05}}]}"
+        changing = (
+            "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {received_budget: 0.05}}]}"
+        )
         scenario = example("fleet.drones=2", changing)
         result = fly_live(scenario, loss=1.0, domain=DOMAIN, begun=interrupt)
     finally:
@@ -318,7 +322,7 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
     assert [d.heard for d in result.each] == [0, 0]
     assert all(d.published > 0 and d.dropped_by_loss > 0 for d in result.each)
     assert (result.data_bytes_per_s, result.context_share, result.health) == (0, None, [])
-    took_over = "all-4 → best-2(rho=0.05): time 0.3 s"
+    took_over = "all-4 → best-2(received_budget=0.05): time 0.3 s"
     assert sorted((n.drone, n.text) for n in result.notices) == [(0, took_over), (1, took_over)]
     for pid in pids.values():
         with pytest.raises(ProcessLookupError):

@@ -18,7 +18,7 @@ from sortie.sim.results.record import SortieRecord
 @pytest.fixture(scope="module")
 def flown() -> list[tuple[str, SortieRecord]]:
     sparse = example("duration_s=3.5")
-    return [("worked", run_sortie(sparse)), ("all-4(rho=0.1)", run_sortie(sparse, "all-4"))]
+    return [("worked", run_sortie(sparse)), ("all-4(received_budget=0.1)", run_sortie(sparse, "all-4"))]
 
 
 def columns(path: Path) -> dict[tuple[str, str], list[object]]:
@@ -40,7 +40,7 @@ def test_each_policy_is_drawn_below_its_root_as_it_is_alone(
 ) -> None:
     save_comparison(flown, tmp_path / "both.rrd")
     both = columns(tmp_path / "both.rrd")
-    for root, (_, record) in zip(("worked", "all-4_rho_0_1"), flown, strict=True):
+    for root, (_, record) in zip(("worked", "all-4_received_budget_0_1"), flown, strict=True):
         save_rrd(record, tmp_path / "one.rrd")
         alone = {key: v for key, v in columns(tmp_path / "one.rrd").items() if not key[0].startswith("/__")}
         below = {(e.removeprefix(f"/{root}") or "/", c): v for (e, c), v in both.items() if e.startswith(f"/{root}")}
@@ -66,10 +66,13 @@ def test_the_layout_has_a_scene_each_and_plots_with_a_line_each(
     assert kinds == ["3D", "3D", "StateTimeline", "StateTimeline", "TextLog", "TextLog", *["TimeSeries"] * 3]
     shown = all_of("ViewContents:query")
     for entity in ("features_delivered", "p99_ms", "busy_percent"):
-        assert [q.split("/")[1] for q in shown if q.rstrip().endswith(entity)] == ["worked", "all-4_rho_0_1"]
+        assert [q.split("/")[1] for q in shown if q.rstrip().endswith(entity)] == [
+            "worked",
+            "all-4_received_budget_0_1",
+        ]
 
 
 def test_labels_that_look_alike_have_roots_of_their_own() -> None:
-    assert roots(["best-2(rho=0.1)", "best-2 rho 0.1", "silence", "§"]) == [
-        "best-2_rho_0_1", "best-2_rho_0_1_1", "silence", "policy",
+    assert roots(["best-2(received_budget=0.1)", "best-2 received_budget 0.1", "silence", "§"]) == [
+        "best-2_received_budget_0_1", "best-2_received_budget_0_1_1", "silence", "policy",
     ]  # fmt: skip

@@ -32,8 +32,8 @@ SMALL = """
 base: track_target
 set: [perception.detector=surrogate, duration_s=3, "mission.phases=[{at_s: 0, phase: search}]", policy.dwell_s=0.3]
 conditions:
-  - {name: poor, rho: 0.02}
-  - {name: rich, rho: 0.25, set: [fleet.formation.shape=line]}
+  - {name: poor, budget: 0.02}
+  - {name: rich, budget: 0.25, set: [fleet.formation.shape=line]}
 """
 
 
@@ -54,17 +54,17 @@ def test_the_held_out_conditions_load_under_every_policy_at_their_budget(name: s
     for condition in conditions.conditions:
         for policy in POLICIES:
             scenario = scenario_of(conditions, condition, policy)
-            assert scenario.policy.params.get("rho", condition.rho) == condition.rho
+            assert set(scenario.policy.params.values()) <= {condition.budget}
         assert (condition.metric == "mission") == (scenario.mission.phases[0].phase == "track")
 
 
 def test_no_held_out_condition_is_one_of_training_or_of_another_set() -> None:
     for first, second in itertools.combinations([held_out(name).conditions for name in SETS], 2):
         assert not {c.name for c in first} & {c.name for c in second}
-        assert not {c.rho for c in first} & {c.rho for c in second}
+        assert not {c.budget for c in first} & {c.budget for c in second}
     for conditions, condition in [(held_out(name), c) for name in SETS for c in held_out(name).conditions]:
         scenario = scenario_of(conditions, condition, "all-4")
-        assert condition.rho not in learn.BUDGETS
+        assert condition.budget not in learn.BUDGETS
         assert scenario.fleet.formation.shape not in learn.SHAPES
         assert scenario.perception.scene.seed not in range(1000, 10**6)
         assert (scenario.radio.tx_power_dbm, scenario.radio.path_loss_exponent) != (5, 2.4), "training's weak links"
@@ -72,8 +72,8 @@ def test_no_held_out_condition_is_one_of_training_or_of_another_set() -> None:
 
 def test_an_unknown_field_of_a_condition_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
-    path.write_text(SMALL.replace("rho: 0.02", "rho: 2"))
-    with pytest.raises(ScenarioError, match=r"conditions\.0\.rho"):
+    path.write_text(SMALL.replace("budget: 0.02", "budget: 2"))
+    with pytest.raises(ScenarioError, match=r"conditions\.0\.budget"):
         load_conditions(path)
     path.write_text(SMALL.replace("name: rich", "name: poor"))
     with pytest.raises(ScenarioError, match="'poor', must be named once"):
@@ -233,7 +233,7 @@ def test_the_tables_fit_a_narrow_terminal() -> None:
     policies = list(POLICIES)
     cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in conditions.conditions]
     tables = list(commands._by_condition(conditions, policies, cells, 80))
-    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("condition", "rho")] == policies
+    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("condition", "budget")] == policies
     console = Console(width=80, record=True, file=io.StringIO())
     for table in tables:
         console.print(table)

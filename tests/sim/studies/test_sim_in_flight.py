@@ -76,7 +76,7 @@ def test_a_set_is_flown_condition_by_condition_within_its_budgets(monkeypatch: p
     flown = []
 
     def fly(scenario: Scenario, policy: None, seed: int, *, detector_of: object) -> SortieRecord:
-        flown.append((scenario.policy.name, scenario.policy.params.get("rho"), seed))
+        flown.append((scenario.policy.name, scenario.policy.params.get("received_budget"), seed))
         return run_sortie(scenario.model_copy(update={"duration_s": 1.0}), policy, seed)
 
     monkeypatch.setattr("sortie.sim.studies.in_flight.run_sortie", fly)
@@ -85,7 +85,7 @@ def test_a_set_is_flown_condition_by_condition_within_its_budgets(monkeypatch: p
     conditions = load_conditions("conditions")
     assert conditions is not None
     assert told[-1] == ("conditions by both detectors", 2 * len(conditions.conditions), 2 * len(conditions.conditions))
-    assert flown[2:4] == [("all-4", conditions.conditions[0].rho, conditions.seeds[0])] * 2
+    assert flown[2:4] == [("all-4", conditions.conditions[0].budget, conditions.seeds[0])] * 2
     assert {v.condition for v in found} == {c.name for c in conditions.conditions}
     assert all(v.torch == v.surrogate for v in found)
 

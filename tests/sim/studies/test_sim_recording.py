@@ -61,7 +61,7 @@ def test_sharing_gains_over_silence_on_a_recording(tmp_path: Path) -> None:
     """The made model sees 45 m far, so that peers know cars that the ego does not; and the same flight twice is the same."""
     path = record_flight(example(*SHORT), tmp_path / "flight.npz", features=False)
     flight = (*SHORT, RECORDED, f"perception.recording={path}")
-    sharing = example(*flight, "policy.name=all-4", "policy.params={rho: 0.05}")
+    sharing = example(*flight, "policy.name=all-4", "policy.params={received_budget: 0.05}")
     silent = example(*flight, "policy.name=silence", "policy.params={}")
     rows, _ = compare([Contender("silence", silent), Contender("all-4", sharing)], [silent.seed])
     _, low, _ = rows[1].gain["full_scene"] or (0.0, 0.0, 0.0)
