@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from sortie.policies.catalogue import adaptive, baselines
 from sortie.policies.catalogue.deputies import deputies
-from sortie.policies.catalogue.prior import METHODS
+from sortie.policies.catalogue.prior import METHODS, STAND_IN
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
@@ -77,6 +77,10 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
     if name.endswith(".py"):
         raise PolicyError(f"policy file {name!r} without its function, must be {name}:function")
     function = _from_file(name) if ":" in name else POLICIES.get(name)
+    if function is None and (stand_in := METHODS.get(name + STAND_IN)) is not None:
+        raise PolicyError(
+            f"policy {name!r} is here as a stand-in alone, name it {stand_in.name}; it lacks {stand_in.missing}"
+        )
     if function is None:
         near = difflib.get_close_matches(name, POLICIES, 1)
         hint = f", did you mean {near[0]}?" if near else ","
@@ -112,6 +116,12 @@ def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> in
     """Bytes that a drone under this policy sends to each peer in each frame before any payload; 0 without a handshake."""
     method = METHODS.get(name)
     return 0 if method is None else method.handshake_bytes(params or {})
+
+
+def missing_parts(name: str) -> str:
+    """What a published method has and its stand-in under this name lacks; empty for every other policy."""
+    method = METHODS.get(name)
+    return "" if method is None else method.missing
 
 
 def own_fusion(name: str) -> str | None:

@@ -108,7 +108,7 @@ def method_table(views: Sequence[FleetView], everything: Iterable[Callable[..., 
         axes, decided = observe(method.policy, views)
         if not decided and method.fusion is not None:
             decided = frozenset({"fusion wts"})
-        rows.append(_row(method.title, Observed(axes, decided)))
+        rows.append(_row(method.name, Observed(axes, decided)))
     seen = [observe(policy, views) for policy in everything]
     plane = Observed(frozenset().union(*(o.axes for o in seen)), frozenset().union(*(o.decisions for o in seen)))
     return "\n".join([*rows, _row("Context plane", plane)]) + "\n"

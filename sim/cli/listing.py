@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sortie.perception.detectors import DETECTORS
-from sortie.policies.registry import POLICIES, parameters
+from sortie.policies.registry import POLICIES, missing_parts, parameters
 from sortie.scenarios.reading.load import campaigns, library, load
 from sortie.scenarios.schema import json_schema
 from sortie.sim.cli.console import out
@@ -26,7 +26,8 @@ def list_(
         for name, function in POLICIES.items():
             defaults = ", ".join(f"{k}={v}" for k, v in parameters(function).items())
             summary = (function.__doc__ or "").strip().splitlines()[0]
-            out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}", soft_wrap=True)
+            missing = f" Missing: {missing_parts(name)}." if missing_parts(name) else ""
+            out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}{missing}", soft_wrap=True)
     elif what == "scenarios":
         for name, path in library().items():
             out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)

@@ -20,7 +20,7 @@ from sortie.sim.studies.compare import pair_up
 SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
 BUDGET = 0.1
 """Of a map on each link: five drones' links of it fit into the channel."""
-POLICIES = ("worked", "who2com", "deputies")
+POLICIES = ("worked", "who2com-style", "deputies")
 LIES = (("coverage", "much"), ("coverage", "little"), ("goodput", "little"), ("battery", "much"))
 
 

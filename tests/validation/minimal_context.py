@@ -1,6 +1,6 @@
 """How small the descriptor can be: AP against context bytes, one knob at a time and together: `python tests/validation/minimal_context.py`.
 
-Policies that read the context (`deputies`, `where2comm`, `who2com`) fly the same sorties with descriptors of several
+Policies that read the context (`deputies` and `who2com-style`) fly the same sorties with descriptors of several
 forms. Bytes are those that went on the air, authentication included; AP is by the surrogate detector.
 """
 
@@ -18,7 +18,7 @@ from sortie.sim.results.record import SortieRecord
 from sortie.sim.studies.compare import pair_up
 
 SCENARIO = "track_target"
-POLICIES = ("deputies", "who2com")
+POLICIES = ("deputies", "who2com-style")
 FORMS: dict[str, tuple[str, ...]] = {
     "the paper's": (),
     "grid 8 × 8": ("context.form=grid_8",),

@@ -23,7 +23,7 @@ def lie(about: str = "coverage", claim: str = "much", until_s: str = "") -> str:
     return f"events=[{{kind: lie, at_s: 1, drone: 1, about: {about}, claim: {claim}{until_s}}}]"
 
 
-def flown(*overrides: str, policy: str = "who2com") -> SortieRecord:
+def flown(*overrides: str, policy: str = "who2com-style") -> SortieRecord:
     settings = (f"policy.name={policy}", f"policy.params={within_budget(resolve(policy), 0.05)}", SEARCH)
     return run_sortie(example(*settings, *overrides))
 
@@ -35,7 +35,7 @@ def links(record: SortieRecord, since_s: float) -> set[tuple[int, int]]:
 
 
 def test_a_liar_takes_everyones_place_until_it_is_found_out() -> None:
-    """Under Who2com each drone is served by one other. All believe that drone 1 is it, which serves where it truly is."""
+    """Under the stand-in for Who2com each drone is served by one other. All believe that drone 1 is it, which serves where it truly is."""
     honest, fooled, trusting = (
         flown(*more, "duration_s=10") for more in ((), (lie(), "context.trust=false"), (lie(),))
     )  # fmt: skip
@@ -72,7 +72,7 @@ def test_trust_comes_back_after_the_lie() -> None:
     assert outcome(record)["distrusted_by"] == {"1": 4}
 
 
-@pytest.mark.parametrize("policy", ["worked", "all-4", "deputies", "where2comm"])
+@pytest.mark.parametrize("policy", ["worked", "all-4", "deputies", "where2comm-style"])
 def test_honest_fleets_doubt_nobody_and_fly_as_without_trust(policy: str) -> None:
     """With a jammer, a lost drone, a battery fault and links that break: none of it is a lie."""
     events = (

@@ -46,7 +46,7 @@ class DiscoNet(PerCell):
     """Softmax over agents per cell; a link's weight multiplies its softmax weight."""
 
     name = "disconet"
-    about = "an edge network's softmax over agents, cell by cell (DiscoNet)"
+    about = "an edge network's softmax over agents, cell by cell (DiscoNet, without its distillation)"
 
     def __init__(self) -> None:
         super().__init__()

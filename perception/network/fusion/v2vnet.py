@@ -26,7 +26,7 @@ class V2VNet(Fusion):
     """
 
     name = "v2vnet"
-    about = f"{ROUNDS} rounds of convolved messages into a convolutional GRU (V2VNet)"
+    about = f"{ROUNDS} rounds of convolved messages into a convolutional GRU (V2VNet, without its delay network)"
     reach_cells = 3 * ROUNDS
     """A round reads one cell further by the message and two by the GRU."""
 

@@ -28,7 +28,7 @@ class Where2comm(PerCell):
     """
 
     name = "where2comm"
-    about = "attention over agents cell by cell, confidence as the prior (Where2comm)"
+    about = "attention over agents cell by cell, a linear confidence as the prior (Where2comm, without its calibrated confidence)"
 
     def __init__(self) -> None:
         super().__init__()

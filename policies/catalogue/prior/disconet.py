@@ -1,4 +1,4 @@
-"""DiscoNet (Li et al., NeurIPS 2021): full maps to every peer; its edge network weights agents cell by cell."""
+"""DiscoNet-style (Li et al., NeurIPS 2021): full maps to every peer; its edge network weights agents cell by cell."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from sortie.policies.contract import Directive, FleetView
 
 
 def disconet(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
-    """DiscoNet: full maps to every peer, no context read; weights come from its edge network (fusion disconet)."""
-    return [full_sharing(view.ego, p, rho, "DiscoNet: everyone, weights in the network") for p in view.peers]
+    """DiscoNet-style: full maps to every peer, no context read; weights come from its edge network (fusion disconet)."""
+    return [full_sharing(view.ego, p, rho, "everyone, weights in the network") for p in view.peers]

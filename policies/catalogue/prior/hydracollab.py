@@ -27,10 +27,10 @@ def hydracollab(view: FleetView, *, rho: float = 1.0, threshold: float = AGREEME
         both, joint = mine & theirs, mine | theirs
         agreement = len(both) / len(joint) if joint else 0.0
         if both and agreement >= threshold:
-            why = f"HydraCollab: both confident, {agreement:.2f}"
+            why = f"both confident, {agreement:.2f}"
             directives.append(full_sharing(view.ego, peer, rho, why)._replace(roi=disc_around(both)))
         else:
-            why = f"HydraCollab: one confident, {agreement:.2f}"
+            why = f"one confident, {agreement:.2f}"
             region = disc_around((mine - theirs) or centre_cell(me))
             late = full_sharing(view.ego, peer, 0.0, why)
             directives.append(late._replace(representation=Representation.DETECTIONS, roi=region))

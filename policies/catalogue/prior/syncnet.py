@@ -1,4 +1,4 @@
-"""SyncNet (Lei et al., ECCV 2022): the delay of a peer's features decides their weight.
+"""SyncNet-style (Lei et al., ECCV 2022): the delay of a peer's features decides their weight.
 
 The method predicts a late peer's present features by a recurrent network. Here late maps are moved by the known ego
 motion instead (`perception.motion_compensation`). Their weight falls with the delay that follows from the link's goodput.
@@ -19,7 +19,7 @@ STEPS = 4
 
 
 def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED_FOR_S) -> list[Directive]:
-    """SyncNet: full maps to every peer, weighted by the delay that follows from the link's goodput."""
+    """SyncNet-style: full maps to every peer, weighted by the delay that follows from the link's goodput."""
     me = view.me
     if me is None:
         return []
@@ -28,6 +28,6 @@ def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED
         goodput_mbps = me.goodput_to(peer)
         delay_s = rho * FEATURE_MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
         weight = max(1, round(STEPS * exp(-delay_s / trusted_for_s))) / STEPS
-        why = f"SyncNet: {delay_s:.1g} s late"
+        why = f"{delay_s:.1g} s late"
         directives.append(full_sharing(view.ego, peer, rho, why)._replace(fusion_weight=weight))
     return directives

@@ -1,4 +1,4 @@
-"""V2VNet (Wang et al., ECCV 2020): full maps to every peer; it only decides in its fusion network."""
+"""V2VNet-style (Wang et al., ECCV 2020): full maps to every peer; it only decides in its fusion network."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from sortie.policies.contract import Directive, FleetView
 
 
 def v2vnet(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
-    """V2VNet: full maps to every peer, no context read; weights come from message passing (fusion v2vnet)."""
-    return [full_sharing(view.ego, p, rho, "V2VNet: everyone, weights in the network") for p in view.peers]
+    """V2VNet-style: full maps to every peer, no context read; weights come from message passing (fusion v2vnet)."""
+    return [full_sharing(view.ego, p, rho, "everyone, weights in the network") for p in view.peers]

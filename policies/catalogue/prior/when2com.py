@@ -1,4 +1,4 @@
-"""When2com (Liu et al., CVPR 2020): attention decides whether to communicate and with whom.
+"""When2com-style (Liu et al., CVPR 2020): attention decides whether to communicate and with whom.
 
 A query of 32 floats goes to every peer, and each answers with its score. Links with an attention above a threshold are
 kept. The attention includes the drone itself; if it dominates, nobody sends. Coverage grids replace learned keys and
@@ -24,7 +24,7 @@ MATCH_BYTES = 32 * 4 + 4
 def when2com(
     view: FleetView, *, rho: float = 1.0, threshold: float = KEPT_ABOVE, sharpness: float = SHARPNESS
 ) -> list[Directive]:
-    """When2com: full maps to the peers whose attention on the ego, against all others and themselves, is high enough."""
+    """When2com-style: full maps to the peers whose attention on the ego, against all others and themselves, is high enough."""
     if view.me is None:
         return []
     directives = []
@@ -32,7 +32,7 @@ def when2com(
         scores = scores_for(view, peer)
         mass = 1.0 + sum(exp(sharpness * s) for s in scores.values())
         attention = exp(sharpness * scores[view.ego]) / mass
-        why = f"When2com: attention {attention:.2f} " + (">" if attention > threshold else "≤") + f" {threshold:g}"
+        why = f"attention {attention:.2f} " + (">" if attention > threshold else "≤") + f" {threshold:g}"
         kept = full_sharing(view.ego, peer, rho, why) if attention > threshold else nothing(view.ego, peer, why)
         directives.append(kept)
     return directives

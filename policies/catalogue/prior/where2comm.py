@@ -1,4 +1,4 @@
-"""Where2comm (Hu et al., NeurIPS 2022): send the cells that matter, by confidence.
+"""Where2comm-style (Hu et al., NeurIPS 2022): send the cells that matter, by confidence.
 
 Coverage grids replace its confidence maps: a drone is confident where it sees well. In the first round a sender uses
 its own confidence alone. In later rounds it also uses the receiver's request, the cells where the receiver lacks
@@ -20,7 +20,7 @@ REQUEST_MAP_BYTES = FEATURE_CELLS * 2
 
 
 def where2comm(view: FleetView, *, rho: float = 1.0, rounds: int = 1) -> list[Directive]:
-    """Where2comm: features of where the ego is confident, from round 2 on of what the peer lacks there; to every peer."""
+    """Where2comm-style: features of where the ego is confident, from round 2 on of what the peer lacks there; to every peer."""
     me = view.me
     if me is None:
         return []
@@ -30,7 +30,7 @@ def where2comm(view: FleetView, *, rho: float = 1.0, rounds: int = 1) -> list[Di
         wanted = confident if rounds < 2 else confident - seen_well(view.descriptors[peer])
         # the method does not decide topology: a link without wanted cells carries one coverage cell
         region = disc_around(wanted or centre_cell(me))
-        why = f"Where2comm: {len(wanted)} cells " + ("confident" if rounds < 2 else "asked for")
+        why = f"{len(wanted)} cells " + ("confident" if rounds < 2 else "asked for")
         directives.append(full_sharing(view.ego, peer, rho, why)._replace(roi=region))
     return directives
 

@@ -23,8 +23,8 @@ def test_every_method_flies_in_a_comparison() -> None:
     )
     sent = {r.policy: r.outcome["bytes"]["data_sent"] for r in rows}
     assert all(sent.values())
-    assert sent["fixed-compression"] < sent["where2comm"] < sent["v2vnet"] == sent["disconet"]
-    assert sent["who2com"] < sent["disconet"]
+    assert sent["fixed-compression"] < sent["where2comm-style"] < sent["v2vnet-style"] == sent["disconet-style"]
+    assert sent["who2com-style"] < sent["disconet-style"]
 
 
 @pytest.mark.filterwarnings("error")
@@ -47,7 +47,7 @@ def test_where_there_is_nothing_to_find_there_is_no_gain() -> None:
 
 def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
     plain, asking = (
-        run_sortie(example("policy.name=where2comm", f"policy.params={{rho: 0.02, rounds: {rounds}}}"))
+        run_sortie(example("policy.name=where2comm-style", f"policy.params={{rho: 0.02, rounds: {rounds}}}"))
         for rounds in (1, 2)
     )
     sent = asking.tables["transmissions"]
@@ -64,9 +64,11 @@ def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
 
 
 def test_a_handshake_is_no_payload() -> None:
-    """Who2com serves each drone by one other: whatever is asked of the rest, only its maps are fused."""
+    """The stand-in for Who2com serves each drone by one other: whatever is asked of the rest, only its maps are fused."""
     record = run_sortie(
-        example("policy.name=who2com", "policy.params={rho: 0.05}", "perception.detector=surrogate", "duration_s=3")
+        example(
+            "policy.name=who2com-style", "policy.params={rho: 0.05}", "perception.detector=surrogate", "duration_s=3"
+        )
     )
     kinds = {k for ks in record.tables["fusions"]["representations"].to_pylist() for k in ks}
     assert kinds == {"features"}
@@ -75,17 +77,17 @@ def test_a_handshake_is_no_payload() -> None:
 
 @pytest.mark.slow
 def test_own_fusion_flies_the_methods_own_network(tmp_path: Path) -> None:
-    """V2VNet and DiscoNet send alike; with their own fusions they see otherwise."""
+    """The stand-ins for V2VNet and DiscoNet send alike; with their own fusions they see otherwise."""
 
     def seen(*more: str) -> dict[str, float]:
         path = tmp_path / "outcomes.json"
         settings = ["duration_s=1.5", "perception.detector=torch", "mission.phases=[{at_s: 0, phase: search}]"]
         flags = [arg for s in settings for arg in ("--set", s)]
-        command = ["compare", "track_target", "--policies", "v2vnet(rho=0.02),disconet(rho=0.02)"]
+        command = ["compare", "track_target", "--policies", "v2vnet-style(rho=0.02),disconet-style(rho=0.02)"]
         done = CliRunner().invoke(app, [*command, *flags, "--out", str(path), *more])
         assert done.exit_code == 0, done.output
         return {name: o["ap50"]["full_scene"] for name, o in json.loads(path.read_text()).items()}
 
     one, own = seen(), seen("--own-fusion")
-    assert one["v2vnet(rho=0.02)"] == one["disconet(rho=0.02)"] == own["disconet(rho=0.02)"]
-    assert own["v2vnet(rho=0.02)"] != one["v2vnet(rho=0.02)"]
+    assert one["v2vnet-style(rho=0.02)"] == one["disconet-style(rho=0.02)"] == own["disconet-style(rho=0.02)"]
+    assert own["v2vnet-style(rho=0.02)"] != one["v2vnet-style(rho=0.02)"]

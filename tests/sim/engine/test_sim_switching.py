@@ -123,7 +123,7 @@ def test_a_command_reaches_whom_it_names() -> None:
 
 def test_a_method_takes_its_handshakes_along() -> None:
     record = run_sortie(
-        example("policy.name=when2com", "policy.params={}", "policy.changes=[{at_s: 3, name: silence}]")
+        example("policy.name=when2com-style", "policy.params={}", "policy.changes=[{at_s: 3, name: silence}]")
     )
     asked = [r["t_sent_s"] for r in rows(record, "transmissions", representation="handshake")]
     assert min(asked) < 1

@@ -152,7 +152,7 @@ def drawn(draw: Any, record: SortieRecord) -> Any:
 
 
 def test_handshakes_are_traffic_too() -> None:
-    record = run_sortie(example("duration_s=2"), "who2com")
+    record = run_sortie(example("duration_s=2"), "who2com-style")
     assert "handshake delivered" in page(record)
     assert {line.get_label() for line in drawn(report_figures._traffic, record).get_lines()} >= {"handshake delivered"}
 
