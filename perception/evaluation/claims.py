@@ -1,15 +1,19 @@
 """Every claim of the paper's Evaluation section as data: its text, how it is measured here, and the rule that judges it.
 
 AP differences are in points, absolute APs from 0 to 1, both as the paper prints them. Where a policy is "the best
-two-peer policy" it is the best of best-2, worst-2 and random-2 at that budget, as in the paper. Claims marked
-`follows` are not sentences of the paper but arithmetic on its sentences. The paper's conditions: unsent cells are
-zeros, cells by confidence, a budget's cells not steered by the mission's region.
+two-peer policy" it is the best of best-2, worst-2 and random-2 at that budget, as in the paper. The paper's conditions:
+unsent cells are zeros, cells by confidence, a budget's cells not steered by the mission's region.
+
+Several claims can state one effect: a contrast and its mirror, a contrast told twice, one sentence over four budgets, or a
+consequence of other claims. They bear the name of that effect (`Claim.effect`), and the effect is counted once. What
+follows from definitions or by arithmetic is no effect (`Claim.kind`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 
 from sortie.perception.evaluation import verdict
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
@@ -34,8 +38,28 @@ from sortie.perception.evaluation.verdict import Judgement, MeasuredValue, Paper
 CURVE = (0.01, 0.02, 0.05, 0.1, 0.25, 1.0)
 BUDGETS = (0.02, 0.05, 0.1, 0.25)
 TWO_PEERS = ("best-2", "worst-2", "random-2")
+MARGIN: dict[Region, float] = {"full": 1.2, "mission": 2.8}
+"""AP points within which two ways count as equal. Half the width of the narrowest interval by which the paper itself finds no
+difference there: smaller differences it could not have told from none. The least differences that it reports as findings are
+larger, 1.4 points in the full scene and 5.9 in the mission's disc."""
+KEPT_MARGIN = 7.0
+"""Per cent of the gain within which two shares of it count as equal: half the width of the paper's interval of a difference
+from full sharing, 1.3 points, over its gain of 18.5."""
 
 Rule = Callable[[Paper, MeasuredValue | None], Judgement]
+
+
+class Kind(StrEnum):
+    """What a claim is about; each kind is counted apart."""
+
+    EFFECT = "effect"
+    """How AP depends on what is shared: what an experiment can find or not."""
+    ARITHMETIC = "arithmetic"
+    """Follows from definitions, wire sizes or other figures of the paper."""
+    LEVEL = "level"
+    """An absolute AP, which is not judged."""
+    COST = "cost"
+    """A time, a rate or a reaction of the context plane in flight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +80,19 @@ class Claim:
     """Whether it stands in the README's short table."""
     follows: bool = False
     """Arithmetic on the paper's figures, not a sentence of it."""
+    defined: bool = False
+    """A sentence of the paper that follows from definitions, wire sizes or its other figures."""
+    effect: str = ""
+    """The effect that it states; empty: one of its own."""
+
+    @property
+    def kind(self) -> Kind:
+        """Decides where it is counted."""
+        if self.rule is verdict.level:
+            return Kind.LEVEL
+        if self.follows or self.defined:
+            return Kind.ARITHMETIC
+        return Kind.COST if isinstance(self.measure, Elsewhere) else Kind.EFFECT
 
 
 def all_4(rho: float) -> Sharing:
@@ -89,7 +126,7 @@ POINTS, AP = "AP points", "AP"
 SET_UP = (
     Claim(
         "bytes.full", "set-up, 6", "Full sharing sends 13.1 MB a fleet-frame", "MB",
-        Paper(13.1), FleetFrameBytes(FULL_SHARING), verdict.exact,
+        Paper(13.1), FleetFrameBytes(FULL_SHARING), verdict.exact, defined=True,
     ),
 )  # fmt: skip
 
@@ -110,7 +147,7 @@ GAIN = (
     ),
     Claim(
         "kept.0.05", "gain, 6", "ρ = 0.05 keeps, of the gain", "%",
-        Paper(58.0, digits=0), Kept(all_4(0.05)), headline=True,
+        Paper(58.0, margin=KEPT_MARGIN, digits=0), Kept(all_4(0.05)), verdict.same_value, headline=True,
     ),
     Claim(
         "curve.0.05", "gain, 6", "ρ = 0.05 against full sharing", POINTS,
@@ -138,12 +175,14 @@ MISSION = (
     Claim("mission.0.1", "mission, 2", "Mission AP at ρ = 0.1", AP, Paper(0.784, digits=3), ApOf(all_4(0.1), "mission"), verdict.level),
     Claim(
         "mission.widest", "mission, 3", "Mission AP at ρ 0.05–0.1, widest from full sharing", POINTS,
-        Paper(2.2, -0.5, 5.1, significant=False),
-        Widest((_against_full(0.05, "mission"), _against_full(0.1, "mission"))), headline=True,
+        Paper(2.2, -0.5, 5.1, MARGIN["mission"]),
+        Widest((_against_full(0.05, "mission"), _against_full(0.1, "mission"))), verdict.no_difference, headline=True,
+        effect="mission under a budget",
     ),
     Claim(
         "mission.tenth", "mission, 4", "Mission AP at ρ = 0.1 against full sharing", POINTS,
-        Paper(significant=False), _against_full(0.1, "mission"),
+        Paper(margin=MARGIN["mission"]), _against_full(0.1, "mission"), verdict.no_difference,
+        effect="mission under a budget",
     ),
     Claim(
         "mission.peak", "figure, a", "Mission AP peaks at 5–10 % of the bytes", "%",
@@ -154,23 +193,24 @@ MISSION = (
 PEERS = (
     Claim(
         "matched", "peers, 2", "Matched policies differ in bytes by", "%",
-        Paper(0.0), UnequalBytes(POLICIES), verdict.exact,
+        Paper(0.0), UnequalBytes(POLICIES), verdict.exact, defined=True,
     ),
     Claim(
         "peers.worst-best", "peers, 3", "ρ = 0.25: worst-2 − best-2", POINTS,
-        Paper(0.8, -0.8, 2.3, significant=False), _pair(0.25, "worst-2", "best-2"), headline=True,
+        Paper(0.8, -0.8, 2.3, MARGIN["full"]), _pair(0.25, "worst-2", "best-2"), verdict.no_difference, headline=True,
     ),
     Claim(
         "peers.worst-random", "peers, 3", "ρ = 0.25: worst-2 − random-2", POINTS,
-        Paper(0.1, -1.1, 1.3, significant=False), _pair(0.25, "worst-2", "random-2"),
+        Paper(0.1, -1.1, 1.3, MARGIN["full"]), _pair(0.25, "worst-2", "random-2"), verdict.no_difference,
     ),
     Claim(
         "peers.best-random", "peers, 3", "ρ = 0.25: best-2 − random-2", POINTS,
-        Paper(-0.7, significant=False), _pair(0.25, "best-2", "random-2"), follows=True,
+        Paper(-0.7, margin=MARGIN["full"]), _pair(0.25, "best-2", "random-2"), verdict.no_difference, follows=True,
     ),
     Claim(
         "peers.all", "peers, 6", "ρ = 0.25: all four over the best two", POINTS,
         Paper(4.8, 3.8, 5.8), Contrast((all_4(0.25),), two(0.25)), headline=True,
+        effect="two or four at ρ = 0.25",
     ),
 )  # fmt: skip
 
@@ -179,41 +219,51 @@ FLIP = (
     Claim(
         "flip.0.02", "budget, 2", "ρ = 0.02: the best two over all four", POINTS,
         Paper(7.7, 6.6, 8.9), _CONCENTRATING[0], headline=True,
+        effect="two or four at ρ = 0.02",
     ),
     Claim(
         "flip.0.05", "budget, 3", "ρ = 0.05: the best two over all four", POINTS,
         Paper(1.4, 0.2, 2.7), _CONCENTRATING[1], headline=True,
+        effect="two or four at ρ = 0.05",
     ),
     Claim(
         "flip.0.1", "budget, 5", "ρ = 0.1: the best two over all four", POINTS,
         Paper(-4.0, -5.3, -2.8), _CONCENTRATING[2], headline=True,
+        effect="two or four at ρ = 0.1",
     ),
-    Claim("flip.0.25", "budget, 6", "ρ = 0.25: the best two over all four", POINTS, Paper(-4.8, -5.8, -3.8), _CONCENTRATING[3]),
+    Claim(
+        "flip.0.25", "budget, 6", "ρ = 0.25: the best two over all four", POINTS,
+        Paper(-4.8, -5.8, -3.8), _CONCENTRATING[3], effect="two or four at ρ = 0.25",
+    ),
     Claim(
         "flip.crossover", "budget, 7", "The lead changes between 5 and 10 % of the bytes, at", "%",
         Paper(low=5.0, high=10.0, digits=0), Crossover(_CONCENTRATING), verdict.same_place, headline=True,
+        effect="choosing by budget",
     ),
     Claim(
         "wrong.starved", "budget, 9", "The winner at ρ = 0.25, used at 0.02, loses", POINTS,
         Paper(-7.7), WrongChoice(POLICIES, chosen_at=3, judged_at=0), headline=True,
+        effect="choosing by budget",
     ),
     Claim(
         "wrong.plentiful", "budget, 9", "The winner at ρ = 0.02, used at 0.25, loses", POINTS,
         Paper(-4.8), WrongChoice(POLICIES, chosen_at=0, judged_at=3), headline=True,
+        effect="choosing by budget",
     ),
     Claim("oracle.level", "budget, 11", "Mean AP of the oracle", AP, Paper(0.320, digits=3), MeanLevel(POLICIES, fixed=False), verdict.level),
     Claim("fixed.level", "budget, 11", "Mean AP of the best fixed policy", AP, Paper(0.299, digits=3), MeanLevel(POLICIES, fixed=True), verdict.level),
-    Claim("oracle", "budget, 11", "The oracle over the best fixed policy", POINTS, Paper(2.1), Oracle(POLICIES), headline=True),
+    Claim("oracle", "budget, 11", "The oracle over the best fixed policy", POINTS, Paper(2.1), Oracle(POLICIES), headline=True, effect="choosing by budget"),
     Claim(
         "oracle.held-out", "budget, 13", "The same, chosen on half of the frames, judged on the rest", POINTS,
-        Paper(2.0), Oracle(POLICIES, held_out=True), headline=True,
+        Paper(2.0), Oracle(POLICIES, held_out=True), headline=True, effect="choosing by budget",
     ),
 )  # fmt: skip
 
 ALLOCATION = tuple(
     Claim(
         f"allocation.{rho:g}", "budget, 18", f"ρ = {rho:g}: allocation by overlap − uniform", POINTS,
-        Paper(significant=False), _overlap_against_uniform(rho), headline=rho == 0.1,
+        Paper(margin=MARGIN["full"]), _overlap_against_uniform(rho), verdict.no_difference, headline=rho == 0.1,
+        effect="allocation",
     )
     for rho in BUDGETS
 )  # fmt: skip
@@ -223,7 +273,7 @@ COMPOSITION = (
     Claim("compose.worst", "composition, 2", "AP of worst-2 at ρ = 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "worst-2")), verdict.level),
     Claim(
         "compose.tie", "composition, 2", "ρ = 0.02, full scene: best-2 − worst-2", POINTS,
-        Paper(0.0, significant=False), _pair(0.02, "best-2", "worst-2"), headline=True,
+        Paper(0.0, margin=MARGIN["full"]), _pair(0.02, "best-2", "worst-2"), verdict.no_difference, headline=True,
     ),
     Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at ρ = 0.02", AP, Paper(0.787, digits=3), ApOf(Sharing(0.02, "best-2"), "mission"), verdict.level),
     Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at ρ = 0.02", AP, Paper(0.728, digits=3), ApOf(Sharing(0.02, "worst-2"), "mission"), verdict.level),
@@ -233,19 +283,19 @@ COMPOSITION = (
     ),
     Claim(
         "compose.spread", "composition, 7", "ρ = 0.05, mission: all four over the best two", POINTS,
-        Paper(3.1, -0.6, 7.0, significant=False), Contrast((all_4(0.05),), two(0.05), "mission"), headline=True,
+        Paper(3.1, -0.6, 7.0, MARGIN["mission"]), Contrast((all_4(0.05),), two(0.05), "mission"), verdict.no_difference, headline=True,
     ),
 )  # fmt: skip
 
 OVERHEAD = (
-    Claim("plane.descriptor", "overhead, 3", "A descriptor", "B", Paper(180.0, digits=0), Elsewhere("descriptor_bytes"), verdict.exact),
-    Claim("plane.counted", "overhead, 3", "Four descriptors at 10 Hz and 80 directives a second, by the wire's sizes", "kB/s", Paper(10.1), Elsewhere("counted_kb_per_s"), verdict.exact, headline=True),
+    Claim("plane.descriptor", "overhead, 3", "A descriptor", "B", Paper(180.0, digits=0), Elsewhere("descriptor_bytes"), verdict.exact, defined=True),
+    Claim("plane.counted", "overhead, 3", "Four descriptors at 10 Hz and 80 directives a second, by the wire's sizes", "kB/s", Paper(10.1), Elsewhere("counted_kb_per_s"), verdict.exact, headline=True, defined=True),
     Claim("plane.rate", "overhead, 3", "Context plane as flown", "kB/s", Paper(10.1), Elsewhere("context_kb_per_s"), verdict.same_order),
     Claim("plane.data", "overhead, 4", "Data plane that it steers", "MB/s", Paper(105.0, digits=0), Elsewhere("data_mb_per_s"), verdict.same_order),
-    Claim("plane.share", "overhead, 5", "Context over data", "%", Paper(0.01, digits=2), Elsewhere("context_percent"), verdict.at_most, headline=True),
+    Claim("plane.share", "overhead, 5", "Context over data", "%", Paper(0.01, digits=2), Elsewhere("context_percent"), verdict.at_most, headline=True, defined=True),
     Claim("plane.median", "overhead, 6", "A policy decision, median", "ms", Paper(0.10, digits=2), Elsewhere("policy_ms_p50"), verdict.at_most, headline=True),
     Claim("plane.p99", "overhead, 6", "A policy decision, 99th percentile", "ms", Paper(0.13, digits=2), Elsewhere("policy_ms_p99"), verdict.at_most),
-    Claim("plane.deadline", "overhead, 7", "The 100 ms deadline over a decision's median", "×", Paper(1000.0, digits=0), Elsewhere("deadline_over_p50"), verdict.at_least),
+    Claim("plane.deadline", "overhead, 7", "The 100 ms deadline over a decision's median", "×", Paper(1000.0, digits=0), Elsewhere("deadline_over_p50"), verdict.at_least, defined=True),
     Claim("plane.core", "overhead, 8", "Of one core, the ROS 2 prototype uses", "%", Paper(9.0, digits=0), Elsewhere("ros2_core_percent"), verdict.at_most),
     Claim("plane.x86.data", "overhead, 9", "Data plane in an x86 container", "MB/s", Paper(62.0, digits=0), Elsewhere("x86_container_mb_per_s"), verdict.same_order),
     Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("x86_policy_ms_p50"), verdict.at_most),

@@ -23,6 +23,7 @@ COLOURS = {"full": "#1f6fb4", "mission": "#c2571a"}
 POLICY_COLOURS = {"all-4": "#1f6fb4", "best-2": "#2a9d5c", "worst-2": "#c2571a", "random-2": "#8a63b8"}
 VERDICTS = {
     ClaimVerdict.REPRODUCED: "#2a9d5c", ClaimVerdict.NOT_REPRODUCED: "#d08a00", ClaimVerdict.OPPOSITE: "#c33a2f",
+    ClaimVerdict.INCONCLUSIVE: "#7a7f87",
 }  # fmt: skip
 DASHES = {"zero": "-", "masked": (0, (4, 2))}
 PAPER_CURVE = {

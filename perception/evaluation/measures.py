@@ -329,8 +329,8 @@ def _table_draws(policies: Policies, scores: Scores) -> Floats:
 
 
 def _interval(value: float, draws: Floats, note: str = "", *, test: bool = True) -> MeasuredValue:
-    """The value with its 95 % percentile interval, and the two-sided level at which zero leaves it."""
+    """The value with its 95 % and 90 % percentile intervals, and the two-sided level at which zero leaves the interval."""
     if not np.isfinite(draws).any():
         return MeasuredValue(value, note=note)
-    low, high = interval(draws)
-    return MeasuredValue(value, low, high, p_value(draws) if test else None, note)
+    p = p_value(draws) if test else None
+    return MeasuredValue(value, *interval(draws), *interval(draws, 0.90), p, note)

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow
+from sortie.perception.evaluation.claims import Kind
+from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, effects
 from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.evaluation.verdict import ClaimVerdict
 from sortie.scenarios.report_text import fixed, interval, picture, signed, table
@@ -30,7 +31,7 @@ def figure(value: float | None, low: float | None, high: float | None, unit: str
 def papers(row: ClaimRow) -> str:
     """What the paper prints."""
     text = figure(row.paper_value, row.paper_low, row.paper_high, row.unit, row.digits)
-    if row.rule == "contrast" and not row.paper_significant:
+    if row.rule == "no_difference":
         return "n.s." if row.paper_value is None else f"{text} n.s."
     return f"({text})" if row.follows and text != "–" else text
 
@@ -39,25 +40,52 @@ def ours(row: ClaimRow) -> str:
     """What we measured."""
     if row.value is None:
         return "none" if row.verdict == ClaimVerdict.NOT_REPRODUCED else "–"
-    small = row.rule != "contrast" and 0 < abs(row.value) < 10.0 ** -_DECIMALS[row.unit]
+    difference = row.rule in ("contrast", "no_difference")
+    small = not difference and 0 < abs(row.value) < 10.0 ** -_DECIMALS[row.unit]
     text = f"{row.value:.1g}{_suffix(row.unit)}" if small else figure(row.value, row.low, row.high, row.unit)
     contains_zero = row.low is not None and row.high is not None and row.low <= 0 <= row.high
-    return f"{text} n.s." if row.rule == "contrast" and contains_zero else text
+    return f"{text} n.s." if difference and contains_zero else text
 
 
 def verdict(row: ClaimRow) -> str:
-    """The verdict, and how the sizes compare."""
+    """The verdict, the margin of a claim of a value, and how the sizes compare."""
     mark = {
         ClaimVerdict.REPRODUCED: "**reproduced**",
         ClaimVerdict.NOT_REPRODUCED: "*not reproduced*",
         ClaimVerdict.OPPOSITE: "*opposite*",
+        ClaimVerdict.INCONCLUSIVE: "*inconclusive*",
     }.get(ClaimVerdict(row.verdict), row.verdict)
+    if row.margin is not None:
+        mark = f"{mark} (±{row.margin:g})"
     return f"{mark}, {row.size}" if row.size and row.rule != "exact" else mark
 
 
 def tally(rows: Iterable[ClaimRow]) -> str:
-    """How many claims got which verdict."""
-    count = Counter(row.verdict for row in rows)
+    """How many independent effects stand under one instrument, and what is counted apart."""
+    rows = list(rows)
+    found = effects(rows)
+    parts = []
+    if found:
+        stand = sum(v == ClaimVerdict.REPRODUCED for v in found.values())
+        rest = _count(v for v in found.values() if v != ClaimVerdict.REPRODUCED)
+        parts.append(f"{stand} of {len(found)} independent effects stand" + (f" ({rest})" if rest else ""))
+    for kind, name in _APART.items():
+        verdicts = [ClaimVerdict(r.verdict) for r in rows if r.kind == kind]
+        if verdicts:
+            parts.append(f"{name}: {_count(verdicts)}")
+    return "; ".join(parts)
+
+
+_APART = {
+    Kind.COST: "costs of the context plane",
+    Kind.ARITHMETIC: "arithmetic and definitions",
+    Kind.LEVEL: "absolute APs",
+}
+"""What is counted apart from effects."""
+
+
+def _count(verdicts: Iterable[ClaimVerdict]) -> str:
+    count = Counter(verdicts)
     return ", ".join(f"{count[v]} {v}" for v in ClaimVerdict if count[v])
 
 
@@ -101,7 +129,8 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
     tail = [
         "",
         "AP differences in points with 95 % intervals; *ours* is the paper's instrument (cells that were not sent count "
-        "as zeros), *masked* leaves them out of the fusion, as sorties do. In brackets: arithmetic on the paper's figures.",
+        "as zeros), *masked* leaves them out of the fusion, as sorties do. In brackets: arithmetic on the paper's figures. "
+        "±: the margin of an equivalence test. An effect stands when every claim that states it is reproduced.",
         f"All claims, figures, and how each verdict is reached: [{link}]({link}).",
         "",
         END,
@@ -110,13 +139,27 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
 
 
 _RULE = """\
-**How verdicts are reached** (`perception/evaluation/verdict.py`, which says what was fixed when). A difference is
-significant when its 95 % interval leaves zero out. *Reproduced*: significant in the paper and here with the same sign,
-or in neither, or not in the paper and here wholly within half a point of zero; *opposite*: significant in both, with
-other signs; *not reproduced*: significant in one alone. The size is reported separately: the *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
-That *most* of the gain is kept asks for an interval above one half. Absolute APs are not comparable between benchmarks, as the paper says itself. Counted bytes have to round to the
-paper's print; times and rates have to lie within half an order of magnitude, or beyond it on the side that makes the
-claim stronger. Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of
+**How verdicts are reached** (`perception/evaluation/verdict.py`, which says what was fixed when).
+
+- A *difference* is significant when its 95 % interval leaves zero out. *Reproduced*: significant here with the paper's
+  sign; *opposite*: significant with the other sign; *not reproduced*: not significant. The size is reported separately: the
+  *same* when intervals overlap (or ours holds the paper's value where it prints no interval).
+- *No difference* (n.s. in the paper) and a claim of a *size* are judged by an equivalence test: two one-sided tests at 5 %.
+  *Reproduced*: the 90 % interval lies within the margin (±) around zero, or around the paper's value. *Not reproduced*:
+  it does not, and the 95 % interval leaves the value out. *Inconclusive*: anything else. The margins are 1.2 points of AP in
+  the full scene and 2.8 in the mission's disc, half the width of the narrowest interval by which the paper finds no
+  difference there; and 7 % of the gain, half the width of its interval of a difference from full sharing.
+- That *most* of the gain is kept asks for an interval above one half.
+- Absolute APs are not comparable between benchmarks, as the paper says itself.
+- Counted bytes have to round to the paper's print. Times and rates have to lie within half an order of magnitude, or beyond
+  it on the side that makes the claim stronger.
+
+**What is counted.** An *effect* is a dependence of AP on what is shared. A contrast and its mirror, a contrast told twice,
+one sentence over four budgets, and consequences of one finding are one effect. It stands when every claim that states it is
+reproduced. What follows from definitions, wire sizes or other figures of the paper is counted apart, and so are times, rates
+and reactions of the context plane. All effects are measured on the same frames, so their errors are correlated.
+
+Intervals are paired percentile bootstraps over frames, the egos of a frame together; q is the level of
 a difference adjusted by Benjamini and Hochberg over the table's differences under the same instrument, for reading
 beside the verdict, which goes by the interval as the paper's does. "The best two" is the best of best-2, worst-2 and
 random-2 at that budget, chosen on all frames, as the paper does; the choice is in no interval. In brackets: not printed

@@ -14,10 +14,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
-from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, conditions
+from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, Kind, conditions
 from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.measures import ApOf, Elsewhere, Region, Scores
-from sortie.perception.evaluation.verdict import MeasuredValue
+from sortie.perception.evaluation.verdict import ClaimVerdict, MeasuredValue
 from sortie.perception.metrics.bootstrap import benjamini_hochberg
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
@@ -37,17 +37,23 @@ class ClaimRow:
     unit: str
     headline: bool
     follows: bool
+    kind: str
+    effect: str
+    """The effect that it states, its own id if nothing else states it; empty for other kinds."""
     rule: str
     paper_value: float | None
     paper_low: float | None
     paper_high: float | None
-    paper_significant: bool
+    margin: float | None
+    """Within which a figure counts as the claimed value, for claims of no difference or of a size."""
     digits: int
     instrument: str
     """zero or masked; empty for what does not depend on it."""
     value: float | None
     low: float | None
     high: float | None
+    low_90: float | None
+    high_90: float | None
     p: float | None
     q: float | None
     """p adjusted by Benjamini and Hochberg over the table's contrasts of the same instrument."""
@@ -102,16 +108,37 @@ def judge(
     return sorted(rows, key=lambda r: place[r.id])
 
 
+_WORST_FIRST = (
+    ClaimVerdict.OPPOSITE, ClaimVerdict.NOT_REPRODUCED, ClaimVerdict.INCONCLUSIVE, ClaimVerdict.NOT_MEASURABLE,
+    ClaimVerdict.REPRODUCED,
+)  # fmt: skip
+
+
+def effects(rows: Iterable[ClaimRow]) -> dict[str, ClaimVerdict]:
+    """Every independent effect of one instrument's rows with the worst verdict of the claims that state it.
+
+    None of them is another's mirror or repetition, nor follows from others. They are measured on the same frames, so
+    their errors are correlated.
+    """
+    found: dict[str, ClaimVerdict] = {}
+    for row in rows:
+        if row.effect:
+            its = ClaimVerdict(row.verdict)
+            found[row.effect] = min(found.get(row.effect, its), its, key=_WORST_FIRST.index)
+    return found
+
+
 def differ_by_chance(rows: Iterable[ClaimRow], claims: Sequence[Claim] = CLAIMS) -> float:
     """In how many verdicts two tables of the same truth would differ on average, each made on frames of its own: every
     figure is taken to be normal about what it is here, as wide as its interval, which moves along."""
     by_id = {c.id: c for c in claims}
     expected = 0.0
     for row in rows:
-        if row.value is None or row.low is None or row.high is None or row.id not in by_id:
+        value, low, high, low_90, high_90 = row.value, row.low, row.high, row.low_90, row.high_90
+        if value is None or low is None or high is None or low_90 is None or high_90 is None or row.id not in by_id:
             continue
-        claim, wide = by_id[row.id], (row.high - row.low) / (_NORMAL[-1] - _NORMAL[0])
-        drawn = (MeasuredValue(row.value + d, row.low + d, row.high + d) for d in (wide * _DRAWS).tolist())
+        claim, wide = by_id[row.id], (high - low) / (_NORMAL[-1] - _NORMAL[0])
+        drawn = (MeasuredValue(value + d, low + d, high + d, low_90 + d, high_90 + d) for d in (wide * _DRAWS).tolist())
         count = Counter(claim.rule(claim.paper, m).verdict for m in drawn)
         expected += 1.0 - sum((n / len(_DRAWS)) ** 2 for n in count.values())
     return expected
@@ -123,10 +150,11 @@ def _row(claim: Claim, instrument: str, ours: MeasuredValue | None, q: float | N
     section = next((name for name, claims in SECTIONS.items() if claim in claims), "")
     return ClaimRow(
         id=claim.id, section=section, place=claim.place, says=claim.says, unit=claim.unit, headline=claim.headline,
-        follows=claim.follows, rule=claim.rule.__name__, paper_value=claim.paper.value, paper_low=claim.paper.low,
-        paper_high=claim.paper.high, paper_significant=claim.paper.significant, digits=claim.paper.digits,
+        follows=claim.follows, kind=str(claim.kind), effect=(claim.effect or claim.id) if claim.kind == Kind.EFFECT else "",
+        rule=claim.rule.__name__, paper_value=claim.paper.value, paper_low=claim.paper.low,
+        paper_high=claim.paper.high, margin=claim.paper.margin, digits=claim.paper.digits,
         instrument=instrument, value=None if shown.value != shown.value else shown.value, low=shown.low,
-        high=shown.high, p=shown.p, q=q, note=shown.note, verdict=str(judgement.verdict), size=str(judgement.size),
+        high=shown.high, low_90=shown.low_90, high_90=shown.high_90, p=shown.p, q=q, note=shown.note, verdict=str(judgement.verdict), size=str(judgement.size),
     )  # fmt: skip
 
 

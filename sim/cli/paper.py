@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 
 NARROW, PIPED_WIDTH = 150, 170
 """Columns of a terminal that show both instruments, and those that a pipe or file is given."""
-COLOURS = {ClaimVerdict.REPRODUCED: "green", ClaimVerdict.NOT_REPRODUCED: "yellow", ClaimVerdict.OPPOSITE: "red"}
+COLOURS = {
+    ClaimVerdict.REPRODUCED: "green",
+    ClaimVerdict.NOT_REPRODUCED: "yellow",
+    ClaimVerdict.OPPOSITE: "red",
+    ClaimVerdict.INCONCLUSIVE: "cyan",
+}
 
 
 def paper(

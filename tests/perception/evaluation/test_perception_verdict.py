@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 from sortie.perception.evaluation import verdict
 from sortie.perception.evaluation.verdict import HALF_AN_ORDER, ClaimVerdict, Judgement, MeasuredValue, Paper, Size
 
-UP, DOWN, NOTHING = Paper(4.8, 3.8, 5.8), Paper(-4.8, -5.8, -3.8), Paper(0.8, -0.8, 2.3, significant=False)
+UP, DOWN, NOTHING = Paper(4.8, 3.8, 5.8), Paper(-4.8, -5.8, -3.8), Paper(0.8, -0.8, 2.3, margin=1.0)
 R, N, O, X = ClaimVerdict.REPRODUCED, ClaimVerdict.NOT_REPRODUCED, ClaimVerdict.OPPOSITE, ClaimVerdict.NOT_MEASURABLE  # noqa: E741
+OPEN = ClaimVerdict.INCONCLUSIVE
 
 
 def m(value: float, low: float, high: float) -> MeasuredValue:
-    return MeasuredValue(value, low, high, 0.5)
+    """A normal figure: its 90 % interval is 0.84 times as wide as that of 95 %."""
+    return MeasuredValue(value, low, high, value + 0.84 * (low - value), value + 0.84 * (high - value), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -33,16 +35,10 @@ def m(value: float, low: float, high: float) -> MeasuredValue:
         (UP, m(-9.0, -9.9, -8.0), Judgement(O, Size.LARGER)),
         (DOWN, m(-5.0, -6.0, -4.0), Judgement(R, Size.SAME)),
         (DOWN, m(2.0, 1.0, 3.0), Judgement(O, Size.SMALLER)),
-        (NOTHING, m(0.2, -0.5, 0.9), Judgement(R, Size.SAME)),
-        (NOTHING, m(-2.0, -5.0, 0.1), Judgement(R, Size.SAME)),
-        (NOTHING, m(1.0, 0.5, 1.5), Judgement(N, Size.SAME)),
-        (NOTHING, m(-3.0, -4.0, -2.0), Judgement(N, Size.LARGER)),
-        (NOTHING, m(0.0, 0.0, 0.0), Judgement(R, Size.SAME)),
         (Paper(58.0), m(55.0, 50.0, 60.0), Judgement(R, Size.SAME)),  # no interval in the paper: ours holds its value
         (Paper(58.0), m(75.0, 70.0, 80.0), Judgement(R, Size.LARGER)),
         (Paper(-24.0), m(-9.0, -10.0, -8.0), Judgement(R, Size.SMALLER)),
-        (Paper(significant=False), m(1.0, -1.0, 2.0), Judgement(R)),  # no value in the paper
-        (Paper(significant=False), m(1.0, 0.5, 2.0), Judgement(N)),
+        (Paper(58.0), m(1.0, -1.0, 2.0), Judgement(N, Size.SMALLER)),
         (UP, None, Judgement(X)),
         (UP, MeasuredValue(4.8), Judgement(X)),
         (UP, m(math.nan, math.nan, math.nan), Judgement(X)),
@@ -57,27 +53,60 @@ def test_a_difference_is_judged_by_sign_and_significance(
 @pytest.mark.parametrize(
     ("ours", "expected"),
     [
+        (m(0.2, -0.5, 0.9), R),
+        (m(0.0, 0.0, 0.0), R),
         (m(0.25, 0.12, 0.38), R),  # significant, and of no weight
-        (m(-0.25, -0.49, -0.01), R),
-        (m(0.4, 0.3, 0.5), N),  # may be half a point
-        (m(-0.35, -0.6, -0.1), N),
-        (m(2.0, 1.8, 2.2), N),
+        (m(0.2, -3.0, 3.4), OPEN),  # noise shows nothing
+        (m(-2.0, -5.0, 0.1), OPEN),
+        (m(0.5, -0.1, 1.1), OPEN),  # the 90 % interval ends at 1.004
+        (m(0.5, -0.09, 1.09), R),  # and here at 0.9956
+        (m(1.0, 0.5, 1.5), N),
+        (m(-3.0, -4.0, -2.0), N),
+        (None, X),
+        (MeasuredValue(0.0), X),
+        (m(math.nan, math.nan, math.nan), X),
     ],
 )
-def test_where_the_paper_finds_none_a_difference_within_half_a_point_is_none(
-    ours: MeasuredValue, expected: ClaimVerdict
-) -> None:
-    for paper in (NOTHING, Paper(significant=False)):
-        assert verdict.contrast(paper, ours).verdict == expected
-    assert verdict.contrast(UP, ours).verdict == (R if ours.value > 0 else O)
+def test_no_difference_takes_an_equivalence_test(ours: MeasuredValue | None, expected: ClaimVerdict) -> None:
+    for paper in (NOTHING, Paper(margin=1.0)):
+        assert verdict.no_difference(paper, ours) == Judgement(expected)
+
+
+@pytest.mark.parametrize(
+    ("ours", "expected"),
+    [
+        (m(60.0, 56.0, 64.0), Judgement(R)),
+        (m(64.4, 61.0, 67.9), Judgement(N, Size.LARGER)),  # far from zero, and from what is claimed
+        (m(30.0, 20.0, 40.0), Judgement(N, Size.SMALLER)),
+        (m(58.0, 40.0, 76.0), Judgement(OPEN)),
+        (None, Judgement(X)),
+        (MeasuredValue(58.0), Judgement(X)),
+    ],
+)
+def test_a_size_is_tested_against_the_papers(ours: MeasuredValue | None, expected: Judgement) -> None:
+    assert verdict.same_value(Paper(58.0, margin=7.0), ours) == expected
+
+
+def test_a_claim_of_a_value_needs_a_margin() -> None:
+    with pytest.raises(ValueError, match="a claim of a value needs a margin"):
+        verdict.no_difference(Paper(0.0), m(0.0, -1.0, 1.0))
+
+
+@given(st.floats(-5, 5), st.floats(0.001, 10), st.floats(0.1, 3))
+def test_more_noise_never_makes_none_of_a_difference(value: float, wide: float, more: float) -> None:
+    """What a wide interval shows a narrower one about the same value shows as well."""
+    narrow, noisy = (m(value, value - w, value + w) for w in (wide, wide + more))
+    if verdict.no_difference(NOTHING, noisy).verdict == R:
+        assert verdict.no_difference(NOTHING, narrow).verdict == R
 
 
 @given(st.floats(-30, 30), st.floats(0.001, 10), st.floats(-30, 30), st.floats(0.001, 10))
 def test_signs_turned_on_both_sides_turn_nothing(a: float, wide_a: float, b: float, wide_b: float) -> None:
     def both(sign: int) -> Judgement:
         ends = sorted((sign * (a - wide_a), sign * (a + wide_a)))
-        paper = Paper(sign * a, *ends, significant=not ends[0] <= 0 <= ends[1])
-        return verdict.contrast(paper, m(sign * b, *sorted((sign * (b - wide_b), sign * (b + wide_b)))))
+        ours = m(sign * b, *sorted((sign * (b - wide_b), sign * (b + wide_b))))
+        rule = verdict.no_difference if ends[0] <= 0 <= ends[1] else verdict.contrast
+        return rule(Paper(sign * a, *ends, margin=1.2), ours)
 
     assert both(1) == both(-1)
 
@@ -85,8 +114,9 @@ def test_signs_turned_on_both_sides_turn_nothing(a: float, wide_a: float, b: flo
 @given(st.floats(-30, 30), st.floats(0.001, 10))
 def test_the_papers_own_figures_reproduce_it(value: float, wide: float) -> None:
     low, high = value - wide, value + wide
-    paper = Paper(value, low, high, significant=not low <= 0 <= high)
-    assert verdict.contrast(paper, m(value, low, high)) == Judgement(R, Size.SAME)
+    if not low <= 0 <= high:
+        assert verdict.contrast(Paper(value, low, high), m(value, low, high)) == Judgement(R, Size.SAME)
+    assert verdict.same_value(Paper(value, margin=wide), m(value, low, high)) == Judgement(R)
 
 
 @pytest.mark.parametrize(
