@@ -95,30 +95,30 @@ class Claim:
         return Kind.COST if isinstance(self.measure, Elsewhere) else Kind.EFFECT
 
 
-def all_4(rho: float) -> Sharing:
+def all_4(budget: float) -> Sharing:
     """Spreading: every peer shares."""
-    return Sharing(rho)
+    return Sharing(budget)
 
 
-def two(rho: float) -> tuple[Sharing, ...]:
+def two(budget: float) -> tuple[Sharing, ...]:
     """Concentrating: the two-peer policies at the same bytes."""
-    return tuple(Sharing(rho, peers) for peers in TWO_PEERS)
+    return tuple(Sharing(budget, peers) for peers in TWO_PEERS)
 
 
-POLICIES = tuple(tuple(Sharing(rho, peers) for rho in BUDGETS) for peers in ("all-4", *TWO_PEERS))
+POLICIES = tuple(tuple(Sharing(budget, peers) for budget in BUDGETS) for peers in ("all-4", *TWO_PEERS))
 """The fixed policies that the paper's oracle switches among, by budget."""
 
 
-def _against_full(rho: float, region: Region = "full") -> Contrast:
-    return Contrast((all_4(rho),), (FULL_SHARING,), region)
+def _against_full(budget: float, region: Region = "full") -> Contrast:
+    return Contrast((all_4(budget),), (FULL_SHARING,), region)
 
 
-def _pair(rho: float, a: str, b: str, region: Region = "full") -> Contrast:
-    return Contrast((Sharing(rho, a),), (Sharing(rho, b),), region)
+def _pair(budget: float, a: str, b: str, region: Region = "full") -> Contrast:
+    return Contrast((Sharing(budget, a),), (Sharing(budget, b),), region)
 
 
-def _overlap_against_uniform(rho: float) -> Contrast:
-    return Contrast((Sharing(rho, allocation="overlap"),), (all_4(rho),))
+def _overlap_against_uniform(budget: float) -> Contrast:
+    return Contrast((Sharing(budget, allocation="overlap"),), (all_4(budget),))
 
 
 POINTS, AP = "AP points", "AP"
@@ -138,49 +138,49 @@ GAIN = (
         Paper(18.5, 16.9, 20.3), Contrast((FULL_SHARING,), (SINGLE,)), headline=True,
     ),
     Claim(
-        "curve.0.1", "gain, 5", "ρ = 0.1 against full sharing", POINTS,
+        "curve.0.1", "gain, 5", "Budget 0.1 against full sharing", POINTS,
         Paper(-2.0, -3.4, -0.8), _against_full(0.1), headline=True,
     ),
     Claim(
-        "kept.0.1", "gain, 5", "ρ = 0.1 keeps most of the gain", "%",
+        "kept.0.1", "gain, 5", "Budget 0.1 keeps most of the gain", "%",
         Paper(89.0, digits=0), Kept(all_4(0.1)), verdict.most, headline=True, follows=True,
     ),
     Claim(
-        "kept.0.05", "gain, 6", "ρ = 0.05 keeps, of the gain", "%",
+        "kept.0.05", "gain, 6", "Budget 0.05 keeps, of the gain", "%",
         Paper(58.0, margin=KEPT_MARGIN, digits=0), Kept(all_4(0.05)), verdict.same_value, headline=True,
     ),
     Claim(
-        "curve.0.05", "gain, 6", "ρ = 0.05 against full sharing", POINTS,
+        "curve.0.05", "gain, 6", "Budget 0.05 against full sharing", POINTS,
         Paper(-7.8), _against_full(0.05), follows=True,
     ),
-    Claim("curve.0.01", "gain, 7", "ρ = 0.01 against full sharing", POINTS, Paper(-24.0, digits=0), _against_full(0.01), headline=True),
+    Claim("curve.0.01", "gain, 7", "Budget 0.01 against full sharing", POINTS, Paper(-24.0, digits=0), _against_full(0.01), headline=True),
     Claim(
-        "starved", "gain, 7", "ρ = 0.01 is worse than a single drone", POINTS,
+        "starved", "gain, 7", "Budget 0.01 is worse than a single drone", POINTS,
         Paper(-5.4), Contrast((all_4(0.01),), (SINGLE,)), headline=True, follows=True,
     ),
     Claim(
-        "curve.0.02", "budget, 2", "ρ = 0.02 against full sharing", POINTS,
+        "curve.0.02", "budget, 2", "Budget 0.02 against full sharing", POINTS,
         Paper(-19.1), _against_full(0.02), follows=True,
     ),
-    Claim("level.0.01", "gain, 7", "AP at ρ = 0.01", AP, Paper(0.131, digits=3), ApOf(all_4(0.01)), verdict.level, follows=True),
-    Claim("level.0.02", "budget, 2", "AP at ρ = 0.02", AP, Paper(0.180, digits=3), ApOf(all_4(0.02)), verdict.level, follows=True),
-    Claim("level.0.05", "gain, 6", "AP at ρ = 0.05", AP, Paper(0.293, digits=3), ApOf(all_4(0.05)), verdict.level, follows=True),
-    Claim("level.0.1", "gain, 5", "AP at ρ = 0.1", AP, Paper(0.351, digits=3), ApOf(all_4(0.1)), verdict.level, follows=True),
-    Claim("level.0.25", "figure, a", "AP at ρ = 0.25 (drawn, not printed)", AP, Paper(), ApOf(all_4(0.25)), verdict.level),
+    Claim("level.0.01", "gain, 7", "AP at a budget of 0.01", AP, Paper(0.131, digits=3), ApOf(all_4(0.01)), verdict.level, follows=True),
+    Claim("level.0.02", "budget, 2", "AP at a budget of 0.02", AP, Paper(0.180, digits=3), ApOf(all_4(0.02)), verdict.level, follows=True),
+    Claim("level.0.05", "gain, 6", "AP at a budget of 0.05", AP, Paper(0.293, digits=3), ApOf(all_4(0.05)), verdict.level, follows=True),
+    Claim("level.0.1", "gain, 5", "AP at a budget of 0.1", AP, Paper(0.351, digits=3), ApOf(all_4(0.1)), verdict.level, follows=True),
+    Claim("level.0.25", "figure, a", "AP at a budget of 0.25 (drawn, not printed)", AP, Paper(), ApOf(all_4(0.25)), verdict.level),
 )  # fmt: skip
 
 MISSION = (
     Claim("mission.full", "mission, 2", "Mission AP at full sharing", AP, Paper(0.763, digits=3), ApOf(FULL_SHARING, "mission"), verdict.level),
-    Claim("mission.0.05", "mission, 2", "Mission AP at ρ = 0.05", AP, Paper(0.773, digits=3), ApOf(all_4(0.05), "mission"), verdict.level),
-    Claim("mission.0.1", "mission, 2", "Mission AP at ρ = 0.1", AP, Paper(0.784, digits=3), ApOf(all_4(0.1), "mission"), verdict.level),
+    Claim("mission.0.05", "mission, 2", "Mission AP at a budget of 0.05", AP, Paper(0.773, digits=3), ApOf(all_4(0.05), "mission"), verdict.level),
+    Claim("mission.0.1", "mission, 2", "Mission AP at a budget of 0.1", AP, Paper(0.784, digits=3), ApOf(all_4(0.1), "mission"), verdict.level),
     Claim(
-        "mission.widest", "mission, 3", "Mission AP at ρ 0.05–0.1, widest from full sharing", POINTS,
+        "mission.widest", "mission, 3", "Mission AP at budgets 0.05–0.1, widest from full sharing", POINTS,
         Paper(2.2, -0.5, 5.1, MARGIN["mission"]),
         Widest((_against_full(0.05, "mission"), _against_full(0.1, "mission"))), verdict.no_difference, headline=True,
         effect="mission under a budget",
     ),
     Claim(
-        "mission.tenth", "mission, 4", "Mission AP at ρ = 0.1 against full sharing", POINTS,
+        "mission.tenth", "mission, 4", "Mission AP at a budget of 0.1 against full sharing", POINTS,
         Paper(margin=MARGIN["mission"]), _against_full(0.1, "mission"), verdict.no_difference,
         effect="mission under a budget",
     ),
@@ -196,44 +196,44 @@ PEERS = (
         Paper(0.0), UnequalBytes(POLICIES), verdict.exact, defined=True,
     ),
     Claim(
-        "peers.worst-best", "peers, 3", "ρ = 0.25: worst-2 − best-2", POINTS,
+        "peers.worst-best", "peers, 3", "Budget 0.25: worst-2 − best-2", POINTS,
         Paper(0.8, -0.8, 2.3, MARGIN["full"]), _pair(0.25, "worst-2", "best-2"), verdict.no_difference, headline=True,
     ),
     Claim(
-        "peers.worst-random", "peers, 3", "ρ = 0.25: worst-2 − random-2", POINTS,
+        "peers.worst-random", "peers, 3", "Budget 0.25: worst-2 − random-2", POINTS,
         Paper(0.1, -1.1, 1.3, MARGIN["full"]), _pair(0.25, "worst-2", "random-2"), verdict.no_difference,
     ),
     Claim(
-        "peers.best-random", "peers, 3", "ρ = 0.25: best-2 − random-2", POINTS,
+        "peers.best-random", "peers, 3", "Budget 0.25: best-2 − random-2", POINTS,
         Paper(-0.7, margin=MARGIN["full"]), _pair(0.25, "best-2", "random-2"), verdict.no_difference, follows=True,
     ),
     Claim(
-        "peers.all", "peers, 6", "ρ = 0.25: all four over the best two", POINTS,
+        "peers.all", "peers, 6", "Budget 0.25: all four over the best two", POINTS,
         Paper(4.8, 3.8, 5.8), Contrast((all_4(0.25),), two(0.25)), headline=True,
-        effect="two or four at ρ = 0.25",
+        effect="two or four at a budget of 0.25",
     ),
 )  # fmt: skip
 
-_CONCENTRATING = tuple(Contrast(two(rho), (all_4(rho),)) for rho in BUDGETS)
+_CONCENTRATING = tuple(Contrast(two(budget), (all_4(budget),)) for budget in BUDGETS)
 FLIP = (
     Claim(
-        "flip.0.02", "budget, 2", "ρ = 0.02: the best two over all four", POINTS,
+        "flip.0.02", "budget, 2", "Budget 0.02: the best two over all four", POINTS,
         Paper(7.7, 6.6, 8.9), _CONCENTRATING[0], headline=True,
-        effect="two or four at ρ = 0.02",
+        effect="two or four at a budget of 0.02",
     ),
     Claim(
-        "flip.0.05", "budget, 3", "ρ = 0.05: the best two over all four", POINTS,
+        "flip.0.05", "budget, 3", "Budget 0.05: the best two over all four", POINTS,
         Paper(1.4, 0.2, 2.7), _CONCENTRATING[1], headline=True,
-        effect="two or four at ρ = 0.05",
+        effect="two or four at a budget of 0.05",
     ),
     Claim(
-        "flip.0.1", "budget, 5", "ρ = 0.1: the best two over all four", POINTS,
+        "flip.0.1", "budget, 5", "Budget 0.1: the best two over all four", POINTS,
         Paper(-4.0, -5.3, -2.8), _CONCENTRATING[2], headline=True,
-        effect="two or four at ρ = 0.1",
+        effect="two or four at a budget of 0.1",
     ),
     Claim(
-        "flip.0.25", "budget, 6", "ρ = 0.25: the best two over all four", POINTS,
-        Paper(-4.8, -5.8, -3.8), _CONCENTRATING[3], effect="two or four at ρ = 0.25",
+        "flip.0.25", "budget, 6", "Budget 0.25: the best two over all four", POINTS,
+        Paper(-4.8, -5.8, -3.8), _CONCENTRATING[3], effect="two or four at a budget of 0.25",
     ),
     Claim(
         "flip.crossover", "budget, 7", "The lead changes between 5 and 10 % of the bytes, at", "%",
@@ -241,12 +241,12 @@ FLIP = (
         effect="choosing by budget",
     ),
     Claim(
-        "wrong.starved", "budget, 9", "The winner at ρ = 0.25, used at 0.02, loses", POINTS,
+        "wrong.starved", "budget, 9", "The winner at a budget of 0.25, used at 0.02, loses", POINTS,
         Paper(-7.7), WrongChoice(POLICIES, chosen_at=3, judged_at=0), headline=True,
         effect="choosing by budget",
     ),
     Claim(
-        "wrong.plentiful", "budget, 9", "The winner at ρ = 0.02, used at 0.25, loses", POINTS,
+        "wrong.plentiful", "budget, 9", "The winner at a budget of 0.02, used at 0.25, loses", POINTS,
         Paper(-4.8), WrongChoice(POLICIES, chosen_at=0, judged_at=3), headline=True,
         effect="choosing by budget",
     ),
@@ -261,28 +261,28 @@ FLIP = (
 
 ALLOCATION = tuple(
     Claim(
-        f"allocation.{rho:g}", "budget, 18", f"ρ = {rho:g}: allocation by overlap − uniform", POINTS,
-        Paper(margin=MARGIN["full"]), _overlap_against_uniform(rho), verdict.no_difference, headline=rho == 0.1,
+        f"allocation.{budget:g}", "budget, 18", f"Budget {budget:g}: allocation by overlap − uniform", POINTS,
+        Paper(margin=MARGIN["full"]), _overlap_against_uniform(budget), verdict.no_difference, headline=budget == 0.1,
         effect="allocation",
     )
-    for rho in BUDGETS
+    for budget in BUDGETS
 )  # fmt: skip
 
 COMPOSITION = (
-    Claim("compose.best", "composition, 2", "AP of best-2 at ρ = 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "best-2")), verdict.level),
-    Claim("compose.worst", "composition, 2", "AP of worst-2 at ρ = 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "worst-2")), verdict.level),
+    Claim("compose.best", "composition, 2", "AP of best-2 at a budget of 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "best-2")), verdict.level),
+    Claim("compose.worst", "composition, 2", "AP of worst-2 at a budget of 0.02", AP, Paper(0.257, digits=3), ApOf(Sharing(0.02, "worst-2")), verdict.level),
     Claim(
-        "compose.tie", "composition, 2", "ρ = 0.02, full scene: best-2 − worst-2", POINTS,
+        "compose.tie", "composition, 2", "Budget 0.02, full scene: best-2 − worst-2", POINTS,
         Paper(0.0, margin=MARGIN["full"]), _pair(0.02, "best-2", "worst-2"), verdict.no_difference, headline=True,
     ),
-    Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at ρ = 0.02", AP, Paper(0.787, digits=3), ApOf(Sharing(0.02, "best-2"), "mission"), verdict.level),
-    Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at ρ = 0.02", AP, Paper(0.728, digits=3), ApOf(Sharing(0.02, "worst-2"), "mission"), verdict.level),
+    Claim("compose.mission.best", "composition, 5", "Mission AP of best-2 at a budget of 0.02", AP, Paper(0.787, digits=3), ApOf(Sharing(0.02, "best-2"), "mission"), verdict.level),
+    Claim("compose.mission.worst", "composition, 5", "Mission AP of worst-2 at a budget of 0.02", AP, Paper(0.728, digits=3), ApOf(Sharing(0.02, "worst-2"), "mission"), verdict.level),
     Claim(
-        "compose.mission", "composition, 5", "ρ = 0.02, mission: best-2 − worst-2", POINTS,
+        "compose.mission", "composition, 5", "Budget 0.02, mission: best-2 − worst-2", POINTS,
         Paper(5.9, 2.5, 9.4), _pair(0.02, "best-2", "worst-2", "mission"), headline=True,
     ),
     Claim(
-        "compose.spread", "composition, 7", "ρ = 0.05, mission: all four over the best two", POINTS,
+        "compose.spread", "composition, 7", "Budget 0.05, mission: all four over the best two", POINTS,
         Paper(3.1, -0.6, 7.0, MARGIN["mission"]), Contrast((all_4(0.05),), two(0.05), "mission"), verdict.no_difference, headline=True,
     ),
 )  # fmt: skip

@@ -1,6 +1,6 @@
 """One way of sharing, as the evaluation measures it. Free of torch.
 
-The paper's knobs, each defined in this folder's README: how much (ρ), from whom (peers), in which parts
+The paper's knobs, each defined in this folder's README: how much (the received budget), from whom (peers), in which parts
 (allocation), which cells (rank, region of interest first), and what a cell that was not sent counts as.
 """
 
@@ -25,7 +25,7 @@ class Sharing:
         ValueError: naming the field, its value and what it must be.
     """
 
-    rho: float
+    received_budget: float
     """Cells shared to each ego, as a fraction of full sharing (4 peers × 4096 cells in a fleet of five), 0 … 1."""
     peers: str = "all-4"
     """all-k, best-k, worst-k, random-k, or none: a drone alone. All of them share the same total of cells."""
@@ -39,8 +39,8 @@ class Sharing:
     """Whether cells in the mission's disc come before all others."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.rho <= 1.0:
-            raise ValueError(f"rho is {self.rho}, must be 0 to 1")
+        if not 0.0 <= self.received_budget <= 1.0:
+            raise ValueError(f"received_budget is {self.received_budget}, must be 0 to 1")
         if not _PEERS.fullmatch(self.peers):
             raise ValueError(
                 f"peers is {self.peers!r}, must be none, or all-k, best-k, worst-k or random-k with k 1 to 99"
@@ -48,8 +48,8 @@ class Sharing:
         for name, allowed in _ALLOWED.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} is {getattr(self, name)!r}, must be {' or '.join(allowed)}")
-        if self.peers == "none" and self.rho != 0.0:
-            raise ValueError(f"rho is {self.rho} with no peers, must be 0")
+        if self.peers == "none" and self.received_budget != 0.0:
+            raise ValueError(f"received_budget is {self.received_budget} with no peers, must be 0")
 
     @property
     def rule(self) -> str:
@@ -66,9 +66,13 @@ class Sharing:
         """A short name, such as `best-2@0.02` or `all-4@0.1,overlap,norm,masked,roi`; `parse` reads it."""
         if self.peers == "none":
             return "single"
-        rho = f"{self.rho:g}" if float(f"{self.rho:g}") == self.rho else repr(self.rho)
+        budget = (
+            f"{self.received_budget:g}"
+            if float(f"{self.received_budget:g}") == self.received_budget
+            else repr(self.received_budget)
+        )
         marks = [str(getattr(self, f.name)) for f in fields(self)[2:5] if getattr(self, f.name) != f.default]
-        return ",".join([f"{self.peers}@{rho}", *marks, *(["roi"] if self.roi else [])])
+        return ",".join([f"{self.peers}@{budget}", *marks, *(["roi"] if self.roi else [])])
 
     @classmethod
     def parse(cls, label: str) -> Sharing:
@@ -80,13 +84,13 @@ class Sharing:
         if label == "single":
             return SINGLE
         head, *marks = label.split(",")
-        peers, at, rho = head.partition("@")
+        peers, at, budget = head.partition("@")
         known = {value: name for name, values in _ALLOWED.items() for value in values}
         try:
             if not at:
                 raise ValueError("no @ in it")
             knobs: dict[str, str] = {known[m]: m for m in marks if m != "roi"}
-            return cls(float(rho), peers, roi="roi" in marks, **knobs)  # type: ignore[arg-type]
+            return cls(float(budget), peers, roi="roi" in marks, **knobs)  # type: ignore[arg-type]
         except (ValueError, KeyError) as error:
             raise ValueError(f"condition is {label!r}, must be like best-2@0.02,masked ({error})") from None
 
@@ -100,9 +104,9 @@ class Sharing:
         out = self
         if out.k and out.k == others:
             out = replace(out, peers=f"all-{others}")
-        if out.k and out.rho * others >= out.k:
+        if out.k and out.received_budget * others >= out.k:
             out = replace(out, allocation="uniform", cells_by="confidence", roi=False)
-        if out.rho == 0.0 and out.unsent == "masked":
+        if out.received_budget == 0.0 and out.unsent == "masked":
             return SINGLE
         return out
 

@@ -188,7 +188,7 @@ def exchanges(
     orders: dict[tuple[str, bool], NDArray[np.int16]] = {}
     out = []
     for c in conditions:
-        total = cells_in(c.rho, drones - 1)
+        total = cells_in(c.received_budget, drones - 1)
         which = (c.cells_by, c.roi and roi is not None)
         if total and which not in orders:
             orders[which] = selection.sending_order(view.rank(c.cells_by), roi if which[1] else None)

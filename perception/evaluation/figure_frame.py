@@ -43,12 +43,14 @@ def draw(picture: Picture) -> Figure:
     peers = max(1, len(picture.est_pose) - 1)
     shades = ListedColormap(colormaps["YlGnBu"](np.linspace(0.3, 1.0, peers)))
     steps = BoundaryNorm(np.arange(0.5, peers + 1), peers)
-    for k, (ax, (rho, counts)) in enumerate(zip(axes[1:], picture.shared, strict=True)):
+    for k, (ax, (budget, counts)) in enumerate(zip(axes[1:], picture.shared, strict=True)):
         x, y = _cell_corners(picture)
         mesh = ax.pcolormesh(x, y, np.ma.masked_equal(counts, 0), cmap=shades, norm=steps, rasterized=True)
         _ground(ax, picture)
         _boxes(ax, picture.truth, TRUTH, filled=False, label="")
-        ax.set_title(f"({'bcdef'[k]}) cells shared with drone {picture.ego} at ρ = {rho:g}", fontsize=9, loc="left")
+        ax.set_title(
+            f"({'bcdef'[k]}) cells shared with drone {picture.ego} at a budget of {budget:g}", fontsize=9, loc="left"
+        )
         if k == len(picture.shared) - 1:
             bar = below.colorbar(
                 mesh, ax=ax, ticks=range(1, peers + 1), boundaries=np.arange(0.5, peers + 1), shrink=0.6

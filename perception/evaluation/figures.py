@@ -48,13 +48,13 @@ def frontier(points: Sequence[Point]) -> Figure:
     figure, axes = figure_of(1, 2, (10.4, 3.9))
     for ax, region, title in zip(axes, COLOURS, ("full scene", "32 m mission disc"), strict=True):
         for instrument, name in INSTRUMENTS.items():
-            line = [p for rho in CURVE for p in _of(points, instrument, region, "all-4", rho)]
+            line = [p for budget in CURVE for p in _of(points, instrument, region, "all-4", budget)]
             if line:
                 style: dict[str, Any] = {
                     "linestyle": DASHES[instrument],
                     "alpha": 1.0 if instrument == "zero" else 0.75,
                 }
-                _whiskers(ax, [p.rho for p in line], line, COLOURS[region], name, **style)
+                _whiskers(ax, [p.received_budget for p in line], line, COLOURS[region], name, **style)
         for single in _of(points, "zero", region, "none", 0.0):
             ax.axhspan(single.low, single.high, color=INK, alpha=0.08, lw=0)
             ax.axhline(single.ap, color=INK, lw=1, ls=":", label="a single drone")
@@ -76,19 +76,19 @@ def peer_selection(points: Sequence[Point]) -> Figure:
     for ax, instrument in zip(axes, shown, strict=True):
         place = np.arange(len(BUDGETS), dtype=float)
         for k, (policy, colour) in enumerate(POLICY_COLOURS.items()):
-            line = [p for rho in BUDGETS for p in _of(points, instrument, "full", policy, rho)]
+            line = [p for budget in BUDGETS for p in _of(points, instrument, "full", policy, budget)]
             if len(line) == len(BUDGETS):
                 _whiskers(ax, place + 0.13 * (k - 1.5), line, colour, policy, linestyle="none", markersize=6)
-        for i, rho in enumerate(BUDGETS):
-            several = [p for policy in POLICY_COLOURS for p in _of(points, instrument, "full", policy, rho)]
+        for i, budget in enumerate(BUDGETS):
+            several = [p for policy in POLICY_COLOURS for p in _of(points, instrument, "full", policy, budget)]
             if several:
                 top = max(several, key=lambda p: p.ap)
                 at = i + 0.13 * (list(POLICY_COLOURS).index(top.peers) - 1.5)
                 ax.plot(at, top.high + 0.012, "v", color=POLICY_COLOURS[top.peers], ms=7)
         for single in _of(points, "zero", "full", "none", 0.0):
             ax.axhline(single.ap, color=INK, lw=1, ls=":", label="a single drone")
-        ax.set_xticks(place, [f"{rho:g}" for rho in BUDGETS])
-        ax.set_xlabel("ρ, part of full sharing's bytes")
+        ax.set_xticks(place, [f"{budget:g}" for budget in BUDGETS])
+        ax.set_xlabel("received budget, share of full sharing")
         ax.set_title(f"{INSTRUMENTS[instrument]}  (▼ the best)", loc="left", fontsize=10)
     axes[0].set_ylabel("AP@0.5, full scene")
     legend_below(figure, axes[0])
@@ -161,11 +161,12 @@ def legend_below(figure: Figure, ax: Axes) -> None:
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=len(labels))
 
 
-def _of(points: Sequence[Point], instrument: str, region: str, peers: str, rho: float) -> list[Point]:
+def _of(points: Sequence[Point], instrument: str, region: str, peers: str, budget: float) -> list[Point]:
     return [
         p
         for p in points
-        if (p.instrument, p.region, p.peers, p.rho, p.allocation) == (instrument, region, peers, rho, "uniform")
+        if (p.instrument, p.region, p.peers, p.received_budget, p.allocation)
+        == (instrument, region, peers, budget, "uniform")
     ]
 
 
@@ -178,9 +179,9 @@ def _whiskers(ax: Axes, x: Any, line: Sequence[Point], colour: str, label: str, 
 
 def _budget_axis(ax: Axes, budgets: Sequence[float]) -> None:
     ax.set_xscale("log")
-    ax.set_xticks(list(budgets), [f"{rho:g}" for rho in budgets])
+    ax.set_xticks(list(budgets), [f"{budget:g}" for budget in budgets])
     ax.minorticks_off()
-    ax.set_xlabel("ρ, part of full sharing's bytes")
+    ax.set_xlabel("received budget, share of full sharing")
 
 
 def _bar(

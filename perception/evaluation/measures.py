@@ -95,7 +95,7 @@ class Widest:
         """That contrast's difference."""
         measured = [(abs(m.value), -i, m) for i, m in enumerate(c.measure(scores) for c in self.among)]
         _, minus_i, widest = max(measured)
-        return replace(widest, note=f"at ρ = {self.among[-minus_i].of[0].rho:g}")
+        return replace(widest, note=f"at a budget of {self.among[-minus_i].of[0].received_budget:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +218,7 @@ class Crossover:
 
     def measure(self, scores: Scores) -> MeasuredValue:
         """Where the line between the last significant lead of concentrating and the first of spreading meets zero, in per cent."""
-        seen = [(c.of[0].rho, c.measure(scores)) for c in self.contrasts]
+        seen = [(c.of[0].received_budget, c.measure(scores)) for c in self.contrasts]
         signs = [(1 if m.value > 0 else -1) if m.significant else 0 for _, m in seen]
         if 1 not in signs or -1 not in signs:
             ahead = {(True, False): "concentrating never trails", (False, True): "concentrating never leads"}
@@ -248,7 +248,7 @@ class Peak:
         top = best(self.curve, self.region, scores)
         if not np.isfinite(scores.ap(top, self.region)):
             return MeasuredValue(float("nan"), note="nothing was there to be found")
-        return MeasuredValue(POINTS * top.rho)
+        return MeasuredValue(POINTS * top.received_budget)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +297,7 @@ Measure = Accuracy | Counted | Elsewhere
 
 def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence") -> Sharing:
     """A claim's condition under another instrument; unchanged where every cell is sent, or none."""
-    everything = condition.peers == "none" or (condition.rule == "all" and condition.rho >= 1.0)
+    everything = condition.peers == "none" or (condition.rule == "all" and condition.received_budget >= 1.0)
     return condition if everything else replace(condition, unsent=unsent, cells_by=cells_by)
 
 

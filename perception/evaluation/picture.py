@@ -68,7 +68,7 @@ def picture(
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)
     view, geometry = instrument.look(frames, f), instrument.geometry
-    conditions = (FULL_SHARING, *(Sharing(rho) for rho in budgets))
+    conditions = (FULL_SHARING, *(Sharing(budget) for budget in budgets))
     given = [e for e, _ in exchanges(view, frames, f, key, conditions, settings, geometry, target) if e.ego == ego]
     found = Boxes.placed(view.detect(given[:1], tau)[0], tuple(frames.est_pose[f, ego].tolist()))
     return Picture(
@@ -81,7 +81,7 @@ def picture(
         found=suppress(found, settings.nms_iou),
         disc=None if target is None else Disc(*target, REGION_M),
         shared=tuple(
-            (rho, sharers(e, frames.est_pose[f], geometry)) for rho, e in zip(budgets, given[1:], strict=True)
+            (budget, sharers(e, frames.est_pose[f], geometry)) for budget, e in zip(budgets, given[1:], strict=True)
         ),
         views=views,
     )

@@ -67,7 +67,7 @@ class Point:
     """The AP of one way of sharing, for the figures."""
 
     peers: str
-    rho: float
+    received_budget: float
     allocation: str
     instrument: str
     region: str
@@ -84,7 +84,7 @@ def points(scores: Mapping[Unsent, Scores]) -> list[Point]:
             for c in conditions():
                 m = ApOf(c, region).measure(its)
                 low, high = (m.value if bound is None else bound for bound in (m.low, m.high))
-                out.append(Point(c.peers, c.rho, c.allocation, instrument, region, m.value, low, high))
+                out.append(Point(c.peers, c.received_budget, c.allocation, instrument, region, m.value, low, high))
     return out
 
 

@@ -135,7 +135,7 @@ def evaluate_recording(
     if conditions is None:
         conditions = [
             SINGLE,
-            *(Sharing(rho, peers) for rho in (0.01, 0.02, 0.05, 0.1, 0.25, 1.0) if recording.drones > 1),
+            *(Sharing(budget, peers) for budget in (0.01, 0.02, 0.05, 0.1, 0.25, 1.0) if recording.drones > 1),
         ]
     found = evaluate(
         RecordedInstrument(recording, fusion), frames_of(recording), conditions,

@@ -40,14 +40,14 @@ def contrasts(plan: StudyPlan, rows: Sequence[StudyRow]) -> Figure:
     for ax, unsent in zip(axes, plan.measured.unsent, strict=True):
         ax.axhline(0, color=INK, lw=0.8)
         if unsent == "zero":
-            at = [budgets.index(rho) for rho in PAPER_CONTRAST if rho in budgets]
+            at = [budgets.index(budget) for budget in PAPER_CONTRAST if budget in budgets]
             ax.plot(at, [PAPER_CONTRAST[budgets[i]] for i in at], "D", ms=6, mfc="none", color=PAPER, label="paper")
         for k, (variant, seed) in enumerate(networks):
-            its = [found.get(FixedSettings(variant, seed, unsent), "contrast", rho) for rho in budgets]
+            its = [found.get(FixedSettings(variant, seed, unsent), "contrast", budget) for budget in budgets]
             x = np.arange(len(budgets)) + 0.6 * ((k + 0.5) / len(networks) - 0.5)
             _whiskers(ax, x, its, COLOURS.get(variant, INK), _first(networks, variant, seed))
-        ax.set_xticks(range(len(budgets)), [f"{rho:g}" for rho in budgets])
-        ax.set_xlabel("ρ, part of full sharing's bytes")
+        ax.set_xticks(range(len(budgets)), [f"{budget:g}" for budget in budgets])
+        ax.set_xlabel("received budget, share of full sharing")
         ax.set_title(UNSENT[unsent], loc="left", fontsize=10)
     axes[0].set_ylabel("AP of two peers minus four, points")
     legend_below(figure, axes[0])
@@ -67,7 +67,7 @@ def starved(plan: StudyPlan, rows: Sequence[StudyRow]) -> Figure:
                 ax.plot([row.low, row.high], [down - k] * 2, color=colour, lw=1.6)
                 ax.plot(row.value, down - k, "o", color=colour, mfc=face or colour, ms=5)
     ax.set_yticks([-k for k in range(len(networks))], [f"{v}-{s}" for v, s in networks])
-    ax.set_xlabel(f"AP at ρ = {plan.measured.starved:g} minus a single drone, points (hollow: masked fusion)")
+    ax.set_xlabel(f"AP at a budget of {plan.measured.starved:g} minus a single drone, points (hollow: masked fusion)")
     return figure
 
 

@@ -41,7 +41,7 @@ class StudyRow:
     tau: float
     quantity: str
     """gain, level, starved, contrast, fill or oracle: see `rows_of`."""
-    rho: float
+    received_budget: float
     """The budget; NaN where there is none."""
     value: float
     low: float
@@ -74,7 +74,7 @@ def rows_of(
     out: list[StudyRow] = []
     many, few = measured.policies
     starved = Sharing(measured.starved, many)
-    wide = tuple(tuple(Sharing(rho, peers) for rho in measured.budgets) for peers in measured.policies)
+    wide = tuple(tuple(Sharing(budget, peers) for budget in measured.budgets) for peers in measured.policies)
     for cells_by in measured.cells_by:
         if replace(starved, cells_by=cells_by, unsent=measured.unsent[0]) not in found.conditions:
             continue
@@ -85,22 +85,22 @@ def rows_of(
             for unsent, scores in ways.items():
                 head = (variant.name, seed, density, unsent, cells_by, str(name), tau)
 
-                def add(quantity: str, rho: float, of: Figures, unit: float = 1.0) -> None:
+                def add(quantity: str, budget: float, of: Figures, unit: float = 1.0) -> None:
                     value, low, high = (unit * v for v in of)
-                    out.append(StudyRow(*head, quantity, rho, value, low, high, len(found.scene)))  # noqa: B023 (called at once)
+                    out.append(StudyRow(*head, quantity, budget, value, low, high, len(found.scene)))  # noqa: B023 (called at once)
 
                 add("gain", np.nan, _figures(Contrast((FULL_SHARING,), (SINGLE,)).measure(scores)))
                 add("level", 0.0, _figures(ApOf(SINGLE).measure(scores)), POINTS)  # levels come as 0 … 1
                 add("level", 1.0, _figures(ApOf(FULL_SHARING).measure(scores)), POINTS)
                 add("starved", measured.starved, _figures(Contrast((starved,), (SINGLE,)).measure(scores)))
-                for rho in measured.budgets:
-                    two, four = Sharing(rho, few), Sharing(rho, many)
-                    add("contrast", rho, _figures(Contrast((two,), (four,)).measure(scores)))
+                for budget in measured.budgets:
+                    two, four = Sharing(budget, few), Sharing(budget, many)
+                    add("contrast", budget, _figures(Contrast((two,), (four,)).measure(scores)))
                     for c in (two, four):
-                        add(f"level {c.peers}", rho, _figures(ApOf(c).measure(scores)), POINTS)
+                        add(f"level {c.peers}", budget, _figures(ApOf(c).measure(scores)), POINTS)
                 if unsent == "zero" and "masked" in ways:
-                    for rho in (measured.starved, *measured.budgets):
-                        add("fill", rho, _between(scores, ways["masked"], Sharing(rho, many)), POINTS)
+                    for budget in (measured.starved, *measured.budgets):
+                        add("fill", budget, _between(scores, ways["masked"], Sharing(budget, many)), POINTS)
                 add("oracle", np.nan, _figures(Oracle(wide).measure(scores)))
     return out
 

@@ -57,9 +57,9 @@ class MeasuredGrid:
 
     def conditions(self) -> Iterator[Sharing]:
         """Every policy at every budget, one fusion and one ranking; others follow by `measures.under`."""
-        for rho in (self.starved, *self.budgets):
+        for budget in (self.starved, *self.budgets):
             for peers in self.policies:
-                yield Sharing(rho, peers)
+                yield Sharing(budget, peers)
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,13 +34,17 @@ class StudyRows:
     def __init__(self, rows: Iterable[StudyRow]) -> None:
         self.rows = tuple(rows)
         self._by = {
-            (FixedSettings(r.variant, r.seed, r.unsent, r.cells_by, r.tau_name, r.density), r.quantity, _key(r.rho)): r
+            (
+                FixedSettings(r.variant, r.seed, r.unsent, r.cells_by, r.tau_name, r.density),
+                r.quantity,
+                _key(r.received_budget),
+            ): r
             for r in self.rows
         }
 
-    def get(self, view: FixedSettings, quantity: str, rho: float = math.nan) -> StudyRow | None:
+    def get(self, view: FixedSettings, quantity: str, budget: float = math.nan) -> StudyRow | None:
         """The row, or None where that was not measured."""
-        return self._by.get((view, quantity, _key(rho)))
+        return self._by.get((view, quantity, _key(budget)))
 
     def networks(self) -> list[tuple[str, int]]:
         """Variant and seed of every network measured, in the rows' order."""
@@ -56,7 +60,7 @@ def sign(row: StudyRow | None) -> int:
 
 def flips(found: StudyRows, view: FixedSettings, budgets: Sequence[float]) -> bool:
     """Whether two peers beat four at some budget and four beat two at a larger one, both significantly."""
-    signs = [sign(found.get(view, "contrast", rho)) for rho in sorted(budgets)]
+    signs = [sign(found.get(view, "contrast", budget)) for budget in sorted(budgets)]
     return any(a > 0 and min(signs[i:]) < 0 for i, a in enumerate(signs))
 
 
@@ -152,15 +156,15 @@ def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
     dropped = [v for v in plan.variants if v.recipe.get("cell_dropout")]
     lines = [
         f"- {flip} at the model's own threshold among {len(networks)} networks under {listed(m.unsent)} filling, and {fall} "
-        f"below a single drone at ρ = {m.starved:g}: with {first} (seeds {listed(seeds)}) two peers minus four at ρ = {little:g} "
+        f"below a single drone at a budget of {m.starved:g}: with {first} (seeds {listed(seeds)}) two peers minus four at a budget of {little:g} "
         f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
-        f"- Zero fill costs {_several(fill)} against masked fusion at ρ = {m.starved:g}, significantly in "
+        f"- Zero fill costs {_several(fill)} against masked fusion at a budget of {m.starved:g}, significantly in "
         + " and ".join(
             f"{sum(sign(found.get(FixedSettings(v.name, s), 'fill', m.starved)) < 0 for s in its)} of {len(its)} networks of `{v.name}`"
             for v in (plan.variants[0], *dropped)
             if (its := [s for s in v.seeds if (v.name, s) in networks])
         )
-        + f": masking moves the contrast at ρ = {little:g} to {_several(masked)}"
+        + f": masking moves the contrast at a budget of {little:g} to {_several(masked)}"
         + "".join(
             f", {v.name} training to {_several([found.get(FixedSettings(v.name, s), 'contrast', little) for s in seeds])}"
             for v in dropped
@@ -219,18 +223,18 @@ def _table(plan: StudyPlan, found: StudyRows, head: str, views: Mapping[str, Fix
     shown = {name: view for name, view in views.items() if found.get(view, "gain") is not None}
     if not shown:
         return []
-    contrasts = [f"two − four, ρ = {rho:g}" for rho in m.budgets]
+    contrasts = [f"two − four, budget {budget:g}" for budget in m.budgets]
     lines = []
     for name, view in shown.items():
         alone, full = found.get(view, "level", 0.0), found.get(view, "level", 1.0)
         cells = [_plain(alone), _plain(full), _difference(found.get(view, "starved", m.starved))]
         cells.append(_difference(found.get(view, "fill", m.starved)))
-        for rho in m.budgets:
-            row = found.get(view, "contrast", rho)
+        for budget in m.budgets:
+            row = found.get(view, "contrast", budget)
             cells.append(f"{'·▲▼'[sign(row)]} {_difference(row)}")
         cells.append(_difference(found.get(view, "oracle")))
         lines.append((name, *cells))
-    return table((head, "alone", "all", f"starved, ρ = {m.starved:g}", "fill", *contrasts, "oracle"), lines)
+    return table((head, "alone", "all", f"starved, budget {m.starved:g}", "fill", *contrasts, "oracle"), lines)
 
 
 def _tau(found: StudyRows, variant: str, seed: int, name: str) -> str:
@@ -259,5 +263,5 @@ def _quoted(text: str) -> list[str]:
     return [f"> {line}".rstrip() for line in text.splitlines()]
 
 
-def _key(rho: float) -> float | None:
-    return None if math.isnan(rho) else rho
+def _key(budget: float) -> float | None:
+    return None if math.isnan(budget) else budget

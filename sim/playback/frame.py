@@ -1,7 +1,7 @@
 """One frame of the benchmark in Rerun, as the paper's data figure: camera views, truth, detections, the cells shared at two budgets.
 
 World frame ENU, metres. Entities: `world/truth` grey, `world/found` blue, `world/drones`, `world/mission`,
-`shared/rho_0.25/cells` and so on over the truth, `views/drone_0/front` …
+`shared/budget_0.25/cells` and so on over the truth, `views/drone_0/front` …
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def log_frame(recording: rr.RecordingStream, picture: Picture) -> None:
     put("world/found", _solid(picture.found, FOUND, filled=False))
     if picture.disc is not None:
         put("world/mission", _ring(*picture.disc))
-    for rho, counts in picture.shared:
-        entity = f"shared/rho_{rho:g}"
+    for budget, counts in picture.shared:
+        entity = f"shared/budget_{budget:g}"
         put(f"{entity}/cells", _cells(picture, counts))
         put(f"{entity}/truth", _solid(picture.truth, TRUTH, filled=False))
         flat = drones * (1.0, 1.0, 0.0)
@@ -72,11 +72,11 @@ def layout(picture: Picture) -> rrb.Blueprint:
             name="truth (grey) and detections (blue)", origin="world", contents="/world/**", **_eye(picture)
         )
     ]
-    for rho, _ in picture.shared:
-        name = f"cells shared with drone {picture.ego} at ρ = {rho:g}, lighter: more peers"
+    for budget, _ in picture.shared:
+        name = f"cells shared with drone {picture.ego} at a budget of {budget:g}, lighter: more peers"
         maps.append(
             rrb.Spatial3DView(
-                name=name, origin=f"shared/rho_{rho:g}", contents=f"/shared/rho_{rho:g}/**", **_eye(picture)
+                name=name, origin=f"shared/budget_{budget:g}", contents=f"/shared/budget_{budget:g}/**", **_eye(picture)
             )
         )
     body: rrb.Container = rrb.Horizontal(*maps)

@@ -25,7 +25,7 @@ class Made:
     known: Mapping[tuple[str, str], float]
     default: Callable[[Sharing, str], float] = lambda condition, region: 0.3
     noise: float = 0.005
-    bytes_of: Callable[[Sharing], float] = lambda condition: 1e6 * condition.rho
+    bytes_of: Callable[[Sharing], float] = lambda condition: 1e6 * condition.received_budget
 
     def ap(self, condition: Sharing, region: Region) -> float:
         return self.known.get((condition.label, region), self.default(condition, region))
@@ -57,7 +57,7 @@ def papers_world(condition: Sharing, region: str) -> float:
         return special.get(condition.label, 0.763 if condition.label == "all-4@1" else 0.72)
     curve = {0.0: 0.185, 0.01: 0.131, 0.02: 0.180, 0.05: 0.293, 0.1: 0.351, 0.25: 0.361, 1.0: 0.371}
     two = {0.02: 0.257, 0.05: 0.307, 0.1: 0.311, 0.25: 0.313}
-    return curve[condition.rho] if condition.rule in ("all", "none") else two[condition.rho]
+    return curve[condition.received_budget] if condition.rule in ("all", "none") else two[condition.received_budget]
 
 
 ELSEWHERE = {

@@ -146,7 +146,9 @@ def staleness(seeds: tuple[int, ...], duration_s: int) -> list[dict[str, Any]]:
     }
     found = []
     for name, settings in cases.items():
-        scenario = fleet("perception.detector=none", f"duration_s={duration_s}", "policy.params={received_budget: 0.02}", *settings)
+        scenario = fleet(
+            "perception.detector=none", f"duration_s={duration_s}", "policy.params={received_budget: 0.02}", *settings
+        )
         ages, mean_s, states = [], [], {"degraded": 0, "detached": 0}
         for seed in seeds:
             record = run_sortie(scenario, seed=seed)

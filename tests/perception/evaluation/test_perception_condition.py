@@ -35,14 +35,14 @@ def test_labels_are_short() -> None:
 @pytest.mark.parametrize(
     ("knobs", "message"),
     [
-        ({"rho": 1.5}, "rho is 1.5, must be 0 to 1"),
-        ({"rho": float("nan")}, "rho is nan, must be 0 to 1"),
-        ({"rho": 0.1, "peers": "nearest-2"}, "peers is 'nearest-2', must be none, or all-k, best-k"),
-        ({"rho": 0.1, "peers": "best-0"}, "peers is 'best-0', must be"),
-        ({"rho": 0.1, "peers": "none"}, "rho is 0.1 with no peers, must be 0"),
-        ({"rho": 0.1, "allocation": "equal"}, "allocation is 'equal', must be uniform or overlap"),
-        ({"rho": 0.1, "cells_by": "luck"}, "cells_by is 'luck', must be confidence or norm"),
-        ({"rho": 0.1, "unsent": "gone"}, "unsent is 'gone', must be zero or masked"),
+        ({"received_budget": 1.5}, "received_budget is 1.5, must be 0 to 1"),
+        ({"received_budget": float("nan")}, "received_budget is nan, must be 0 to 1"),
+        ({"received_budget": 0.1, "peers": "nearest-2"}, "peers is 'nearest-2', must be none, or all-k, best-k"),
+        ({"received_budget": 0.1, "peers": "best-0"}, "peers is 'best-0', must be"),
+        ({"received_budget": 0.1, "peers": "none"}, "received_budget is 0.1 with no peers, must be 0"),
+        ({"received_budget": 0.1, "allocation": "equal"}, "allocation is 'equal', must be uniform or overlap"),
+        ({"received_budget": 0.1, "cells_by": "luck"}, "cells_by is 'luck', must be confidence or norm"),
+        ({"received_budget": 0.1, "unsent": "gone"}, "unsent is 'gone', must be zero or masked"),
     ],
 )
 def test_what_a_condition_refuses(knobs: dict, message: str) -> None:

@@ -147,7 +147,7 @@ def test_the_peak_is_a_budget_in_per_cent() -> None:
 
 def test_matched_bytes_are_compared_at_the_same_budget() -> None:
     assert UnequalBytes(POLICIES).measure(PAPER).value == 0.0
-    uneven = Made({}, bytes_of=lambda c: 1e6 * c.rho * (0.9 if c.label == "best-2@0.05" else 1.0))
+    uneven = Made({}, bytes_of=lambda c: 1e6 * c.received_budget * (0.9 if c.label == "best-2@0.05" else 1.0))
     assert UnequalBytes(POLICIES).measure(uneven).value == pytest.approx(10.0)
 
 

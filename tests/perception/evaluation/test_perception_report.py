@@ -23,7 +23,7 @@ from sortie.perception.evaluation.verdict import MeasuredValue
 
 @pytest.fixture(scope="module")
 def table() -> list[ClaimRow]:
-    weaker = Made({}, lambda c, r: papers_world(c, r) + (0.1 if c.rho < 0.1 and c.rule == "all" else 0.0))
+    weaker = Made({}, lambda c, r: papers_world(c, r) + (0.1 if c.received_budget < 0.1 and c.rule == "all" else 0.0))
     return rows.judge({"zero": Made({}, papers_world), "masked": weaker}, ELSEWHERE)
 
 

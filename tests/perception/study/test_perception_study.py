@@ -25,13 +25,13 @@ def rows_with(
 ) -> list[StudyRow]:
     """One network's rows: these contrasts by budget, the rest plain."""
     base = replace(ONE, **changes)  # type: ignore[arg-type]
-    out = [replace(base, quantity="gain", rho=math.nan, value=18.0, low=16.0, high=20.0)]
+    out = [replace(base, quantity="gain", received_budget=math.nan, value=18.0, low=16.0, high=20.0)]
     out += [
-        replace(base, rho=rho, value=v, low=v - half_width, high=v + half_width)
-        for rho, v in zip(BUDGETS, contrasts, strict=True)
+        replace(base, received_budget=budget, value=v, low=v - half_width, high=v + half_width)
+        for budget, v in zip(BUDGETS, contrasts, strict=True)
     ]
-    out.append(replace(base, quantity="starved", rho=0.01, value=-3.0, low=-4.0, high=-2.0))
-    out.append(replace(base, quantity="oracle", rho=math.nan, value=0.4, low=0.1, high=0.9))
+    out.append(replace(base, quantity="starved", received_budget=0.01, value=-3.0, low=-4.0, high=-2.0))
+    out.append(replace(base, quantity="oracle", received_budget=math.nan, value=0.4, low=0.1, high=0.9))
     return out
 
 

@@ -233,13 +233,13 @@ def test_a_frame_reads_back_from_its_recording(tmp_path: Path) -> None:
     assert len(found["/world/found", "Boxes3D:centers"]) == 1
     assert len(found["/world/drones", "Points3D:positions"]) == 5
     assert ("/world/mission", "LineStrips3D:strips") in found
-    cells = np.array(found["/shared/rho_0.25/cells", "Boxes3D:centers"])
+    cells = np.array(found["/shared/budget_0.25/cells", "Boxes3D:centers"])
     # the ego stands at (10, 0) and looks east: row 40 is (40.5 − 32) · 3.2 m ahead, column 20 to its right
     assert cells[:, :2].tolist() == pytest.approx(
         np.array([[10 + 8.5 * 3.2, -11.5 * 3.2], [10 - 21.5 * 3.2, -21.5 * 3.2]])[::-1]
     )
     r, g, b, a = SHADES[4]
-    assert found["/shared/rho_0.25/cells", "Boxes3D:colors"][0] == (r << 24 | g << 16 | b << 8 | a)
+    assert found["/shared/budget_0.25/cells", "Boxes3D:colors"][0] == (r << 24 | g << 16 | b << 8 | a)
     assert {e for e, _ in found if e.startswith("/views/")} == {
         f"/views/drone_{d}/{c}" for d in range(5) for c in ("front", "left", "right", "back", "nadir")
     }
