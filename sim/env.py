@@ -276,7 +276,7 @@ class _Flight:
         """AP of its fusions in the second, less what it sent and spent."""
         new = {**self._new, "mission": self._mission}
         fusions = new["fusions"].filter(pc.equal(new["fusions"]["drone"], drone))
-        record = SortieRecord(self._scenario, "", 0, 0, code_version(), {**new, "fusions": fusions}, {})
+        record = SortieRecord(self._scenario, "", 0, 0, code_version(), "", {**new, "fusions": fusions}, {})
         frames = list(matched(record, mission=True).values()) or list(matched(record, mission=False).values())
         ap = average_precision(frames) if frames else 0.0
         sent = new["transmissions"]

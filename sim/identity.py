@@ -11,10 +11,12 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 from sortie.policies.user_code import imported_files
 from sortie.scenarios.reading.files import named_files
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.traces import located
 
 DISTRIBUTION = "sortie-sim"
 RELEASE = version(DISTRIBUTION)
@@ -53,37 +55,84 @@ def release_of(code: str) -> str:
     return code.partition("+")[0]
 
 
-def user_code(scenario: Scenario, policy: str | Callable[..., object] | None = None) -> dict[str, str]:
-    """The user's own code that a sortie runs: every Python file that the scenario names, and every module that such a
-    file imports from outside the standard library and installed packages.
+def name_of(thing: object) -> str:
+    """The name under which a record keeps a policy or a detector that was passed as a Python object.
+
+    That is its attribute `name`, where the object or its own class has one. A subclass does not inherit it, because it
+    may do something else. Without one it is the module and the qualified name, with the arguments that a `partial` binds.
+
+    Example:
+        >>> name_of(functools.partial(release_of, code="0.1.0+0"))
+        "sortie.sim.identity.release_of(code='0.1.0+0')"
+    """
+    if isinstance(thing, functools.partial):
+        bound = [*map(repr, thing.args), *(f"{key}={value!r}" for key, value in thing.keywords.items())]
+        return f"{name_of(thing.func)}({', '.join(bound)})"
+    own = {*vars(type(thing)), *getattr(thing, "__dict__", ())}
+    if "name" in own and isinstance(name := getattr(thing, "name", None), str):
+        return name
+    source: Any = thing if hasattr(thing, "__qualname__") else type(thing)
+    return f"{source.__module__}.{source.__qualname__}"
+
+
+def own_files(
+    scenario: Scenario, policy: str | Callable[..., object] | None = None, detector: object = None
+) -> dict[str, str]:
+    """The files beside the package that a sortie reads.
+
+    Those are the files that the scenario names (policies, weights, recordings, fusion, traces), the files of objects
+    that were passed in, and the modules that Python files among them import. The standard library and installed
+    packages do not count.
 
     Args:
-        scenario: whose policies and fusion may be in files.
-        policy: a name, `file.py:function` or a callable that decides in place of the scenario's policy.
+        scenario: what flies.
+        policy: a name, `file.py:function` or a callable that decides in place of the scenario's policies.
+        detector: the detector that flies.
 
     Returns:
-        16 hex digits of SHA-256 by path; a callable that is in no file stands under its name with the digest of its
+        16 hex digits of SHA-256 by path. An object without a file stands under its name, with the digest of its
         source, or of nothing where Python has none.
+
+    Raises:
+        OSError: a file cannot be read.
     """
-    named = [Path(name) for name in named_files(scenario.model_dump(mode="json")) if name.endswith(".py")]
-    found = {}
-    if isinstance(policy, str):
-        named += [Path(policy.rpartition(":")[0])] if ":" in policy else []
-    elif policy is not None:
-        function = inspect.unwrap(policy.func if isinstance(policy, functools.partial) else policy)
+    sections = scenario.model_dump(mode="json")
+    if policy is not None and policy != scenario.policy.name:
+        sections["policy"] = {"name": policy if isinstance(policy, str) else ""}
+    named = {name: located(Path(name)) for name in named_files(sections)}
+    found = {name: _digest(path) for name, path in named.items() if path.suffix != ".py"}
+    code = [path for path in named.values() if path.suffix == ".py"]
+    for thing in (None if isinstance(policy, str) else policy, detector):
+        function: Any = inspect.unwrap(thing.func if isinstance(thing, functools.partial) else thing)  # type: ignore[arg-type]
         function = function if inspect.isroutine(function) else type(function)
-        home = str(getattr(function, "__module__", "")).partition(".")[0]
+        if thing is None or str(getattr(function, "__module__", "")).partition(".")[0] == "sortie":
+            continue
         try:
             file = Path(inspect.getsourcefile(function) or "")
             source = inspect.getsource(function)
         except (OSError, TypeError):  # typed in, or written in C
             file, source = Path(), ""
-        if file.is_file() and home != "sortie":
-            named.append(file)
-        elif home != "sortie":
-            found[function.__qualname__] = hashlib.sha256(source.encode()).hexdigest()[:16]
-    files = {file for path in named for file in imported_files(path)}
-    return found | {_shown(path): file_digest(path)[:16] for path in sorted(files)}
+        if file.is_file():
+            code.append(file)
+        else:
+            found[name_of(thing)] = hashlib.sha256(source.encode()).hexdigest()[:16]
+    modules = {file for path in code for file in imported_files(path)}
+    return found | {_shown(path): _digest(path) for path in sorted(modules)}
+
+
+def _digest(path: Path) -> str:
+    """16 hex digits of a file, or of a folder's files with their names."""
+    if not path.is_dir():
+        return _digest_as_it_stands(path, path.stat().st_size, path.stat().st_mtime_ns)
+    inside = sorted(file for file in path.rglob("*") if file.is_file())
+    lines = "".join(f"{file.relative_to(path).as_posix()} {_digest(file)}\n" for file in inside)
+    return hashlib.sha256(lines.encode()).hexdigest()[:16]
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest_as_it_stands(path: Path, size: int, changed_ns: int) -> str:
+    """A recording may be large and fly often: a file is read again only once it has changed."""
+    return file_digest(path)[:16]
 
 
 def _shown(path: Path) -> str:

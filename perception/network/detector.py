@@ -86,6 +86,9 @@ class TorchDetector:
     are handed in, and what a task waits for is settled, and handed in, before it is. The numbers do not depend on it.
     """
 
+    name = "torch"
+    """As `perception.detector` names it."""
+
     def __init__(
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:

@@ -39,6 +39,9 @@ class RecordedDetector:
         RecordingError: a broken recording, one of several scenes, or of other features than the radio carries.
     """
 
+    name = "recorded"
+    """As `perception.detector` names it."""
+
     def __init__(self, config: Perception) -> None:
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config

@@ -57,6 +57,9 @@ class SurrogateDetector:
         InputError: a calibration that is missing or broken, or of another fusion than `perception.fusion`.
     """
 
+    name = "surrogate"
+    """As `perception.detector` names it."""
+
     def __init__(
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from sortie.sim.folders import RunError, write_text
 
-LEFT_OUT = ("fingerprint", "version", "user_code", "wall_s", "realtime_factor", "policy_eval_us")
+LEFT_OUT = ("fingerprint", "version", "own_files", "wall_s", "realtime_factor", "policy_eval_us")
 """Wall clock, and what changes with every release."""
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 """Tolerances of a new file; edit them there. Other processors round a network's output differently."""

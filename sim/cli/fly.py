@@ -11,6 +11,8 @@ import typer
 from rich.markup import escape
 
 import sortie
+from sortie.scenarios.reading.load import ScenarioError, load
+from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
 from sortie.sim.cli.console import bars, out
@@ -18,6 +20,7 @@ from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
+from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results import run_folder
 
 
@@ -66,9 +69,11 @@ def fly(
     """Fly one sortie, print its outcome and save the run."""
     if campaign is not None or run is not None:
         flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
+        own = None
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
-    path = out_dir or run_folder.default_path(flown, seed, number)
+        own = _as_filed(_named(scenario), flown.policy.name)
+    path = out_dir or run_folder.default_path(flown, flown.seed if seed is None else seed, number, own)
     run_folder.ensure_writable(path)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
@@ -107,6 +112,15 @@ def _named(scenario: str | None) -> str:
     if scenario is None:
         raise RunError("no scenario named, as in: sortie fly track_target")
     return scenario
+
+
+def _as_filed(scenario: str, policy: str) -> Scenario | None:
+    """The scenario without `--set`, under a policy; None where the file is a scenario only with `--set`."""
+    try:
+        own = load(scenario)
+        return own if policy == own.policy.name else load(scenario, policy_overrides(policy, own.policy.name))
+    except ScenarioError:
+        return None
 
 
 @contextmanager

@@ -28,7 +28,7 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table.add_column()
     ap, data = result["ap50"], result["bytes"]
     if ap["detector"] != "none":
-        model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else ""
+        model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else f"; {ap['detector']}"
         rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{model}"
         table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
         for phase in result["phases"]:
@@ -69,6 +69,8 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table.add_row(
         "wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(result['realtime_factor'], '.1f')} × real time"
     )
+    if result["own_files"]:
+        table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
     table.add_row("fingerprint", result["fingerprint"][:16])
     return table
 

@@ -35,7 +35,7 @@ from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
-from sortie.sim.identity import code_version, user_code
+from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 
 KEY_ID = 1
@@ -84,12 +84,12 @@ def run_sortie(
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
-    code = user_code(scenario, policy)  # as it is now: a file may be edited while the sortie flies
     parts = build(scenario, policies, seed, replication, detector_of)
+    files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited while the sortie flies
     _fly(parts, progress, observer)
     record = _collect(parts, name, seed, replication)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
-    return dataclasses.replace(record, user_code=code, wall=wall)
+    return dataclasses.replace(record, own_files=files, wall=wall)
 
 
 @dataclass(frozen=True)
@@ -222,6 +222,7 @@ def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRe
         seed=seed,
         replication=replication,
         version=code_version(),
+        detector="none" if parts.detector is None else name_of(parts.detector),
         tables=tables,
         totals={**notes.totals(), **parts.audit.totals(), **counters, "medium_busy_fraction": air.utilisation},
         calibration=parts.detector.calibration if isinstance(parts.detector, DetectsMany) else None,
@@ -260,9 +261,5 @@ def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Polic
     section = scenario.policy
     if policy is None or policy == section.name:
         return section.name, plan_of(section)
-    first = (
-        named_policy(policy, {})
-        if isinstance(policy, str)
-        else NamedPolicy(getattr(policy, "__name__", "policy"), policy)
-    )
+    first = named_policy(policy, {}) if isinstance(policy, str) else NamedPolicy(name_of(policy), policy)
     return first.name, plan_of(section, first)

@@ -32,13 +32,16 @@ APPLICATION = "sortie"
 class Playback:
     """Draws one sortie into a recording, all below `root`, from tables that come whole or second by second."""
 
-    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "") -> None:
+    def __init__(
+        self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "", policy: str = ""
+    ) -> None:
+        """Args: `policy` is the record's name of what flies; empty, the scenario's own flies."""
         canvas = Canvas(recording, scenario.context.rate_hz, root)
         self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
         self._disc_t_s: Floats = np.zeros(0)
         self._discs: Floats = np.zeros((0, 3))
         if not root:
-            recording.send_recording_name(f"{scenario.name} · {scenario.policy.name} · seed {scenario.seed}")
+            recording.send_recording_name(f"{scenario.name} · {policy or scenario.policy.name} · seed {scenario.seed}")
         canvas.static("about", legend(scenario))
         self._scene.begin()
         self._charts.begin()
@@ -61,7 +64,8 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
         RunError: the file cannot be written.
     """
     with new_file(path, blueprint(record.scenario)) as recording:
-        Playback(recording, record.scenario, scene_of(record)).add(record.scenario.duration_s, record.tables)
+        playback = Playback(recording, record.scenario, scene_of(record), policy=record.policy)
+        playback.add(record.scenario.duration_s, record.tables)
 
 
 def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> None:

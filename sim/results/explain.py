@@ -45,7 +45,7 @@ def _payloads(result: dict[str, Any]) -> str:
 def _fused(record: SortieRecord, result: dict[str, Any]) -> str:
     fusions = record.tables["fusions"]
     if not fusions.num_rows:
-        return f"nothing was scored (perception.detector is {record.scenario.perception.detector})"
+        return f"nothing was scored (the detector is {record.detector})"
     held = pc.sum(pc.list_value_length(fusions["peers"])).as_py() or 0
     age = result["data_age_s"]["p50"]
     late = "" if age is None else f", {age:.2f} s old at the median"

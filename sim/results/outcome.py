@@ -46,13 +46,14 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "seed": record.seed,
         "replication": record.replication,
         "version": record.version,
-        "user_code": dict(record.user_code),
+        "own_files": dict(record.own_files),
         "fingerprint": record.fingerprint,
         "duration_s": scenario.duration_s,
         "frame_s": scenario.frame_s,
         "ap50": {
             **_accuracy(both),
-            "detector": scenario.perception.detector,
+            "detector": record.detector,
+            "fusion": _fusion(record),
             "calibration": record.calibration,
             "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
@@ -127,6 +128,12 @@ def both_matched(record: SortieRecord) -> Both:
     """Every scored fusion matched in the full scene and in the mission disc."""
     fusions = _Fusions(record, 0.0, float("inf"))
     return {"full_scene": fusions.in_full(), "mission": fusions.in_mission()}
+
+
+def _fusion(record: SortieRecord) -> str | None:
+    """What fuses payloads, as the scenario names it; None where a detector flew that the scenario does not name."""
+    section = record.scenario.perception
+    return (section.recorded_fusion or section.fusion) if record.detector == section.detector != "none" else None
 
 
 class _Fusions:

@@ -30,7 +30,13 @@ class Accuracy(TypedDict):
 
 
 class Ap50(Accuracy):
-    detector: Annotated[str, "`perception.detector`."]
+    detector: Annotated[
+        str, "The detector that flew: `perception.detector`, or for one passed in its `name` or module and class."
+    ]
+    fusion: Annotated[
+        str | None,
+        "`perception.fusion` or `perception.recorded_fusion`; null where the scenario's detector did not fly.",
+    ]
     calibration: Annotated[str | None, "Which fit a surrogate detector is of."]
     sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
     scored_fusions: Annotated[int, "How many fusions were scored."]
@@ -98,13 +104,19 @@ class Outcome(TypedDict):
     """All of `outcome.json`; what is a ratio of nothing is null."""
 
     scenario: Annotated[str, "Its name."]
-    policy: Annotated[str, "The policy flown."]
+    policy: Annotated[
+        str, "The policy that flew, by its name; one passed as a callable by its `name` or module and function."
+    ]
     seed: Annotated[int, "Of every random draw."]
     replication: Annotated[int, "Which draw of a campaign."]
     version: Annotated[
         str, "The code that made the record: release, plus sign, digest of the package and its libraries."
     ]
-    user_code: Annotated[dict[str, str], "Digest of each file of the user's own code that the sortie ran."]
+    own_files: Annotated[
+        dict[str, str],
+        "Digest of each file beside the package that flew: policies, detector and fusion with the modules that they "
+        "import, weights, recordings, traces.",
+    ]
     fingerprint: Annotated[str, "SHA-256 over the record's values; equal inputs give equal fingerprints."]
     duration_s: Annotated[float, "Length of the sortie."]
     frame_s: Annotated[float, "From one frame to the next."]
@@ -170,7 +182,7 @@ def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bo
         "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
         "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
         "phases": tuple(map(str, range(phases))),
-        "user_code": (),  # digests are no numbers
+        "own_files": (),  # digests are no numbers
     }
 
 

@@ -110,13 +110,15 @@ class SortieRecord:
     replication: int
     version: str
     """Of the code that made it, as `sortie.sim.identity.code_version`."""
+    detector: str
+    """The detector that flew, as `sortie.sim.identity.name_of` names it; `none` without one."""
     tables: Mapping[str, pa.Table]
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""
     calibration: str | None = None
     """Which fit a surrogate detector is of; None with any other."""
-    user_code: Mapping[str, str] = field(default_factory=dict)
-    """Digests of the user's own code, as `sortie.sim.identity.user_code`; no part of the fingerprint."""
+    own_files: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the files beside the package, as `sortie.sim.identity.own_files`; no part of the fingerprint."""
     wall: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
 

@@ -73,7 +73,7 @@ def page(record: SortieRecord) -> str:
 <h2>In numbers</h2>
 {_numbers(result)}
 <details><summary>The scenario as it was flown</summary><pre>{escape(dump(scenario))}</pre></details>
-<footer>Fingerprint {result["fingerprint"]}: the same scenario, policy, seed and version give the same one.</footer>
+{_own_files(result)}<footer>Fingerprint {result["fingerprint"]}: the same scenario, policy, seed and version give the same one.</footer>
 </main></body>
 </html>
 """
@@ -99,6 +99,12 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Context plane", size(data["context_sent"]), f"{percent(result['context_share'])} of all bytes"),
         ("Energy", f"{result['energy_j']['total'] / 1e3:.1f} kJ", f"least charge left {percent(least)}"),
     ]  # fmt: skip
+
+
+def _own_files(result: dict[str, Any]) -> str:
+    """The files beside the package that flew, with their digests; empty where there are none."""
+    lines = "\n".join(f"{escape(name)}  {digest}" for name, digest in result["own_files"].items())
+    return f"<details><summary>Own files, SHA-256</summary><pre>{lines}</pre></details>\n" if lines else ""
 
 
 def _decisions(result: dict[str, Any]) -> str:

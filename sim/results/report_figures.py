@@ -56,7 +56,7 @@ def figures(record: SortieRecord) -> dict[str, str]:
         ("Age of descriptors when a policy read them, 99th percentile, ms", 1.8, _age),
         ("The way over the ground, m: drones, and the target with its mission disc", 4.2, _map),
     ]
-    if record.scenario.perception.detector == "none":
+    if record.detector == "none":
         del plots[1]
     style: dict[Any, Any] = {
         "svg.hashsalt": "sortie", "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Callable
@@ -25,11 +26,24 @@ WRITTEN = frozenset(
 """All that a run's folder may hold for another run to take its place: what can be made again."""
 
 
-def default_path(scenario: Scenario, seed: int | None, replication: int) -> Path:
-    """`runs/SCENARIO-POLICY-seedN`: flying the same sortie again replaces it, and a line says so where the settings differ."""
+def default_path(scenario: Scenario, seed: int, replication: int, own: Scenario | None) -> Path:
+    """The run's folder, named after what flies: `runs/SCENARIO-sSEED-POLICY`, then `-rN` for a replication.
+
+    Six hex digits follow where the scenario is not as its file has it. They are a digest of all that flies but the
+    seed, so that other settings, and other parameters of the policy, have folders of their own. The same sortie flown
+    again has the same folder.
+
+    Args:
+        scenario: what flies.
+        seed, replication: of the random draws.
+        own: the scenario as its file has it, under the same policy; None where there is no such file.
+    """
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
-    rep = f"-rep{replication}" if replication else ""
-    return Path("runs") / f"{scenario.name}-{policy}-seed{scenario.seed if seed is None else seed}{rep}"
+    parts = [scenario.name, f"s{seed}", policy, *([f"r{replication}"] if replication else [])]
+    flown, filed = (None if s is None else s.model_dump_json(exclude={"seed"}) for s in (scenario, own))
+    if flown != filed:
+        parts.append(hashlib.sha256(str(flown).encode()).hexdigest()[:6])
+    return Path("runs") / "-".join(parts)
 
 
 def ensure_writable(path: Path) -> None:
@@ -65,7 +79,8 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
             "replication": record.replication,
             "version": record.version,
             "calibration": record.calibration,
-            "user_code": dict(record.user_code),
+            "detector": record.detector,
+            "own_files": dict(record.own_files),
             "totals": dict(record.totals),
             "wall": dict(record.wall),
         }

@@ -115,7 +115,7 @@ def test_metrics_are_the_outcomes_numbers_by_dotted_name() -> None:
 
 @pytest.mark.parametrize(
     ("policy", "name"),
-    [(None, "worked"), ("silence", "silence"), ("best-2(received_budget=0.1)", "best-2"), (quiet, "quiet")],
+    [(None, "worked"), ("silence", "silence"), ("best-2(received_budget=0.1)", "best-2"), (quiet, "test_api.quiet")],
 )
 def test_a_policy_is_a_name_with_parameters_or_a_callable(policy: object, name: str) -> None:
     assert sortie.fly("track_target", SHORT, policy=policy).policy == name  # type: ignore[arg-type]

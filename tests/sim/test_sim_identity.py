@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sim_examples import example
 
+from sortie.perception.detectors import DETECTORS, DetectorKind
+from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
+from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
 from sortie.sim import identity
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 
 FILES = ("__init__.py", "fleet/agent.py", "perception/weights/net.safetensors", "sim/core.cpython-311.so")
@@ -74,17 +79,17 @@ def test_the_users_own_code_is_named_with_a_digest_of_each_file(
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "helper.py").write_text("PEERS = 2\n")
     scenario = example("duration_s=1", "perception.detector=none")
-    by_name = run_sortie(example("duration_s=1", "policy.name='mine.py:decide'", "policy.params={}")).user_code
+    by_name = run_sortie(example("duration_s=1", "policy.name='mine.py:decide'", "policy.params={}")).own_files
     assert set(by_name) == {"mine.py", "helper.py"}
     assert (
-        run_sortie(scenario, "mine.py:decide").user_code
+        run_sortie(scenario, "mine.py:decide").own_files
         == by_name
-        == outcome(run_sortie(scenario, "mine.py:decide"))["user_code"]
+        == outcome(run_sortie(scenario, "mine.py:decide"))["own_files"]
     )
     (tmp_path / "helper.py").write_text("PEERS = 3\n")
-    after = run_sortie(scenario, "mine.py:decide").user_code
+    after = run_sortie(scenario, "mine.py:decide").own_files
     assert (after["mine.py"], after["helper.py"] != by_name["helper.py"]) == (by_name["mine.py"], True)
-    assert run_sortie(scenario).user_code == {}
+    assert run_sortie(scenario).own_files == {}
 
 
 def quiet(view: FleetView) -> list[Directive]:
@@ -93,12 +98,12 @@ def quiet(view: FleetView) -> list[Directive]:
 
 def test_a_callables_file_counts_and_one_without_a_file_by_its_source() -> None:
     scenario = example("duration_s=1", "perception.detector=none")
-    (name,) = (n for n in identity.user_code(scenario, quiet) if n.endswith("test_sim_identity.py"))
-    assert identity.user_code(scenario, quiet)[name] == identity.file_digest(Path(__file__))[:16]
+    (name,) = (n for n in identity.own_files(scenario, quiet) if n.endswith("test_sim_identity.py"))
+    assert identity.own_files(scenario, quiet)[name] == identity.file_digest(Path(__file__))[:16]
     space: dict[str, Any] = {"__name__": "typed_in"}
     exec("def decide(view):\n    return []\n", space)  # noqa: S102 - as it is typed into an interpreter
-    assert list(identity.user_code(scenario, space["decide"])) == ["decide"]
-    assert identity.user_code(scenario, resolve("worked")) == {}
+    assert list(identity.own_files(scenario, space["decide"])) == ["typed_in.decide"]
+    assert identity.own_files(scenario, resolve("worked")) == {}
 
 
 def test_a_change_of_code_that_changes_no_value_leaves_the_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,3 +113,107 @@ def test_a_change_of_code_that_changes_no_value_leaves_the_fingerprint(monkeypat
     after = run_sortie(scenario)
     assert after.version != before.version
     assert after.fingerprint == before.fingerprint
+
+
+class Blind:
+    """A detector that was passed in: it finds nothing."""
+
+    def detect(self, jobs: Any) -> list[Boxes]:
+        return [Boxes.empty() for _ in jobs]
+
+    def truth(self, t_s: float, ego: Any) -> Boxes:
+        return Boxes.empty()
+
+    def count_boxes(self, capture: Any, roi: Any) -> int:
+        return 0
+
+
+class Called(Blind):
+    name = "my model 3"
+
+
+class Derived(Called):
+    pass
+
+
+SHORT = ("duration_s=1", "perception.detector=torch")
+
+
+@pytest.mark.parametrize(
+    ("detector", "name"),
+    [
+        (Blind(), f"{__name__}.Blind"),
+        (Called(), "my model 3"),
+        (Derived(), f"{__name__}.Derived"),
+        (None, "none"),
+    ],
+)
+def test_the_record_names_the_detector_that_flew(detector: Any, name: str, tmp_path: Path) -> None:
+    record = run_sortie(example(*SHORT), detector_of=lambda scene, config, seed, replication: detector)
+    run_folder.save(record, tmp_path / "run")
+    accuracy = outcome(run_folder.load(tmp_path / "run"))["ap50"]
+    assert (record.detector, accuracy["detector"], accuracy["fusion"]) == (name, name, None)
+    named = [Path(file).name for file in record.own_files]
+    assert ("test_sim_identity.py" in named) == (detector is not None)
+
+
+def test_the_table_of_detectors_does_not_name_what_stands_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guide has a reader try a detector under the name of another one."""
+    mine = DetectorKind("finds nothing", lambda scene, config, seed, replication: Called())
+    monkeypatch.setitem(DETECTORS, "torch", mine)
+    assert outcome(run_sortie(example(*SHORT)))["ap50"]["detector"] == "my model 3"
+
+
+def test_the_scenarios_own_detector_has_its_name_and_fusion() -> None:
+    accuracy = outcome(run_sortie(example("duration_s=1", "perception.detector=surrogate")))["ap50"]
+    assert (accuracy["detector"], accuracy["fusion"]) == ("surrogate", "disconet")
+
+
+def test_own_weights_are_named_with_their_digest(tmp_path: Path) -> None:
+    weights = tmp_path / "mine.safetensors"
+    weights.write_bytes(CALIBRATION.read_bytes())
+    flown = example("duration_s=1", "perception.detector=surrogate", f"perception.weights={weights}")
+    assert outcome(run_sortie(flown))["own_files"] == {str(weights): identity.file_digest(weights)[:16]}
+
+
+def test_a_folder_is_named_with_one_digest_of_its_files(tmp_path: Path) -> None:
+    recording = tmp_path / "seen.zarr"
+    recording.mkdir()
+    (recording / "a").write_text("1")
+    asked = ("duration_s=1", "perception.detector=recorded", f"perception.recording={recording}")
+    before = identity.own_files(example(*asked))
+    assert list(before) == [str(recording)]
+    (recording / "a").rename(recording / "b")
+    assert identity.own_files(example(*asked)) != before
+
+
+def test_the_files_of_a_policy_that_does_not_fly_do_not_count(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def decide(view):\n    return []\n")
+    own = example("duration_s=1", f"policy.name='{tmp_path}/mine.py:decide'", "policy.params={}")
+    assert identity.own_files(own, "silence") == {}
+
+
+def typed(view: FleetView, rho: float = 1.0) -> list[Directive]:
+    return []
+
+
+class Policy:
+    def __call__(self, view: FleetView) -> list[Directive]:
+        return []
+
+
+@pytest.mark.parametrize(
+    ("policy", "name"),
+    [
+        (typed, f"{__name__}.typed"),
+        (functools.partial(typed, rho=0.1), f"{__name__}.typed(rho=0.1)"),
+        (Policy(), f"{__name__}.Policy"),
+        (Policy().__call__, f"{__name__}.Policy.__call__"),
+        (resolve("silence"), "sortie.policies.catalogue.baselines.silence"),
+    ],
+)
+def test_a_policy_passed_as_a_callable_is_named_by_its_module(policy: Any, name: str) -> None:
+    """`worked` of one's own is not the catalogue's."""
+    record = run_sortie(example("duration_s=1"), policy)
+    assert outcome(record)["policy"] == name
+    assert list(outcome(record)["policies"]["decisions"]) == [name]

@@ -193,7 +193,8 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     for word in ("context plane", "data plane", "energy", "fingerprint", "decisions and events"):
         assert word in done.stdout
-    kept = json.loads((tmp_path / "runs" / "example-worked-seed1" / "outcome.json").read_text())
+    (folder,) = (tmp_path / "runs").glob("example-s1-worked-??????")
+    kept = json.loads((folder / "outcome.json").read_text())
     assert max(kept["battery"].values()) < 0.5
     again = sortie(
         "fly",
@@ -210,6 +211,51 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     assert again.returncode == 0, again.stderr
     kept = json.loads((tmp_path / "here" / "outcome.json").read_text())
     assert (kept["policy"], kept["seed"]) == ("best-2", 7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "folder"),
+    [
+        ((), "example-s1-worked"),
+        (("--seed", "4"), "example-s4-worked"),
+        (("--set", "seed=4"), "example-s4-worked"),
+        (("--replication", "2"), "example-s1-worked-r2"),
+        (("--policy", "silence"), "example-s1-silence"),
+        (("--policy", "worked(rho=0.25)"), "example-s1-worked"),
+        (("--policy", "worked(rho=0.5)"), "example-s1-worked-[0-9a-f]{6}"),
+        (("--set", "fleet.drones=3", "--seed", "4"), "example-s4-worked-[0-9a-f]{6}"),
+        (("--set", "policy.name=silence", "--set", "policy.params={}"), "example-s1-silence"),
+    ],
+)
+def test_a_runs_folder_is_named_after_what_flew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], folder: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = BASE.replace("duration_s: 6", "duration_s: 0.5").replace("at_s: 3, phase: track", "at_s: 0.3, phase: track")
+    (tmp_path / "example.yaml").write_text(text)
+    assert command("fly", "example.yaml", "--no-recording", *arguments) == 0
+    (made,) = (tmp_path / "runs").iterdir()
+    assert re.fullmatch(folder, made.name)
+
+
+def test_other_settings_have_a_folder_of_their_own_and_the_same_ones_do_not(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fly = ("fly", scenario, "--no-recording", "--set", "duration_s=0.5", "--set", "mission.phases=[{}]")
+    for drones in (2, 3, 2):
+        assert command(*fly, "--set", f"fleet.drones={drones}") == 0
+    assert len(list((tmp_path / "runs").iterdir())) == 2
+
+
+def test_a_scenario_that_lacks_a_field_in_its_file_flies_with_it_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "open.yaml").write_text("name: open\nduration_s: -1\nperception: {detector: none}\n")
+    assert command("fly", "open.yaml", "--no-recording", "--set", "duration_s=0.5") == 0
+    (made,) = (tmp_path / "runs").iterdir()
+    assert re.fullmatch("open-s1-worked-[0-9a-f]{6}", made.name)
 
 
 def test_a_run_that_another_replaces_is_told(
