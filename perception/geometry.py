@@ -66,6 +66,24 @@ def to_world(forward_m: Any, left_m: Any, pose: Any) -> tuple[Any, Any]:
     return pose[0] + c * forward_m - s * left_m, pose[1] + s * forward_m + c * left_m
 
 
+def camera_margins(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+    """How far inside a picture a direction lies: 1 in the middle, 0 at the edge, negative outside.
+
+    Args:
+        x, y, z: the direction in the body frame (FLU), numbers or arrays.
+
+    Returns:
+        The margin in the camera that looks straight down, and in that of the four pitched cameras which faces the
+        direction. A direction that another pitched camera sees is in the facing one, too.
+    """
+    depth, across, along = np.maximum(-z, 0.1), np.abs(y), np.abs(x)
+    down = 1.0 - np.maximum(across / HALF_H, along / HALF_V) / depth
+    ahead, right = np.maximum(along, across), np.minimum(along, across)
+    forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
+    u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
+    return down, 1.0 - np.maximum(u, v)
+
+
 def in_square(
     xy_m: NDArray[np.floating], poses: ArrayLike, half_extent_m: float = FULL.half_extent_m
 ) -> NDArray[np.bool_]:

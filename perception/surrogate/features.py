@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.perception.geometry import FULL, HALF_H, HALF_V
+from sortie.perception.geometry import FULL, camera_margins
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
@@ -241,12 +241,7 @@ def _in_view(tilt: Floats, local: Floats, height_m: Floats) -> tuple[NDArray[np.
     `tilt` is [3, 3, n], so that each of its numbers is a run in memory."""
     ahead_m, left_m, drop_m = local[:, 0], local[:, 1], height_m - 0.8
     x, y, z = (tilt[0, k] * ahead_m + tilt[1, k] * left_m - tilt[2, k] * drop_m for k in range(3))
-    depth, across, along = np.maximum(-z, 0.1), np.abs(y), np.abs(x)
-    down = 1.0 - np.maximum(across / HALF_H, along / HALF_V) / depth
-    ahead, right = np.maximum(along, across), np.minimum(along, across)
-    forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
-    u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
-    side = 1.0 - np.maximum(u, v)
+    down, side = camera_margins(x, y, z)
     return down > 0.0, np.maximum(down, side)
 
 

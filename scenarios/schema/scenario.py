@@ -96,6 +96,13 @@ class Scenario(Section):
         """Frames that begin before the end (end exclusive)."""
         return math.ceil(round(self.duration_s * self.context.rate_hz, 9))
 
+    @property
+    def scored_frames(self) -> list[int]:
+        """The frames in which accuracy is scored, `perception.sample_rate_hz` of them a second; the first one is."""
+        share = min(1.0, self.perception.sample_rate_hz / self.context.rate_hz)
+        before = [math.floor((frame - 1) * share + 1e-9) for frame in range(self.frames + 1)]
+        return [frame for frame in range(self.frames) if before[frame + 1] > before[frame]]
+
 
 def json_schema() -> dict[str, Any]:
     """The JSON Schema of a scenario, for editors."""

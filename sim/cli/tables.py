@@ -26,11 +26,19 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table = Table(title=f"{result['scenario']} · {result['policy']} · seed {result['seed']}", show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    ap, data = result["ap50"], result["bytes"]
+    ap, data, mission = result["ap50"], result["bytes"], result["mission"]
+    if mission["flown_share"] < 1.0:
+        table.add_row("flown", f"{percent(mission['flown_share'])} of drone-seconds")
     if ap["detector"] != "none":
         model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else f"; {ap['detector']}"
         rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{model}"
         table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
+        if mission["flown_share"] < 1.0:
+            blind = ap["grounded_blind"]
+            table.add_row(
+                "  grounded drones blind",
+                f"{number(blind['full_scene'])} full scene, {number(blind['mission'])} mission",
+            )
         for phase in result["phases"]:
             seen = phase["ap50"]
             payload = (
@@ -41,6 +49,8 @@ def outcome_table(result: dict[str, Any]) -> Table:
                 f"{number(seen['full_scene'])} full, {number(seen['mission'])} mission, "
                 f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {percent(phase['deadline_miss_rate'])} missed",
             )
+    if seen_of_mission := _mission_in_words(mission):
+        table.add_row("mission", seen_of_mission)
     table.add_row(
         "context plane",
         f"{size(data['context_sent'])} ({percent(result['context_share'])} of all bytes), "
@@ -73,6 +83,20 @@ def outcome_table(result: dict[str, Any]) -> Table:
         table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
     table.add_row("fingerprint", result["fingerprint"][:16])
     return table
+
+
+def _mission_in_words(mission: dict[str, Any]) -> str:
+    """What the fleet saw of its region and its target; empty where it has neither."""
+    told = []
+    if mission["region_observed_share"] is not None:
+        told.append(f"{percent(mission['region_observed_share'])} of the region in view")
+    for what, share, gap in (("in view", "in_view", "out_of_view"), ("detected", "detected", "undetected")):
+        if mission[f"target_{share}_share"] is not None:
+            gap_s = mission[f"target_longest_{gap}_s"]
+            told.append(
+                f"target {what} {percent(mission[f'target_{share}_share'])} of the time, longest gap {gap_s:.1f} s"
+            )
+    return "; ".join(told)
 
 
 def transitions_table(result: dict[str, Any]) -> Table:
@@ -151,7 +175,24 @@ def _side_by_side(rows: Sequence[Compared]) -> dict[str, list[str]]:
         "  compute": lambda r: f"{r.outcome['energy_j']['compute'] / 1e3:.2f} kJ",
         "charge left, least": lambda r: percent(min(r.outcome["battery"].values(), default=None)),
     }
+    if any(r.outcome["mission"]["flown_share"] < 1.0 for r in rows):
+        figures = {"flown": lambda r: percent(r.outcome["mission"]["flown_share"])} | _with_blind(figures)
     return {name: [figure(r) for r in rows] for name, figure in figures.items()}
+
+
+def _with_blind(figures: dict[str, Callable[[Compared], str]]) -> dict[str, Callable[[Compared], str]]:
+    """The rows, with the AP that counts grounded drones as blind below each AP."""
+    blind = {
+        "AP@0.5 full scene": ("  grounded drones blind", "full_scene"),
+        "AP@0.5 mission": ("  grounded drones blind ", "mission"),
+    }
+    out: dict[str, Callable[[Compared], str]] = {}
+    for name, figure in figures.items():
+        out[name] = figure
+        if name in blind:
+            row, area = blind[name]
+            out[row] = lambda r, area=area: number(r.outcome["ap50"]["grounded_blind"][area])  # type: ignore[misc]
+    return out
 
 
 def _gain(gain: tuple[float, float, float] | None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,12 +16,6 @@ from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import Recorder
-
-
-def scored(frame: int, rate_hz: float, sample_rate_hz: float) -> bool:
-    """Whether a frame is scored, so that `sample_rate_hz` of them are in the mean; the first one is."""
-    share = min(1.0, sample_rate_hz / rate_hz)
-    return math.floor(frame * share + 1e-9) > math.floor((frame - 1) * share + 1e-9)
 
 
 def as_share(received: Received, trust: float = 1.0) -> Share:
@@ -43,6 +36,8 @@ class Ego(NamedTuple):
     """Where it is."""
     job: Job | None
     """What it fuses; None where its own capture is too old, so that it detects nothing."""
+    flying: bool = True
+    """False for a drone that left the air: it fuses nothing, and the cars about its place in the plan are recorded."""
 
 
 Moment = tuple[float, list[Ego]]
@@ -68,12 +63,14 @@ class Scorer:
         detector: Detector,
         agents: Sequence[Agent],
         recorder: Recorder,
+        planned: Callable[[int, int], Capture],
     ) -> None:
+        """Args: `planned` gives where a drone is in a frame, or would be had it not left the air."""
         self._env, self._scenario, self._detector = env, scenario, detector
         # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
-        self._agents, self._recorder = agents, recorder
+        self._agents, self._recorder, self._planned = agents, recorder, planned
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
@@ -85,16 +82,17 @@ class Scorer:
     def _run(self) -> Generator[simpy.Event, Any, None]:
         env, scenario = self._env, self._scenario
         delay_s = scenario.perception.fusion_delay_s
-        for frame in range(scenario.frames):
-            if scored(frame, scenario.context.rate_hz, scenario.perception.sample_rate_hz):
-                yield env.timeout(max(0.0, frame * scenario.frame_s + delay_s - env.now))
-                self._score()
+        for frame in scenario.scored_frames:
+            yield env.timeout(max(0.0, frame * scenario.frame_s + delay_s - env.now))
+            self._score(frame)
 
-    def _score(self) -> None:
+    def _score(self, frame: int) -> None:
         now_s = self._env.now
         moment: Moment = now_s, []
         for agent in self._agents:
-            if agent.status.airborne and agent.here is not None and agent.latest is not None:
+            if not agent.status.airborne:
+                moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
+            elif agent.here is not None and agent.latest is not None:
                 moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
@@ -125,8 +123,10 @@ class Scorer:
         for (now_s, ego), truth in zip(egos_scored, truths, strict=True):
             boxes, shares = (Boxes.empty(), []) if ego.job is None else (next(each), ego.job[1])
             drone = ego.here.drone
-            rows["detections"].append((now_s, drone, boxes))
             rows["truths"].append((now_s, drone, truth))
+            if not ego.flying:
+                continue
+            rows["detections"].append((now_s, drone, boxes))
             rows["fusions"].append(
                 (
                     now_s, drone, [s.capture.drone for s in shares], [s.representation for s in shares],

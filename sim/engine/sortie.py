@@ -172,7 +172,9 @@ def build(
         )
         for i in drones
     ]
-    scorer = None if detector is None else Scorer(env, scenario, detector, agents, recorder)
+    scorer = None
+    if detector is not None:
+        scorer = Scorer(env, scenario, detector, agents, recorder, lambda i, frame: world.sensed(i, frame).capture)
     schedule(scenario, world, transport, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(

@@ -5,18 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.sim.results.record import SortieRecord
 
 FEW = 3
+GROUNDED = ("landed", "drone_lost")
+"""Kinds of events by which a drone leaves the air."""
 
 
 def explain_metric(metric: str, record: SortieRecord, result: dict[str, Any]) -> str:
     """The facts behind a metric: fates of payloads, what was fused, energy by cause; and what happened to the fleet."""
     top = metric.partition(".")[0]
     facts = []
-    if top in ("ap50", "data_age_s", "phases"):
+    if top in ("ap50", "mission"):
+        facts.append(_grounded(record))
+    if top in ("ap50", "mission", "data_age_s", "phases"):
         facts.append(_fused(record, result))
     if top in ("bytes", "context_share", "data_rate_mbps", "deadline_miss_rate", "payload_fates", "phases", "ap50",
                "medium_busy_fraction", "data_age_s"):  # fmt: skip
@@ -40,6 +45,13 @@ def _payloads(result: dict[str, Any]) -> str:
         return "no payload was sent"
     shown = ", ".join(f"{v} {k}" for k, v in _most(fates))
     return f"payloads: {shown} of {sum(fates.values())}, medium {100 * result['medium_busy_fraction']:.0f} % busy"
+
+
+def _grounded(record: SortieRecord) -> str:
+    rows = record.tables["events"].filter(pc.is_in(record.tables["events"]["kind"], pa.array(GROUNDED))).to_pylist()
+    shown = ", ".join(f"drone {r['drone']} at {r['t_s']:g} s ({r['text']})" for r in rows[:FEW])
+    more = f" and {len(rows) - FEW} more" if len(rows) > FEW else ""
+    return f"left the air: {shown}{more}" if rows else ""
 
 
 def _fused(record: SortieRecord, result: dict[str, Any]) -> str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
 from sortie.radio.transmission import Status
+from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 
@@ -40,6 +41,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     changes = list(transitions(tables["directives"], {}))
     drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
     both = both_matched(record)
+    ap = _accuracy(both)
     return {
         "scenario": scenario.name,
         "policy": record.policy,
@@ -51,13 +53,15 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "duration_s": scenario.duration_s,
         "frame_s": scenario.frame_s,
         "ap50": {
-            **_accuracy(both),
+            **ap,
             "detector": record.detector,
             "fusion": _fusion(record),
             "calibration": record.calibration,
+            "grounded_blind": _grounded_blind(record, both, ap),
             "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
         },
+        "mission": mission_outcome(record),
         "bytes": {
             "context_sent": int(context_bytes),
             "context_descriptors": int(totals["context_descriptor_bytes"]),
@@ -130,6 +134,23 @@ def both_matched(record: SortieRecord) -> Both:
     return {"full_scene": fusions.in_full(), "mission": fusions.in_mission()}
 
 
+def _grounded_blind(record: SortieRecord, both: Both, ap: dict[str, float | None]) -> dict[str, float | None]:
+    """AP with every drone that left the air counted as one that detects nothing.
+
+    Its cars join the truths and it adds no detection. So precision stays, and each recall and AP shrink by one factor.
+    """
+    truths = record.tables["truths"]
+    scored = both["full_scene"].keys()  # who left the air has cars and no fusion
+    blind = [row not in scored for row in zip(truths["t_s"].to_pylist(), truths["drone"].to_pylist(), strict=True)]
+    t_s, x_m, y_m = (truths[c].to_numpy()[blind] for c in ("t_s", "x_m", "y_m"))
+    disc_x_m, disc_y_m, radius_m = _discs_at(record.tables["mission"], t_s).T
+    inside = (x_m - disc_x_m) ** 2 + (y_m - disc_y_m) ** 2 <= radius_m**2
+    missed = {"full_scene": len(t_s), "mission": int(np.count_nonzero(inside))}
+    sought = {name: sum(m.truths for m in fusions.values()) for name, fusions in both.items()}
+    shares = {name: _ratio(sought[name], sought[name] + missed[name]) for name in both}
+    return {name: None if share is None else share * (ap[name] or 0.0) for name, share in shares.items()}
+
+
 def _fusion(record: SortieRecord) -> str | None:
     """What fuses payloads, as the scenario names it; None where a detector flew that the scenario does not name."""
     section = record.scenario.perception
@@ -157,12 +178,17 @@ class _Fusions:
 
     def in_mission(self) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the mission disc, where there is one."""
-        discs = np.column_stack([self._missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
-        disc = discs[np.searchsorted(self._missions["t_s"].to_numpy(), self._t_s, side="right") - 1]
+        disc = _discs_at(self._missions, self._t_s)
         images, cars = self._matches.image, self._matches.cars
         inside = self._matches.matched(_within(self._boxes, disc[images]), _within(self._truth, disc[cars]))
         there = ~np.isnan(disc[:, 2])
         return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
+
+
+def _discs_at(missions: pa.Table, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mission disc at times [n]: x, y and radius [n, 3], NaN where there is none."""
+    discs = np.column_stack([missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
+    return np.asarray(discs[np.searchsorted(missions["t_s"].to_numpy(), t_s, side="right") - 1])
 
 
 def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -38,8 +38,37 @@ class Ap50(Accuracy):
         "`perception.fusion` or `perception.recorded_fusion`; null where the scenario's detector did not fly.",
     ]
     calibration: Annotated[str | None, "Which fit a surrogate detector is of."]
+    grounded_blind: Annotated[
+        Accuracy,
+        "The same with every drone that left the air counted as blind: at each scored instant it detects nothing, and "
+        "the cars about the place that it would have in the formation count as missed. Equal where all fly to the end.",
+    ]
     sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
     scored_fusions: Annotated[int, "How many fusions were scored."]
+
+
+class MissionOutcome(TypedDict):
+    flown_share: Annotated[float, "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air."]
+    region_observed_share: Annotated[
+        float | None,
+        "Share of the mission region's area in view, 0 … 1, averaged over the time in which there is a region. A place is "
+        "in view where it lies in the picture of one of the five cameras of a drone, on flat ground without houses and "
+        "trees, and in the square of the drone's feature map. The drone flies, and its duty cycle is above 0.",
+    ]
+    target_in_view_share: Annotated[
+        float | None, "Share of the time of phase `track`, 0 … 1, in which the target's place is in view, as above."
+    ]
+    target_longest_out_of_view_s: Annotated[
+        float | None, "Longest unbroken time of phase `track` in which no drone has the target in view, s."
+    ]
+    target_detected_share: Annotated[
+        float | None,
+        "Share of the time of phase `track`, 0 … 1, in which a box of at least one drone overlaps the target with an "
+        "IoU of at least 0.5. Each scored instant stands for the time until the next one.",
+    ]
+    target_longest_undetected_s: Annotated[
+        float | None, "Longest unbroken time of phase `track` in which no drone's boxes hold the target, s."
+    ]
 
 
 class Bytes(TypedDict):
@@ -120,7 +149,10 @@ class Outcome(TypedDict):
     fingerprint: Annotated[str, "SHA-256 over the record's values; equal inputs give equal fingerprints."]
     duration_s: Annotated[float, "Length of the sortie."]
     frame_s: Annotated[float, "From one frame to the next."]
-    ap50: Annotated[Ap50, "Accuracy."]
+    ap50: Annotated[Ap50, "Accuracy of the drones that fly."]
+    mission: Annotated[
+        MissionOutcome, "The mission of the whole fleet; null where there is no region, no target or no detector."
+    ]
     bytes: Annotated[Bytes, "What was sent."]
     context_share: Annotated[float | None, "Context bytes over all bytes."]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]

@@ -86,7 +86,8 @@ ABOUT = {
     "`arrived_bytes` of it.",
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
     "detections": "A box that an ego detected, ENU.",
-    "truths": "A car within an ego's range at a scored fusion, ENU.",
+    "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
+    "it would have in the formation. Such a drone has no row in `fusions`.",
     "mission": "The mission in a frame; NaN where there is no region or target.",
     "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "
     "drones have a usable link. What follows the last row is in `medium_busy_fraction` alone.",

@@ -85,12 +85,27 @@ def _tile(name: str, value: str, note: str) -> str:
 
 def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The few figures that a reader takes home: name, value, what it is of."""
-    ap, data = result["ap50"], result["bytes"]
+    ap, data, mission = result["ap50"], result["bytes"], result["mission"]
     tiles = []
+    whole = mission["flown_share"] == 1.0
+    if not whole:
+        tiles.append(("Flown", percent(mission["flown_share"]), "of drone-seconds"))
     if ap["detector"] != "none":
         by = f"the surrogate {ap['calibration']}" if ap["calibration"] else f"the {ap['detector']} detector"
-        tiles.append(("Accuracy, mission disc", number(ap["mission"]), f"AP@0.5, {by}"))
-        tiles.append(("Accuracy, full scene", number(ap["full_scene"]), f"{ap['scored_fusions']} fusions scored"))
+        blind = ap["grounded_blind"]
+        notes = [f"AP@0.5, {by}", f"{ap['scored_fusions']} fusions scored"]
+        if not whole:
+            notes = [f"{number(blind[area])} with grounded drones blind" for area in ("mission", "full_scene")]
+        tiles.append(("Accuracy, mission disc", number(ap["mission"]), notes[0]))
+        tiles.append(("Accuracy, full scene", number(ap["full_scene"]), notes[1]))
+    if mission["region_observed_share"] is not None:
+        tiles.append(("Region in view", percent(mission["region_observed_share"]), "of its area, mean over time"))
+    if mission["target_in_view_share"] is not None:
+        gap = f"of the time, longest gap {mission['target_longest_out_of_view_s']:.1f} s"
+        tiles.append(("Target in view", percent(mission["target_in_view_share"]), gap))
+    if mission["target_detected_share"] is not None:
+        gap = f"of the time, longest gap {mission['target_longest_undetected_s']:.1f} s"
+        tiles.append(("Target detected", percent(mission["target_detected_share"]), gap))
     least = min(result["battery"].values(), default=None)
     return [
         *tiles,

@@ -34,14 +34,17 @@ class Sighting:
 def sightings(
     tables: Mapping[str, pa.Table], disc_t_s: NDArray[np.float64], discs: NDArray[np.float64]
 ) -> Iterator[Sighting]:
-    """Judge every fusion in `tables["fusions"]`, whose boxes stand in the box tables in the same order.
+    """Judge every fusion in `tables["fusions"]`. Its boxes stand in the box tables in the same order.
+
+    Cars about drones that left the air belong to no fusion and are left out.
 
     Args:
         tables: `fusions`, `detections` and `truths`, whole or a slice of whole fusions.
         disc_t_s, discs: [n] times, and [n, 3] x, y, radius of the mission disc from each on; NaN where there is none.
     """
     fusions = tables["fusions"]
-    boxes, truths = _boxes(tables["detections"]), _boxes(tables["truths"])
+    flying = np.isin(_fusion_of(tables["truths"]), _fusion_of(fusions))
+    boxes, truths = _boxes(tables["detections"]), _boxes(tables["truths"].filter(pa.array(flying)))
     at, truth_at = 0, 0
     rows = zip(*(fusions[c].to_pylist() for c in ("t_s", "drone", "detections", "truths")), strict=True)
     for t_s, drone, count, truth_count in rows:
@@ -62,6 +65,11 @@ def _uncovered(truth: Boxes, hits: Boxes) -> NDArray[np.bool_]:
     left = np.ones(len(truth), bool)
     left[linear_sum_assignment(away)[0]] = False
     return left
+
+
+def _fusion_of(table: pa.Table) -> NDArray[np.complex128]:
+    """Time and drone of each row, as one number."""
+    return np.asarray(table["t_s"].to_numpy() + 1j * table["drone"].to_numpy())
 
 
 def _boxes(table: pa.Table) -> Boxes:
