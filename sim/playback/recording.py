@@ -33,15 +33,15 @@ class Playback:
     """Draws one sortie into a recording, all below `root`, from tables that come whole or second by second."""
 
     def __init__(
-        self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "", policy: str = ""
+        self, recording: rr.RecordingStream, scenario: Scenario, scene: SceneModel, root: str = "", name: str = ""
     ) -> None:
-        """Args: `policy` is the record's name of what flies; empty, the scenario's own flies."""
+        """Args: `name` is the recording's; a sortie that still flies has its scenario's."""
         canvas = Canvas(recording, scenario.context.rate_hz, root)
         self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
         self._disc_t_s: Floats = np.zeros(0)
         self._discs: Floats = np.zeros((0, 3))
         if not root:
-            recording.send_recording_name(f"{scenario.name} · {policy or scenario.policy.name} · seed {scenario.seed}")
+            recording.send_recording_name(name or f"{scenario.name} · {scenario.policy.name}")
         canvas.static("about", legend(scenario))
         self._scene.begin()
         self._charts.begin()
@@ -64,7 +64,8 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
         RunError: the file cannot be written.
     """
     with new_file(path, blueprint(record.scenario)) as recording:
-        playback = Playback(recording, record.scenario, scene_of(record), policy=record.policy)
+        name = f"{record.scenario.name} · {record.policy} · seed {record.seed}"
+        playback = Playback(recording, record.scenario, scene_of(record), name=name)
         playback.add(record.scenario.duration_s, record.tables)
 
 
@@ -81,7 +82,7 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
     labels = [label for label, _ in flown]
     scenario = flown[0][1].scenario
     with new_file(path, comparison(scenario, labels)) as recording:
-        recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {scenario.seed}")
+        recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {flown[0][1].seed}")
         for root, (_, record) in zip(roots(labels), flown, strict=True):
             playback = Playback(recording, record.scenario, scene_of(record), root)
             playback.add(record.scenario.duration_s, record.tables)

@@ -639,3 +639,11 @@ def test_a_viewer_that_fails_is_quoted(
     monkeypatch.setenv("DISPLAY", ":99")
     with pytest.raises(RunError, match=r"the viewer (failed|does not come up): winit: no window for you$"):
         to_new_viewer(rr.RecordingStream("test"), scenario()) if live else open_viewer(saved)
+
+
+def test_a_recording_is_named_after_the_policy_that_flew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not after the scenario's own, which another one replaced."""
+    named: list[str] = []
+    monkeypatch.setattr(rr.RecordingStream, "send_recording_name", lambda self, name: named.append(name))
+    save_rrd(run_sortie(example("duration_s=0.5", "mission.phases=[{}]"), "silence", 4), tmp_path / "a.rrd")
+    assert named == ["example · silence · seed 4"]
