@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
 
-.PHONY: help sortie screenshot test quick lint check format bench validate clean scenarios notebooks
+.PHONY: help sortie screenshot test quick lint check format bench figures clean scenarios notebooks
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -53,8 +53,8 @@ format: $(STAMP) ## format and fix what can be fixed
 bench: $(STAMP) ## run the benchmarks
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
 
-validate: $(STAMP) ## run every script behind the figures of the READMEs, plots into docs/validation
-	@for script in link transport energy; do $(BIN)/python tests/validation/$$script.py || exit 1; done
+figures: $(STAMP) ## measure the pages' figures again, hours in all (FIGURE=name for one; FIGURE=--list, FIGURE=--render)
+	$(BIN)/python tests/validation/figures.py $(FIGURE)
 
 clean: ## remove runs and caches, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info

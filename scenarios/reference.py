@@ -17,11 +17,12 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from sortie.scenarios.reading.explain import sections_of
+from sortie.scenarios.report_text import replace_section, table
 from sortie.scenarios.schema import Scenario, json_schema
 from sortie.scenarios.schema.base import PresetSection
 
 HERE = Path(__file__).parent
-BEGIN, END = "<!-- fields: made by python -m sortie.scenarios.reference -->", "<!-- end of fields -->"
+BEGIN, END = "<!-- fields:begin -->", "<!-- fields:end -->"
 _SIGNS = {Ge: ("ge", "≥"), Gt: ("gt", ">"), Le: ("le", "≤"), Lt: ("lt", "<")}
 _NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "nothing"}
 
@@ -33,21 +34,19 @@ def schema_text() -> str:
 
 def readme_text(old: str) -> str:
     """The README with its tables made anew; the rest stays."""
-    before, _, rest = old.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n\n{fields_markdown()}\n{END}{after}"
+    return replace_section(old, f"{BEGIN}\n\n{fields_markdown()}\n{END}", BEGIN, END)
 
 
 def fields_markdown() -> str:
     """One table a section: field, values, default, meaning."""
     lines: list[str] = []
     for path, section in _sections(Scenario, ""):
-        lines += [f"**{path or 'top level'}**", "", "| field | values | default | meaning |", "|---|---|---|---|"]
-        for name, field in section.model_fields.items():
-            if not sections_of(field.annotation) or field.description:
-                cells = (f"`{name}`", _values(field), _default(field), field.description or "Which event.")
-                lines.append("| " + " | ".join(cells) + " |")
-        lines.append("")
+        rows = [
+            (f"`{name}`", _values(field), _default(field), field.description or "Which event.")
+            for name, field in section.model_fields.items()
+            if not sections_of(field.annotation) or field.description
+        ]
+        lines += [f"**{path or 'top level'}**", "", *table(("field", "values", "default", "meaning"), rows), ""]
     return "\n".join(lines)
 
 

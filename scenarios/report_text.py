@@ -90,6 +90,22 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [top, f"|{'---|' * len(head)}", *(f"| {' | '.join(row)} |" for row in rows)]
 
 
+def replace_section(text: str, section: str, begin: str, end: str) -> str:
+    """A text with what stands between its markers replaced, the markers too.
+
+    Raises:
+        ValueError: the markers are missing, doubled or in the wrong order.
+
+    Example:
+        >>> replace_section("a <b> old </b> c", "<b> new </b>", "<b>", "</b>")
+        'a <b> new </b> c'
+    """
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"must hold {begin} and {end} once each, in this order")
+    before, _, rest = text.partition(begin)
+    return before + section + rest.partition(end)[2]
+
+
 def picture(file: str, caption: str) -> list[str]:
     """A figure with its caption in Markdown, a line each, an empty one after it."""
     return [f"![{caption}]({file})", "", f"*{caption}.*", ""]

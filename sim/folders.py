@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.report_text import replace_section
 
 
 class RunError(SortieError):
@@ -145,22 +146,6 @@ def put_between(path: Path, section: str, begin: str, end: str) -> None:
         RunError: no such file, or one without the markers.
     """
     write_text(path, _put_between(path, section, begin, end))
-
-
-def replace_section(text: str, section: str, begin: str, end: str) -> str:
-    """A text with what stands between its markers replaced, the markers too.
-
-    Raises:
-        ValueError: the markers are missing, doubled or in the wrong order.
-
-    Example:
-        >>> replace_section("a <b> old </b> c", "<b> new </b>", "<b>", "</b>")
-        'a <b> new </b> c'
-    """
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise ValueError(f"must hold {begin} and {end} once each, in this order")
-    before, _, rest = text.partition(begin)
-    return before + section + rest.partition(end)[2]
 
 
 def _put_between(path: Path, section: str, begin: str, end: str) -> str:

@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +35,6 @@ from sortie.perception.scene.scene_model import SceneModel
 SEED = 7
 SCENES = 12
 CONDITIONS: tuple[Sharing, ...] = (SINGLE, FULL_SHARING)
-BEGIN, END = "<!-- effects: begin -->", "<!-- effects: end -->"
-"""Around the table in the README; `write_table` replaces what is between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,43 +171,3 @@ def _read(path: Path, rows: int) -> list[list[list[Matched]]]:
             return Matched(file[f"{key}.score"], file[f"{key}.hit"], int(file[f"{key}.truths"]))
 
         return [[[unit(f"{r}.{c}.{e}") for e in range(egos)] for c in range(len(CONDITIONS))] for r in range(rows)]
-
-
-def table(effects: Sequence[Effect], weights: Path, scenes: int) -> str:
-    """The effects as Markdown, with their date and weights."""
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:12]
-    lines = [
-        f"Measured {datetime.now(UTC):%Y-%m-%d} with `{weights.name}` (SHA-256 {digest}…): {scenes} scenes of seed {SEED}'s test layouts, "
-        f"one fleet-frame × five egos each, AP@0.5 without a threshold. Change: of AP under full sharing against the first row, "
-        "paired by scene, 95 %; bold where the interval leaves out 0. A bootstrap over few scenes is too sure of itself: "
-        "below twenty, take small changes for hints.",
-        "",
-        "| parameter | moved to | AP alone | AP sharing all | cooperation | change |",
-        "|---|---|---|---|---|---|",
-    ]
-    for e in effects:
-        change = "–"
-        if e.change is not None:
-            change = f"{e.change.delta:+.3f} [{e.change.low:+.3f}, {e.change.high:+.3f}]"
-            change = f"**{change}**" if e.change.low > 0 or e.change.high < 0 else change
-        name = f"`{e.move.parameter}`" if e.change is not None else e.move.parameter
-        lines.append(
-            f"| {name} | {e.move.value} | {e.gain.ap_a:.3f} | {e.gain.ap_b:.3f} | {e.gain.delta:+.3f} | {change} |"
-        )
-    return "\n".join(lines)
-
-
-def write_table(readme: Path, text: str) -> None:
-    """Put a table between the markers of a README, under a temporary name first.
-
-    Raises:
-        ValueError: the README or its markers are missing.
-    """
-    if not readme.is_file():
-        raise ValueError(f"{readme}: missing, the table goes between {BEGIN} and {END} in it")
-    before, begin, rest = readme.read_text("utf-8").partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise ValueError(f"{readme}: {BEGIN} and {END} are missing, the table goes between them")
-    with replacing(readme) as part:
-        part.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", "utf-8")

@@ -24,6 +24,7 @@ from sortie.perception.surrogate.levels import level
 from sortie.perception.surrogate.model import Parameters, save
 from sortie.perception.surrogate.plan import MANNERS, THRESHOLD, Split, scene_model
 from sortie.perception.surrogate.rows import FitRows, rows_of
+from sortie.scenarios.report_text import NONE, interval, table
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)
 LOST = 0.003
@@ -150,15 +151,30 @@ def _alone(recorded: DetectorRuns) -> tuple[list[Any], list[Any]]:
 def card(parameters: Parameters, verdict: CalibrationVerdict) -> str:
     """The calibration's card, Markdown."""
     f = parameters.card
-    levels = "\n".join(
-        f"| {v.condition} | {v.torch:.3f} | {v.surrogate:.3f} | {v.error:+.3f} [{v.low:+.3f}, {v.high:+.3f}] | {'yes' if abs(v.error) <= WITHIN else 'no'} |"
-        for v in verdict.levels
-    )
-    orders = "\n".join(
-        f"| {o.b} − {o.a} | {o.torch:+.3f} [{o.low:+.3f}, {o.high:+.3f}] | {o.surrogate:+.3f} "
-        f"| {'–' if not o.significant else 'kept' if o.kept else 'lost'} |"
-        for o in verdict.orders
-    )
+
+    def sure(value: float, low: float, high: float) -> str:
+        return interval(value, low, high, lambda v: f"{v:+.3f}")
+
+    levels = "\n".join(table(
+        ("condition", "torch", "surrogate", "error", f"within ±{WITHIN:g}"),
+        (
+            (
+                v.condition, f"{v.torch:.3f}", f"{v.surrogate:.3f}", sure(v.error, v.low, v.high),
+                "yes" if abs(v.error) <= WITHIN else "no",
+            )
+            for v in verdict.levels
+        ),
+    ))  # fmt: skip
+    orders = "\n".join(table(
+        ("contrast", "torch", "surrogate", "order"),
+        (
+            (
+                f"{o.b} − {o.a}", sure(o.torch, o.low, o.high), f"{o.surrogate:+.3f}",
+                NONE if not o.significant else "kept" if o.kept else "lost",
+            )
+            for o in verdict.orders
+        ),
+    ))  # fmt: skip
     within = sum(abs(v.error) <= WITHIN for v in verdict.levels)
     kept = [o.kept for o in verdict.orders if o.significant]
     return f"""# Calibration {f["id"]}
@@ -170,15 +186,11 @@ with fusion {f["fusion"]}, weights {f["weights"]}. Boxes below a score of {param
 
 {f["held_out"]} scenes, {verdict.levels[0].egos} moments a condition; the error with its 95 % interval by whole scenes. {within} of {len(verdict.levels)} conditions within ±{WITHIN:g}.
 
-| condition | torch | surrogate | error | within ±{WITHIN:g} |
-|---|---|---|---|---|
 {levels}
 
 ## Order of policies
 
 The torch detector's contrast with its paired 95 % interval by whole scenes. {sum(kept)} of {len(kept)} significant orders kept.
 
-| contrast | torch | surrogate | order |
-|---|---|---|---|
 {orders}
 """

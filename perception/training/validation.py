@@ -21,6 +21,7 @@ from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
 from sortie.perception.training.recipe import command, of_benchmark
+from sortie.scenarios.report_text import interval, table
 
 LEVELS = ((1.0, 1.0), (1.0, 2.5), (0.0, 0.0))
 """Factors on the benchmark's own pose errors, position and heading; its own first."""
@@ -90,13 +91,39 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
     """The model card, Markdown, from the facts in the weights file."""
     bench = facts["benchmark"]
     made = "\n".join(
-        f"| {k} | `{command(r, model, bench['seed'], name)}` | {r['done']} | {r['loss']:.3f} | {r['minutes']:.0f} |"
-        for k, r in enumerate(facts["runs"], 1)
+        table(
+            ("run", "made by", "steps done", "loss, mean of the last 50", "minutes on two shared cores"),
+            (
+                (
+                    f"{k}",
+                    f"`{command(r, model, bench['seed'], name)}`",
+                    f"{r['done']}",
+                    f"{r['loss']:.3f}",
+                    f"{r['minutes']:.0f}",
+                )
+                for k, r in enumerate(facts["runs"], 1)
+            ),
+        )
     )
+    gains = [(v, v["gain"]) for v in facts["validation"]]
     accuracy = "\n".join(
-        f"| {v['position_sigma_m']:g} m, {v['heading_sigma_deg']:g}° | {v['gain']['ap_a']:.3f} | {v['gain']['ap_b']:.3f} "
-        f"| {v['gain']['delta']:+.3f} [{v['gain']['low']:+.3f}, {v['gain']['high']:+.3f}] |"
-        for v in facts["validation"]
+        table(
+            (
+                "pose error σ (position, heading)",
+                "AP@0.5 alone",
+                "AP@0.5, all five",
+                "cooperation, paired 95 % interval by scenes",
+            ),
+            (
+                (
+                    f"{v['position_sigma_m']:g} m, {v['heading_sigma_deg']:g}°",
+                    f"{g['ap_a']:.3f}",
+                    f"{g['ap_b']:.3f}",
+                    interval(g["delta"], g["low"], g["high"], lambda d: f"{d:+.3f}"),
+                )
+                for v, g in gains
+            ),
+        )
     )
     last: dict[str, Any] = (
         facts["runs"][-1] if facts["runs"] else {"scenes": 0, "cell_dropout": 0.0, "unsent": "masked"}
@@ -111,8 +138,6 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
 
 Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, v in model.items())}.
 
-| run | made by | steps done | loss, mean of the last 50 | minutes on two shared cores |
-|---|---|---|---|---|
 {made}
 
 **Data**: {last["scenes"] * SIZES["train"][1]} fleet-frames of five drones in {last["scenes"]} scenes, the train split of benchmark
@@ -121,8 +146,6 @@ Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, 
 present (two to five) and one is alone, so a third of the supervised outputs are single-drone: the head works without peers.
 {dropped}
 
-| pose error σ (position, heading) | AP@0.5 alone | AP@0.5, all five | cooperation, paired 95 % interval by scenes |
-|---|---|---|---|
 {accuracy}
 
 Validation split: {scenes * per_scene} fleet-frames in {scenes} scenes, every drone an ego; score threshold {TAU}. Boxes stand in the world by the

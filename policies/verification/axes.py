@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, cast
 from sortie.policies.catalogue.prior import METHODS
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation
+from sortie.scenarios.report_text import NONE, table
 
 
 class Axis(Enum):
@@ -103,7 +104,7 @@ def method_table(views: Sequence[FleetView], everything: Iterable[Callable[..., 
 
     A method with a fusion network of its own decides fusion weights there.
     """
-    rows = ["| method | Mis. | Scene | Plat. | Geom. | decides |", "|---|---|---|---|---|---|"]
+    rows = []
     for method in METHODS.values():
         axes, decided = observe(method.policy, views)
         if not decided and method.fusion is not None:
@@ -111,14 +112,15 @@ def method_table(views: Sequence[FleetView], everything: Iterable[Callable[..., 
         rows.append(_row(method.name, Observed(axes, decided)))
     seen = [observe(policy, views) for policy in everything]
     plane = Observed(frozenset().union(*(o.axes for o in seen)), frozenset().union(*(o.decisions for o in seen)))
-    return "\n".join([*rows, _row("Context plane", plane)]) + "\n"
+    head = ("method", "Mis.", "Scene", "Plat.", "Geom.", "decides")
+    return "\n".join(table(head, [*rows, _row("Context plane", plane)])) + "\n"
 
 
-def _row(title: str, observed: Observed) -> str:
-    read = " | ".join("●" if axis in observed.axes else "–" for axis in Axis)
+def _row(title: str, observed: Observed) -> list[str]:
+    read = ["●" if axis in observed.axes else NONE for axis in Axis]
     decides = (
         "all six"
         if len(observed.decisions) == len(DECISIONS)
         else " + ".join(d for d in DECISIONS if d in observed.decisions)
     )
-    return f"| {title} | {read} | {decides} |"
+    return [title, *read, decides]

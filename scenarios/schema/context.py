@@ -23,7 +23,7 @@ class DescriptorForm(PresetSection):
         "numbers_8_bit": {"number_bits": 8},
         "small": {"grid_cells": 8, "grid_bits": 1, "number_bits": 16},
     }
-    """`paper` is the paper's schema in CDR. `tests/validation/minimal_context.py` measures the others against it."""
+    """`paper` is the paper's schema in CDR. `fleet/README.md` measures the others against it."""
 
     grid_cells: Literal[0, 4, 8, 16] = Field(16, description="Coverage cells a side on the air; 0 leaves the grid out.")
     grid_bits: Literal[1, 2] = Field(2, description="Bits of a coverage cell on the air; 1 is seen well or not.")

@@ -13,6 +13,7 @@ from rich.table import Table
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.manifest import problems, read
 from sortie.perception.geometry import Geometry
+from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import err, out, stages
 from sortie.sim.user_errors import user_errors
 
@@ -146,20 +147,18 @@ def difficulty(
     weights: Annotated[Path | None, typer.Option(help="A safetensors file; default: the shipped weights.")] = None,
     scenes: Annotated[int, typer.Option(help="Number of scenes that each row is measured on.", min=2)] = 12,
     store: Annotated[Path, typer.Option(help="Folder for finished scenes.")] = Path("runs/difficulty"),
-    readme: Annotated[
-        Path | None, typer.Option(help="Write the table between the markers of this Markdown file.")
-    ] = None,
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per core.", min=1)] = None,
 ) -> None:
     """Measure how each parameter of the difficulty changes AP. An interrupted run continues."""
     with user_errors(), stages() as report:
-        from sortie.perception.evaluation.difficulty_effects import measure, table, write_table
+        from sortie.perception.evaluation.difficulty_effects import measure
         from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
         used = weights or SHIPPED_WEIGHTS
-        text = table(
-            measure(used, store, scenes=scenes, workers=workers, progress=partial(report, "scenes")), used, scenes
-        )
-        if readme is not None:
-            write_table(readme, text)
-    out.print(text, markup=False, soft_wrap=True)
+        effects = measure(used, store, scenes=scenes, workers=workers, progress=partial(report, "scenes"))
+    title = f"AP@0.5 without a threshold, {scenes} scenes, {used.name}; change of AP sharing all, paired by scene, 95 %"
+    table = Table("parameter", "moved to", "AP alone", "AP sharing all", "change, points", title=title)
+    for e in effects:
+        change = "" if e.change is None else points((e.change.delta, e.change.low, e.change.high), "+.1f")
+        table.add_row(e.move.parameter, e.move.value, f"{e.gain.ap_a:.3f}", f"{e.gain.ap_b:.3f}", change)
+    out.print(table)

@@ -1,23 +1,18 @@
-"""The energy model against a real flight, and what its effects are worth: every figure of fleet/README.md.
+"""The energy model against a real flight, and what its effects are worth (`make figures FIGURE=energy`, and `FIGURE=flight`).
 
-    python tests/validation/energy.py [LOG] [--out FOLDER]
-
-LOG is the ArduCopter log `log171.bin` of dronekit-la's test data (CC BY-SA 3.0, not in this repository); left out, the
-environment's SORTIE_FLIGHT_LOG, else ../shared/flightlogs/log171.bin beside the repository. Without it only the
-effects are computed. Prints Markdown, writes energy.json and, with matplotlib, energy_*.png into FOLDER.
+The flight is the ArduCopter log `log171.bin` of dronekit-la's test data (CC BY-SA 3.0, not in this repository); the
+environment's SORTIE_FLIGHT_LOG names it, else ../shared/flightlogs/log171.bin beside the repository.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stored import Column, Table
 
 from sortie.fleet.energy.battery import CAUSES, FleetBatteries
 from sortie.fleet.flight.rotor import figure_of_merit, momentum_power_w, rotor_power_w
@@ -35,7 +30,6 @@ from sortie.scenarios.schema import Airframe, Battery, Polarisation
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = Path(os.environ.get("SORTIE_FLIGHT_LOG", ROOT.parent / "shared/flightlogs/log171.bin"))
-OUT = ROOT / "docs/validation"
 
 # --- what is known of the flight, and from where ---------------------------------------------------
 TAKEOFF_S, SPLIT_S, END_S = 75.0, 118.5, 205.5
@@ -234,65 +228,77 @@ def cold_start() -> dict[str, float]:
 # --- report ----------------------------------------------------------------------------------------
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("log", nargs="?", type=Path, default=LOG)
-    parser.add_argument("--out", type=Path, default=OUT)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    figures: dict[str, Any] = {"budgets": budgets(), "endurance_min": dict(effects()), "cold_start": cold_start()}
-    if given.log.is_file():
-        log = read_log(given.log)
-        figures |= {
-            "voltage": voltage_figures(log),
-            "hover": hover_figures(log),
-            "thrust": thrust_figures(log, given.log),
-        }
-        draw_flight(log, given.out)
-    else:
-        sys.stdout.write(f"{given.log}: not here; the flight's part is left out\n\n")
-    draw_effects(given.out)
-    (given.out / "energy.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    sys.stdout.write(markdown(figures))
+def tables() -> dict[str, Table]:
+    """What the default drone spends, and what each effect is worth."""
+    parts = ("rotor", "compute", "radio", "ohmic")
+    cold = cold_start()
+    return {
+        "energy_budgets": Table(
+            [
+                Column(""),
+                Column("endurance", ".1f", " min"),
+                Column("mean power", ".0f", " W"),
+                *(Column(name, ".1f", " %", 100) for name in ("rotors", *parts[1:])),
+            ],
+            [[name, b["min"], b["w"], *(b[cause] for cause in parts)] for name, b in budgets().items()],
+        ),
+        "energy_effects": Table([Column("hover until landing"), Column("min", ".1f")], effects()),
+        "energy_cold": Table(
+            [
+                Column("a fresh pack at −15 °C", ".1f", " V at once"),
+                Column("highest", ".1f", " V"),
+                Column("after", ".0f", " min"),
+            ],
+            [[cold["first_v"], cold["highest_v"], cold["after_min"]]],
+        ),
+    }
 
 
-def markdown(figures: dict[str, Any]) -> str:
-    """The figures as they stand in fleet/README.md."""
-    lines = []
-    if "voltage" in figures:
-        v, h, t = figures["voltage"], figures["hover"], figures["thrust"]
-        lines += [
-            "| real flight | value |",
-            "|---|---|",
-            f"| voltage, pack as stated ({v['stated_mohm']:g} mΩ a cell), whole log / in flight | "
-            f"{v['stated_whole']:.2%} / {v['stated_flight']:.2%} RMS |",
-            f"| voltage, {v['fitted_mohm']:.1f} + {v['fitted_polarisation_mohm']:.1f} mΩ identified on the first part, "
-            f"first / rest | {v['fitted_first']:.2%} / {v['fitted_rest']:.2%} RMS |",
-            "| … the rest, by time constant | "
-            + ", ".join(f"{e:.2%} at {float(s):g} s" for s, e in v["fitted_rest_by_time_constant_s"].items())
-            + " |",
-            f"| the curve at rest before take-off | {v['curve_low_before_takeoff_v']:.2f} V low |",
-            f"| power at hover, measured over {h['seconds']:.0f} s | {h['measured_w']:.1f} ± {h['measured_std_w']:.1f} W |",
-            f"| … predicted for {MASS_KG:.2f} kg | {h['predicted_w']:.1f} W ({h['predicted_w'] / h['measured_w'] - 1:+.1%}) |",
-            f"| … for {BARE_KG:.2f} kg, without the camera | {h['predicted_bare_w']:.1f} W "
-            f"({h['predicted_bare_w'] / h['measured_w'] - 1:+.1%}) |",
-            f"| power by the accelerometer's thrust, 0.5 s | slope {t['slope']:.2f}, correlation {t['correlation']:.2f} |",
-            f"| … by ground speed | correlation {t['ground_speed_correlation']:.2f} |",
-            "",
-        ]
-    lines += [
-        "| | endurance | mean power | rotors | compute | radio | ohmic |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, b in figures["budgets"].items():
-        shares = " | ".join(f"{100 * b[cause]:.1f} %" for cause in ("rotor", "compute", "radio", "ohmic"))
-        lines.append(f"| {name} | {b['min']:.1f} min | {b['w']:.0f} W | {shares} |")
-    lines.append("")
-    lines += ["| hover until landing | min |", "|---|---|"]
-    lines += [f"| {name} | {minutes:.1f} |" for name, minutes in figures["endurance_min"].items()]
-    c = figures["cold_start"]
-    lines += ["", f"−15 °C: {c['first_v']:.1f} V at once, {c['highest_v']:.1f} V after {c['after_min']:.0f} min"]
-    return "\n".join(lines) + "\n"
+def flight_tables(path: Path) -> dict[str, Table]:
+    """The model beside the real flight."""
+    log = read_log(path)
+    v, h, t = voltage_figures(log), hover_figures(log), thrust_figures(log, path)
+    rms = Column("RMS error of the voltage", ".2f", " %", 100)
+    identified = f"{v['fitted_mohm']:.1f} + {v['fitted_polarisation_mohm']:.1f} mΩ a cell identified on the first part"
+    return {
+        "flight_voltage": Table(
+            [Column("pack"), Column("part of the log"), rms],
+            [
+                [f"as stated, {v['stated_mohm']:g} mΩ a cell", "whole", v["stated_whole"]],
+                ["the same", "in flight", v["stated_flight"]],
+                [identified, "first", v["fitted_first"]],
+                ["the same", "rest", v["fitted_rest"]],
+                *(
+                    [f"the same, time constant {float(s):g} s", "rest", error]
+                    for s, error in v["fitted_rest_by_time_constant_s"].items()
+                ),
+            ],
+        ),
+        "flight_power": Table(
+            [Column("power at hover"), Column("", ".1f", " W"), Column("of the measured", "+.1f", " %", 100)],
+            [
+                [f"measured over {h['seconds']:.0f} s", h["measured_w"], None],
+                ["its standard deviation", h["measured_std_w"], None],
+                [f"predicted for {MASS_KG:.2f} kg", h["predicted_w"], h["predicted_w"] / h["measured_w"] - 1],
+                [
+                    f"predicted for {BARE_KG:.2f} kg, without the camera",
+                    h["predicted_bare_w"],
+                    h["predicted_bare_w"] / h["measured_w"] - 1,
+                ],
+            ],
+        ),
+        "flight_variation": Table(
+            [Column("power explained by"), Column("slope", ".2f"), Column("correlation", ".2f")],
+            [
+                ["the accelerometer's thrust, in half-seconds", t["slope"], t["correlation"]],
+                ["ground speed", None, t["ground_speed_correlation"]],
+            ],
+        ),
+        "flight_rest": Table(
+            [Column("the open-circuit curve at rest before take-off", ".2f", " V low")],
+            [[v["curve_low_before_takeoff_v"]]],
+        ),
+    }
 
 
 def draw_flight(log: FlightLog, folder: Path) -> None:
@@ -365,7 +371,3 @@ def plotting() -> Any:
     except ModuleNotFoundError:
         return None
     return plt
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""What age costs, and what moving late features by the known ego motion gives back: `python tests/validation/fusion_age.py`.
+"""What age costs, and what moving late features by the known ego motion gives back (`make figures FIGURE=fusion_age`).
 
 Five drones fly straight at a given speed. Each ego has its own features of now and its peers' of `age` ago, all cells;
 they are placed by the pose that the peer had then (compensated), or by the one it has now, as if they were fresh
@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
+from stored import Column, Table, points
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Benchmark
@@ -148,36 +148,17 @@ def _frame(
     return out
 
 
-def table(rows: Sequence[AgeRow]) -> str:
-    """Markdown."""
-
-    def sure(d: Difference) -> str:
-        return f"{d.delta:+.3f} [{d.low:+.3f}, {d.high:+.3f}]"
-
-    lines = [
-        "| age | age ignored | compensated | gain of compensation | compensated − fresh | compensated − single |",
-        "|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.age_s:g} s | {r.gain.ap_a:.3f} | {r.gain.ap_b:.3f} | {sure(r.gain)} | {sure(r.lost)} | {sure(r.over_single)} |"
-        for r in rows
-    ]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-
-    from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("weights", type=Path, nargs="?", default=SHIPPED_WEIGHTS)
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=4)
-    parser.add_argument("--speed-mps", type=float, default=SPEED_MPS)
-    args = parser.parse_args()
-    sys.stdout.write(
-        table(measure(load_weights(args.weights), scenes=args.scenes, frames=args.frames, speed_mps=args.speed_mps))
+def table(rows: Sequence[AgeRow], about: str = "") -> Table:
+    """A row an age; differences of AP."""
+    return Table(
+        [
+            Column("age", "g", " s"),
+            Column("age ignored", ".3f"),
+            Column("compensated", ".3f"),
+            Column("gain of compensation", "+.3f"),
+            Column("compensated − fresh", "+.3f"),
+            Column("compensated − single", "+.3f"),
+        ],
+        [[r.age_s, r.gain.ap_a, r.gain.ap_b, points(r.gain), points(r.lost), points(r.over_single)] for r in rows],
+        about,
     )

@@ -1,15 +1,15 @@
-"""The fusion methods beside each other on the same frames, with their bytes: `python tests/validation/fusion_comparison.py`."""
+"""The fusion methods beside each other on the same frames, with their bytes (`make figures FIGURE=fusion_methods`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stored import Column, Table, points
 
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
@@ -128,31 +128,17 @@ def measure(weights: Mapping[str, CarNet], frames: FleetFrames) -> list[MethodRo
     return rows
 
 
-def table(rows: Sequence[MethodRow]) -> str:
-    """Markdown."""
-    lines = ["| method | ρ | AP@0.5 alone | with peers | gain | kB a fleet-frame |", "|---|---|---|---|---|---|"]
-    for r in rows:
-        budget = f"{r.rho:g}" if r.rho else "–"
-        gain = f"{r.gain.delta:+.3f} [{r.gain.low:+.3f}, {r.gain.high:+.3f}]"
-        lines.append(
-            f"| {r.method} | {budget} | {r.gain.ap_a:.3f} | {r.gain.ap_b:.3f} | {gain} | {r.bytes_per_frame / 1e3:,.1f} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-
-    from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
-    from sortie.perception.network.checkpoint import load_weights
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("weights", type=Path, nargs="+", help="weights files, one a method")
-    parser.add_argument("--scenes", type=int, default=30, help="scenes of the test split, one frame each")
-    parser.add_argument("--bench", type=Path, default=Path("runs/bench"))
-    args = parser.parse_args()
-    files = [path for path in args.weights if path.name != "checkpoint.safetensors"]  # lies beside weights, is none
-    nets = {net.config.fusion: net for net in map(load_weights, files)}
-    split = make_split(Benchmark(), "test", args.bench, scenes=args.scenes)
-    sys.stdout.write(table(measure(nets, load_frames(split))))
+def table(rows: Sequence[MethodRow], about: str = "") -> Table:
+    """A row a method and budget."""
+    return Table(
+        [
+            Column("method"),
+            Column("ρ", "g"),
+            Column("AP@0.5 alone", ".3f"),
+            Column("with peers", ".3f"),
+            Column("gain", "+.1f", factor=100),
+            Column("a fleet-frame", ",.1f", " kB", 1e-3),
+        ],
+        [[r.method, r.rho or None, r.gain.ap_a, r.gain.ap_b, points(r.gain), r.bytes_per_frame] for r in rows],
+        about,
+    )

@@ -1,4 +1,4 @@
-"""What one liar costs, with and without trust, and whom trust doubts where nobody lies: `python tests/validation/liars.py`.
+"""What one liar costs, with and without trust, and whom trust doubts where nobody lies (`make figures FIGURE=liars`).
 
 Each row flies the same sorties three times: everyone honest, one drone lying from the fifth second on, and the same
 with trust. AP is of the honest drones alone, from the moment of the lie, and scored by the surrogate detector.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+
+from stored import Column, Table, points
 
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.policies.registry import resolve, within_budget
@@ -90,33 +92,31 @@ def _lost(honest: Sequence[SortieRecord], lied_to: Sequence[SortieRecord]) -> Di
     return compare(*pair_up(honest, lied_to, mission=False, begin_s=SINCE_S, leaving_out={LIAR}))
 
 
-def table(rows: Sequence[LiarRow], sorties: int) -> str:
-    """Markdown; differences in AP points with 95 % intervals."""
-
-    def points(d: Difference) -> str:
-        return f"{100 * d.delta:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]"
-
-    lines = [
-        "| policy | drone 2 claims | AP honest | lost, no trust | lost, trust | doubt it | doubt others |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.policy} | {r.lie} | {r.untrusting.ap_a:.3f} | {points(r.untrusting)} | {points(r.trusting)} "
-        f"| {r.doubting} of {4 * sorties} | {r.wronged} |"
-        for r in rows
-    ]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--duration-s", type=float, default=40.0)
-    args = parser.parse_args()
-    seeds = range(1, args.seeds + 1)
-    sys.stdout.write(table(list(measure(seeds, args.duration_s)), args.seeds))
-    alarms, minutes = false_alarms(seeds, args.duration_s)
-    sys.stdout.write(f"\nNobody lying: {alarms} false alarms in {minutes} minutes of one drone judging another.\n")
+def tables(seeds: Sequence[int], duration_s: float) -> dict[str, Table]:
+    """What a liar costs, and how often honest drones are doubted."""
+    rows = list(measure(seeds, duration_s))
+    alarms, minutes = false_alarms(seeds, duration_s)
+    return {
+        "liars": Table(
+            [
+                Column("policy"),
+                Column(f"drone {LIAR} claims"),
+                Column("AP honest", ".3f"),
+                *(Column(name, "+.1f", factor=100) for name in ("change, no trust", "change, trust")),
+                *(Column(name, ".0f") for name in ("doubt it", "of", "doubt others")),
+            ],
+            [
+                [
+                    r.policy, r.lie, r.untrusting.ap_a, points(r.untrusting), points(r.trusting),
+                    r.doubting, 4 * len(seeds), r.wronged,
+                ]
+                for r in rows
+            ],
+            f"{len(seeds)} sorties of {duration_s:g} s for each row; change of AP against the honest fleet, in points, with "
+            "intervals over scored instants.",
+        ),
+        "false_alarms": Table(
+            [Column("false alarms where nobody lies", ".0f"), Column("minutes of one drone judging another", ",.0f")],
+            [[alarms, minutes]],
+        ),
+    }  # fmt: skip

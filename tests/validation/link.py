@@ -1,15 +1,7 @@
-"""The link, the rates, the medium and what they cost: every figure of those in radio/README.md.
-
-    python tests/validation/link.py [--quick] [--out FOLDER]
-
-Prints Markdown, writes link.json and, with matplotlib, link_*.png into FOLDER.
-"""
+"""The link, the rates, the medium and what they cost (`make figures FIGURE=link`, and `FIGURE=radio_scale`)."""
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +11,7 @@ import csma
 import numpy as np
 import simpy
 from scipy import stats
+from stored import Table
 
 from sortie.radio import Air
 from sortie.radio.channel.antenna import antenna_loss_db
@@ -32,8 +25,6 @@ from sortie.radio.rates import STANDARDS, per, rate_table
 from sortie.radio.sample import Service
 from sortie.radio.settings import AirSettings
 
-ROOT = Path(__file__).resolve().parents[2]
-OUT = ROOT / "docs/validation"
 CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60]], float)
 NS3 = {  # FACTS: ns-3's wifi-bianchi reference, 1500 B, no aggregation, N = 5, 10, 20, 50
     "11a, 54 Mb/s": (29.832, 28.152, 26.293, 23.562),
@@ -438,13 +429,33 @@ def scale(seconds: float, sizes: tuple[int, ...]) -> Rows:
 # --- telling -----------------------------------------------------------------------------------------
 
 
-def markdown(title: str, rows: Rows) -> str:
-    names = list(dict.fromkeys(k for row in rows for k in row))
-    lines = ["", f"### {title}", "", "| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    return "\n".join(lines + ["| " + " | ".join(str(row.get(k, "")) for k in names) + " |" for row in rows])
+def tables() -> dict[str, Table]:
+    """Everything but what times the host."""
+    return {
+        "link_free_space": Table.of(friis()),
+        "link_two_rays": Table.of(two_rays()),
+        "link_outage": Table.of(outage(20_000)),
+        "link_shadowing": Table.of(shadowing(24_000, 3000)),
+        "link_banking": Table.of(banking()),
+        "link_rates": Table.of(rates()),
+        "link_bianchi": Table.of(bianchi(), "Throughput in Mb/s; the last column is against ns-3's reference."),
+        "link_contended": Table.of(contended(12_000), "CSMA/CA run over the analytic throughput."),
+        "link_unequal": Table.of(unequal()),
+        "link_rate_control": Table.of(rate_control(600), "Goodput over the best rate's."),
+        "link_goodput": Table.of(goodput(300)),
+        "link_goodput_step": Table.of(goodput_step(), "After a step of 12 dB."),
+    }
 
 
-def figures(folder: Path) -> None:
+def scale_tables() -> dict[str, Table]:
+    """Processor time of the radio by the size of the fleet."""
+    about = (
+        "Every drone sends a descriptor of 208 B at 10 Hz for 120 s; the best of three runs, of one with 400 drones."
+    )
+    return {"radio_scale": Table.of(scale(120, (5, 25, 100, 400)), about)}
+
+
+def draw(path: Path) -> None:
     """Path loss, outage and autocorrelation, PER curves, contention."""
     import matplotlib
 
@@ -491,49 +502,5 @@ def figures(folder: Path) -> None:
     d.set(xlabel="senders (dots: CSMA/CA run)", ylabel="throughput, Mb/s")
     for axes in (a, b, c, d):
         axes.legend(fontsize="small")
-    figure.savefig(folder / "link.png", dpi=110)
+    figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer draws, shorter flights")
-    parser.add_argument("--out", type=Path, default=OUT)
-    asked = parser.parse_args()
-    quick = asked.quick
-    found: dict[str, Any] = {}
-
-    def tell(name: str, title: str, rows: Rows) -> None:
-        found[name] = rows
-        sys.stdout.write(markdown(title, rows) + "\n")
-        sys.stdout.flush()
-
-    tell("friis", "Free space", friis())
-    tell("two_ray", "Two rays", two_rays())
-    tell("outage", "Rician outage", outage(2000 if quick else 20_000))
-    tell("shadowing", "Shadowing", shadowing(4000 if quick else 24_000, 300 if quick else 3000))
-    tell("banking", "A dipole that banks", banking())
-    tell("rates", "Rates and PER", rates())
-    tell("bianchi", "Analytic throughput against ns-3, Mb/s", bianchi())
-    tell("contended", "CSMA/CA run over analytic throughput", contended(2000 if quick else 12_000))
-    tell("unequal", "Unequal rates", unequal())
-    tell("rate_control", "Rate control: goodput over the best rate's", rate_control(60 if quick else 600))
-    tell("goodput", "Goodput as measured against the truth", goodput(30 if quick else 300))
-    tell("goodput_step", "Goodput after a step of 12 dB", goodput_step())
-    tell(
-        "scale",
-        "208 B at 10 Hz from every drone",
-        scale(6 if quick else 120, (5, 25, 100) if quick else (5, 25, 100, 400)),
-    )
-    asked.out.mkdir(parents=True, exist_ok=True)
-    new = asked.out / ".link.json.new"
-    new.write_text(json.dumps(found, indent=1) + "\n")
-    new.replace(asked.out / "link.json")
-    try:
-        figures(asked.out)
-    except ImportError:
-        sys.stdout.write("no matplotlib, no figure\n")
-
-
-if __name__ == "__main__":
-    main()

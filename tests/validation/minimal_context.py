@@ -1,4 +1,4 @@
-"""How small the descriptor can be: AP against context bytes, one knob at a time and together: `python tests/validation/minimal_context.py`.
+"""How small the descriptor can be: AP against context bytes, one knob at a time and together (`make figures FIGURE=context_forms`).
 
 Policies that read the context (`deputies` and `who2com-style`) fly the same sorties with descriptors of several
 forms. Bytes are those that went on the air, authentication included; AP is by the surrogate detector.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+
+from stored import Column, Table, points
 
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.scenarios.reading.load import load
@@ -73,47 +74,23 @@ def _flown(policy: str, seed: int, duration_s: float, settings: Sequence[str]) -
     return run_sortie(load(SCENARIO, [*fixed, *settings]), policy, seed)
 
 
-def table(rows: Sequence[ContextRow]) -> str:
-    """Markdown; differences in AP points with 95 % intervals."""
-    lines = ["| policy | descriptor | context | data | AP@0.5 | against the paper's |", "|---|---|---|---|---|---|"]
-    for r in rows:
-        d = r.difference
-        lines.append(
-            f"| {r.policy} | {r.form} | {r.context_bytes_per_s / 1e3:.2f} kB/s | {r.data_bytes_per_s / 1e6:.1f} MB/s "
-            f"| {d.ap_b:.3f} | {100 * d.delta:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}] |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def draw(rows: Sequence[ContextRow], path: Path) -> None:
-    """AP against context bytes, a series a policy; needs matplotlib (the extra `report`)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    for policy in dict.fromkeys(r.policy for r in rows):
-        mine = [r for r in rows if r.policy == policy]
-        x = [r.context_bytes_per_s / 1e3 for r in mine]
-        axes.plot(x, [r.difference.ap_b for r in mine], "o", label=policy)
-        for r, at in zip(mine, x, strict=True):
-            axes.annotate(r.form, (at, r.difference.ap_b), fontsize=6, xytext=(3, 3), textcoords="offset points")
-    axes.set(xscale="log", xlabel="descriptors on the air, kB/s, whole fleet", ylabel="AP@0.5 (surrogate)")
-    axes.legend()
-    part = path.with_name(path.name + ".part")
-    figure.savefig(part, format=path.suffix.lstrip(".") or "png")
-    part.replace(path)
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--duration-s", type=float, default=40.0)
-    parser.add_argument("--figure", type=Path, help="Draw AP against context bytes here (.png, .svg, .pdf).")
-    args = parser.parse_args()
-    found = list(measure(range(1, args.seeds + 1), args.duration_s))
-    sys.stdout.write(table(found))
-    if args.figure:
-        draw(found, args.figure)
+def table(rows: Sequence[ContextRow], about: str = "") -> Table:
+    """A row a policy and form; differences in AP points."""
+    return Table(
+        [
+            Column("policy"),
+            Column("descriptor"),
+            Column("context", ".2f", " kB/s", 1e-3),
+            Column("data", ".1f", " MB/s", 1e-6),
+            Column("AP@0.5", ".3f"),
+            Column("against the paper's", "+.1f", factor=100),
+        ],
+        [
+            [
+                r.policy, r.form, r.context_bytes_per_s, r.data_bytes_per_s, r.difference.ap_b,
+                points(r.difference) if FORMS[r.form] else None,
+            ]
+            for r in rows
+        ],
+        about,
+    )  # fmt: skip

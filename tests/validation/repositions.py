@@ -1,4 +1,4 @@
-"""What choosing viewpoints gains and costs, measured: `python tests/validation/repositions.py`.
+"""What choosing viewpoints gains and costs (`make figures FIGURE=viewpoints`).
 
 `vantage` flies against `all-4`, which shares the very same and holds its slots: same seeds, same town, same draws. The
 mission is given by where its target drives; AP is by the surrogate detector, energy by the rotor model that charges
@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from stored import Column, Table, points
 
 from sortie.fleet.coverage import footprint_radius_m
 from sortie.perception.metrics.bootstrap import Difference, compare
@@ -63,7 +64,15 @@ class RepositionRow:
 def measure(
     seeds: Sequence[int], duration_s: float, missions: Sequence[str] = tuple(MISSIONS)
 ) -> Iterator[RepositionRow]:
-    """One row a mission. Every seed has a town of its own."""
+    """One row a mission. Every seed has a town of its own.
+
+    Raises:
+        ValueError: one sortie, which has no interval, or one that ends before it tracks, which has no accuracy.
+    """
+    if len(seeds) < 2:
+        raise ValueError(f"{len(seeds)} seeds, must be at least 2")
+    if not duration_s > TRACKING_FROM_S:
+        raise ValueError(f"duration_s is {duration_s:g}, must be above {TRACKING_FROM_S:g}, when tracking begins")
     for mission in missions:
         stays, moves = ([_flown(policy, seed, duration_s, mission) for seed in seeds] for policy in (STAYS, MOVES))
         covered = np.array([[covered_share(r) for r in arm] for arm in (stays, moves)])
@@ -146,41 +155,28 @@ def _difference(a: Sequence[SortieRecord], b: Sequence[SortieRecord], *, mission
     return compare(*pair_up(a, b, mission=mission, begin_s=TRACKING_FROM_S, whole_sorties=True))
 
 
-def table(rows: Sequence[RepositionRow]) -> str:
-    """Markdown; AP points, percent of the disc, and kJ of the fleet, with 95 % intervals."""
-
-    def spelt(gain: Interval, factor: float) -> str:
-        mean, low, high = (factor * g for g in gain)
-        return f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]"
-
-    def points(d: Difference) -> str:
-        return f"{d.ap_a:.3f}, {spelt((d.delta, d.low, d.high), 100)}"
-
-    lines = [
-        "| mission | mission AP, gained | full AP, gained | disc covered, gained (%) | energy, more (kJ) | nearest pair | moves |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.mission} | {points(r.mission_ap)} | {points(r.full_ap)} "
-        f"| {100 * r.covered[0]:.0f}, {spelt(r.covered_gain, 100)} "
-        f"| {r.energy_j[0] / 1e3:.1f}, {spelt(r.energy_gain_j, 1e-3)} | {r.nearest_m:.1f} m | {r.moves:.1f} |"
-        for r in rows
-    ]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--duration-s", type=float, default=60.0)
-    args = parser.parse_args()
-    if args.seeds < 2:  # intervals are over sorties
-        parser.error(f"argument --seeds: {args.seeds}, must be at least 2")
-    if not args.duration_s > TRACKING_FROM_S:
-        parser.error(
-            f"argument --duration-s: {args.duration_s:g}, must be above {TRACKING_FROM_S:g}, when tracking begins"
-        )
-    sys.stdout.write(table(list(measure(range(1, args.seeds + 1), args.duration_s))))
+def table(rows: Sequence[RepositionRow], about: str = "") -> Table:
+    """A row a mission: what `all-4` has, and what `vantage` changes."""
+    return Table(
+        [
+            Column("mission"),
+            Column("mission AP", ".3f"),
+            Column("gain", "+.1f", factor=100),
+            Column("full AP", ".3f"),
+            Column("gain", "+.1f", factor=100),
+            Column("disc covered", ".0f", " %", 100),
+            Column("gain", "+.1f", factor=100),
+            Column("energy", ".1f", " kJ", 1e-3),
+            Column("change", "+.1f", factor=1e-3),
+            Column("nearest pair", ".1f", " m"),
+            Column("moves", ".1f"),
+        ],
+        [
+            [
+                r.mission, r.mission_ap.ap_a, points(r.mission_ap), r.full_ap.ap_a, points(r.full_ap), r.covered[0],
+                r.covered_gain, r.energy_j[0], r.energy_gain_j, r.nearest_m, r.moves,
+            ]
+            for r in rows
+        ],
+        about,
+    )  # fmt: skip

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import minimal_context
 import pytest
 from sim_examples import example
@@ -43,11 +41,8 @@ def test_no_form_makes_honest_drones_doubt_each_other(form: tuple[str, ...]) -> 
     assert outcome(record)["distrusted_by"] == {}
 
 
-def test_the_table_and_the_figure_are_made(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+def test_the_table_is_made() -> None:
     rows = list(minimal_context.measure([1], 3.0, ["deputies"], ["the paper's", "no grid"]))
     assert rows[0].difference.delta == 0.0
     assert rows[1].context_bytes_per_s < 0.8 * rows[0].context_bytes_per_s
-    assert minimal_context.table(rows).count("\n") == 4
-    minimal_context.draw(rows, tmp_path / "context.svg")
-    assert (tmp_path / "context.svg").read_text().startswith("<?xml")
+    assert [row[-1] is None for row in minimal_context.table(rows).rows] == [True, False]

@@ -1,18 +1,11 @@
-"""What the data plane does on bad links: every figure of transport, bursts, age and relay in radio/README.md.
+"""What the data plane does on bad links: transport, bursts, age and relay (`make figures FIGURE=transport`).
 
-    python tests/validation/transport.py [--quick] [--only PART …] [--out FOLDER]
-
-Prints Markdown, writes transport.json (four digits, part by part) and, with matplotlib, transport_framing.png into
-FOLDER. Accuracy is the surrogate's, but for a few frames with the network (`network`).
+Accuracy is the surrogate's, but for a few frames with the network (`framing_network`).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +13,7 @@ import numpy as np
 import pyarrow.compute as pc
 import simpy
 from age import Chain, mean_age_s, share_older
+from stored import Table
 
 from sortie.radio import Air, Status
 from sortie.radio.settings import AirSettings
@@ -28,8 +22,6 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
-ROOT = Path(__file__).resolve().parents[2]
-OUT = ROOT / "docs/validation"
 TABLE_Q, TABLE_K = 1e-3, (488, 122, 10, 1)
 LOSSES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
 FLEET = """
@@ -222,17 +214,7 @@ def relayed(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
 # --- out -------------------------------------------------------------------------------------------
 
 
-def markdown(title: str, rows: list[dict[str, Any]]) -> str:
-    """Rows of dicts as a table."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    lines = [f"## {title}", "", "| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    for row in rows:
-        cells = [row.get(name, "") for name in names]
-        lines.append("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells) + " |")
-    return "\n".join([*lines, ""])
-
-
-def figure(rows: list[dict[str, Any]], path: Path) -> None:
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """AP and goodput of both framings over the loss of frames."""
     import matplotlib as mpl
 
@@ -254,43 +236,18 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
     plt.close(drawn)
 
 
-def main() -> None:
-    """Fly what is asked for."""
-    parts: dict[str, tuple[str, Callable[[bool, tuple[int, ...]], list[dict[str, Any]]]]] = {
-        "fragments": ("(1 − q)^k, q = 0.001", lambda quick, _: fragments_table(2_000 if quick else 20_000)),
-        "framings": ("Framing over the loss of frames", lambda _, seeds: framings(LOSSES, seeds, "surrogate")),
-        "crowded": ("Framing where the channel is full", lambda _, seeds: crowded(seeds)),
-        "closed_ages": ("Ages in closed form", lambda _, seeds: closed_ages()),
-        "staleness": ("Ages as policies read them", lambda quick, seeds: staleness(seeds, 60 if quick else 120)),
-        "relay": ("Hops allowed", lambda _, seeds: relayed(seeds)),
-        "network": (
-            "Framing with the network",
-            lambda _, seeds: framings((0.0, 0.01, 0.1), seeds[:1], "torch", "duration_s=3"),
+def tables(picture: Path, seeds: tuple[int, ...] = (1, 2, 3)) -> dict[str, Table]:
+    """Every part; `picture` shows the framings over the loss of frames."""
+    lossy = framings(LOSSES, seeds, "surrogate")
+    draw(lossy, picture)
+    return {
+        "fragments": Table.of(fragments_table(20_000), f"q = {TABLE_Q:g}, 20,000 samples; half of the 95 % interval."),
+        "framing_loss": Table.of(lossy, f"{len(seeds)} seeds; retries are off."),
+        "framing_crowded": Table.of(crowded(seeds), f"{len(seeds)} seeds; retries are on."),
+        "framing_network": Table.of(
+            framings((0.0, 0.01, 0.1), seeds[:1], "torch", "duration_s=3"), "The torch detector, six scored frames."
         ),
+        "ages_flown": Table.of(staleness(seeds, 120), f"{len(seeds)} seeds of 120 s."),
+        "ages_closed": Table.of(closed_ages(), "Ages count from the moment of hearing."),
+        "relay": Table.of(relayed(seeds), f"{len(seeds)} seeds."),
     }
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer samples and one seed")
-    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
-    parser.add_argument("--out", type=Path, default=OUT)
-    asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
-    kept = asked.out / "transport.json"
-    found: dict[str, Any] = json.loads(kept.read_text()) if kept.is_file() else {}
-    for name in asked.only:
-        title, fly = parts[name]
-        rows = fly(asked.quick, (1,) if asked.quick else (1, 2, 3))
-        found[name] = [{k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()} for row in rows]
-        sys.stdout.write(markdown(title, found[name]) + "\n")
-        sys.stdout.flush()
-        new = asked.out / ".transport.json.new"
-        new.write_text(json.dumps(found, indent=1) + "\n")
-        new.replace(kept)
-    try:
-        if "framings" in found:
-            figure(found["framings"], asked.out / "transport_framing.png")
-    except ImportError:
-        sys.stdout.write("no matplotlib, no figure\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from places import VALIDATION
+import repositions
 from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
@@ -36,8 +34,6 @@ LONG = (
     ASIDE,
     "mission.phases=[{at_s: 0, phase: search}, {at_s: 2, phase: track, region: {radius_m: 32}}]",
 )
-
-SCRIPT = VALIDATION / "repositions.py"
 
 
 def share(view: FleetView) -> list[Directive]:
@@ -183,14 +179,13 @@ def test_nearer_the_region_more_is_found_in_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("seeds", "duration_s", "message"),
     [
-        (["--seeds", "1"], "argument --seeds: 1, must be at least 2"),
-        (["--duration-s", "5"], "argument --duration-s: 5, must be above 5, when tracking begins"),
+        (1, 60.0, "1 seeds, must be at least 2"),
+        (2, 5.0, "duration_s is 5, must be above 5, when tracking begins"),
     ],
 )
-def test_gains_that_cannot_be_measured_are_refused(arguments: list[str], message: str) -> None:
+def test_gains_that_cannot_be_measured_are_refused(seeds: int, duration_s: float, message: str) -> None:
     """One sortie has no interval, and one that ends before it tracks has no accuracy: it was NaN."""
-    ran = subprocess.run([sys.executable, str(SCRIPT), *arguments], capture_output=True, text=True)
-    assert ran.returncode == 2
-    assert ran.stderr.endswith(f"error: {message}\n")
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        list(repositions.measure(range(seeds), duration_s))

@@ -11,7 +11,7 @@ from sortie.perception.study import report as study
 from sortie.perception.study.figures import CAPTIONS
 from sortie.perception.study.measure import from_table
 from sortie.perception.study.plan import read_plan
-from sortie.sim.folders import replace_section
+from sortie.scenarios.report_text import replace_section
 from sortie.sim.studies import paper
 
 

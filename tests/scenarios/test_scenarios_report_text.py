@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sortie.sim.folders import replace_section
+from sortie.scenarios.report_text import replace_section
 
 BEGIN, END = "<!-- part:begin -->", "<!-- part:end -->"
 

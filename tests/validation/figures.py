@@ -1,0 +1,578 @@
+"""Every measured figure of the pages: the list, and the command that measures and renders them (`make figures`).
+
+    python tests/validation/figures.py [NAME …]     measure these, or all of them, cheapest first, and render the pages
+    python tests/validation/figures.py --list       names, and how many minutes each takes on two cores
+    python tests/validation/figures.py --render     write the stored tables into the pages; measures nothing
+
+What is measured goes to docs/results/tables/NAME.json (`stored.py`). A page shows a table where it has its markers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stored import FOLDER, MARKED, ROOT, Column, Table, rendered, save, sections
+
+from sortie.scenarios.reading.load import load, load_conditions
+from sortie.sim.folders import write_text
+
+PICTURES = ROOT / "docs/validation"
+WORK = ROOT / "runs/figures"
+"""What long measurements keep, so that a run that was cut off goes on."""
+Tables = Mapping[str, Table | str]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One file of tables, and what measures it."""
+
+    minutes: float
+    """On two cores."""
+    measure: Callable[[], Tables | None]
+    """None where a command writes its own tables and pages."""
+    timed: bool = False
+    """Times of this host are measured; the page names it."""
+
+
+# --- by the scripts beside this one -----------------------------------------------------------------
+
+
+def _liars() -> Tables:
+    import liars
+
+    return liars.tables(range(1, 3), 40.0)
+
+
+def _context_forms() -> Tables:
+    import minimal_context
+
+    rows = list(minimal_context.measure(range(1, 3), 40.0))
+    return {
+        "context_forms": minimal_context.table(
+            rows, "Two sorties of 40 s for each row; intervals over scored instants."
+        )
+    }
+
+
+def _viewpoints() -> Tables:
+    import repositions
+
+    rows = list(repositions.measure(range(1, 9), 60.0))
+    return {"viewpoints": repositions.table(rows, "Eight sorties of 60 s in eight towns; intervals over sorties.")}
+
+
+def _fusion_age() -> Tables:
+    import fusion_age
+
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+
+    rows = fusion_age.measure(load_weights(SHIPPED_WEIGHTS), scenes=16, frames=2)
+    return {
+        "fusion_age": fusion_age.table(rows, "16 test scenes of two frames, five egos each; intervals over scenes.")
+    }
+
+
+def _fusion_methods() -> Tables:
+    """Trains the methods that are not shipped for 120 steps from the study's `full-0`, then evaluates all of them."""
+    import fusion_comparison
+
+    from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+
+    files = {"disconet": SHIPPED_WEIGHTS}
+    for method in ("fcooper", "where2comm", "v2vnet"):
+        files[method] = WORK / f"{method}.safetensors"
+        _sortie(
+            "train", "--fusion", method, "--steps", "120", "--peak-lr", "0.001", "--out", files[method],
+            "--warm-start", ROOT / "perception/study/weights/full-0.safetensors",
+        )  # fmt: skip
+    split = make_split(Benchmark(), "test", ROOT / "runs/bench", scenes=30)
+    rows = fusion_comparison.measure({name: load_weights(path) for name, path in files.items()}, load_frames(split))
+    return {"fusion_methods": fusion_comparison.table(rows, "30 frames of the test split; intervals over scenes.")}
+
+
+def _link() -> Tables:
+    import link
+
+    link.draw(PICTURES / "link.png")
+    return link.tables()
+
+
+def _radio_scale() -> Tables:
+    import link
+
+    return link.scale_tables()
+
+
+def _transport() -> Tables:
+    import transport
+
+    return transport.tables(PICTURES / "transport_framing.png")
+
+
+def _energy() -> Tables:
+    import energy
+
+    energy.draw_effects(PICTURES)
+    return energy.tables()
+
+
+def _flight() -> Tables:
+    import energy
+
+    energy.draw_flight(energy.read_log(energy.LOG), PICTURES)
+    return energy.flight_tables(energy.LOG)
+
+
+# --- policies over conditions -----------------------------------------------------------------------
+
+
+def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: bool = False) -> Table:
+    """As `sortie compare NAME --policies …`: every policy's AP, and its gain over the best fixed one, by phase and budget."""
+    from sortie.perception.detectors import make_detector
+    from sortie.sim.studies.conditions import best_fixed, fly_all, paired_interval, summarise
+    from sortie.sim.studies.in_flight import torch_answers
+
+    conditions = load_conditions(name)
+    assert conditions is not None, name
+    conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
+    cells = fly_all(conditions, policies, detector_of=torch_answers() if by_torch else make_detector)
+    rows = summarise(cells)
+    first = best_fixed(rows)
+    ap = {(c.policy, c.condition): c.ap for c in cells}
+    budgets = sorted({c.rho for c in conditions.conditions})
+    parts = [
+        *([c for c in conditions.conditions if (c.metric == "mission") == tracking] for tracking in (False, True)),
+        *([c for c in conditions.conditions if c.rho == rho] for rho in budgets),
+    ]
+
+    def gain(policy: str, part: Sequence[Any]) -> tuple[float, float, float] | None:
+        over = np.array([ap[policy, c.name] - ap[first, c.name] for c in part])
+        over = over[np.isfinite(over)]
+        return (float(over.mean()), *paired_interval(over)) if len(over) else None
+
+    gains = ["searching", "tracking", *(f"ρ = {rho:g}" for rho in budgets)]
+    return Table(
+        [
+            Column("policy"),
+            Column("AP", ".3f"),
+            *(Column(name, "+.1f", factor=100) for name in (f"over {first}", *gains)),
+            Column("of the oracle", ".0f", " %", 100),
+            Column("data a sortie", ".1f", " MB", 1e-6),
+            Column("missed", ".1f", " %", 100),
+        ],
+        [
+            [
+                r.policy, r.ap, None if r.policy == first else r.gain,
+                *(None if r.policy == first else gain(r.policy, part) for part in parts),
+                r.of_oracle, r.data_bytes, r.miss_rate,
+            ]
+            for r in sorted(rows, key=lambda r: -r.ap)
+        ],
+        f"{len(conditions.conditions)} conditions; gains in AP points, with intervals over conditions.",
+    )  # fmt: skip
+
+
+ADAPTIVE = ("adaptive", "boxes", "learned", "worked")
+SLOWLY = "perception.sample_rate_hz=0.5"
+
+
+def _held_out() -> Tables:
+    from sortie.sim.studies.conditions import FIXED
+
+    return {"held_out": _over_conditions("conditions_fourth", [*FIXED, *ADAPTIVE], SLOWLY, by_torch=True)}
+
+
+def _conditions_first() -> Tables:
+    policies = ["all-4", "adaptive", "boxes"]
+    return {
+        "first_by_torch": _over_conditions("conditions", policies, SLOWLY, by_torch=True),
+        "first_by_surrogate": _over_conditions("conditions", policies),
+    }
+
+
+def _where_boxes_average() -> Tables:
+    policies = ["all-4", "boxes", "adaptive", "learned"]
+    return {"where_boxes_average": _over_conditions("conditions_third", policies, "perception.join=average")}
+
+
+def _arms() -> Tables:
+    """As `sortie learn --by-torch`."""
+    from sortie.policies.catalogue.adaptive import ARMS
+    from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains
+
+    lessons = fly_lessons(0, 100, by_torch=True, workers=2)
+    rows: list[list[Any]] = []
+    for k, arm in enumerate(ARMS[1:], start=1):
+        found = gains(lessons, k)
+        for phase in ("search", "track"):
+            means = [found.get((phase, rho)) for rho in BUDGETS]
+            rows.append([arm.text, phase, *(m and (m[0], m[0] - 1.96 * m[1], m[0] + 1.96 * m[1]) for m in means)])
+    budgets = [Column(f"ρ = {rho:g}", "+.1f", factor=100) for rho in BUDGETS]
+    about = f"{len(lessons)} training conditions; AP points over maps to all, ± 1.96 standard errors."
+    return {"arms": Table([Column("arm"), Column("phase"), *budgets], rows, about)}
+
+
+def _surrogate_in_flight() -> Tables:
+    """As `sortie calibrate --fly conditions_fourth --towns 10`."""
+    from sortie.perception.surrogate.model import SHIPPED
+    from sortie.sim.studies.in_flight import REGIONS, flights, means
+
+    policies = ["silence", "all-4", "boxes", "adaptive"]
+    levels = list(flights("conditions_fourth", SHIPPED, None, 0.5, policies, None, 10))
+    columns = [
+        Column("region"),
+        Column("policy"),
+        *_points("torch", ".1f"),
+        *_points("surrogate", ".1f"),
+        *_points("error"),
+    ]
+    return {
+        "surrogate_in_flight": Table(
+            columns,
+            [[REGIONS[m.region], m.what, m.torch, m.surrogate, m.error] for m in means(levels)],
+            "Forty conditions in ten towns each; points of AP, with intervals over conditions.",
+        )
+    }
+
+
+def _points(name: str, form: str = "+.1f") -> Iterator[Column]:
+    yield Column(name, form, factor=100)
+
+
+# --- perception -------------------------------------------------------------------------------------
+
+
+def _difficulty() -> Tables:
+    from sortie.perception.evaluation.difficulty_effects import SEED, measure
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+
+    rows = [
+        [
+            e.move.parameter, e.move.value, e.gain.ap_a, e.gain.ap_b, e.gain.delta,
+            None if e.change is None else (e.change.delta, e.change.low, e.change.high),
+        ]
+        for e in measure(SHIPPED_WEIGHTS, WORK / "difficulty", scenes=60, workers=2)
+    ]  # fmt: skip
+    about = f"`{SHIPPED_WEIGHTS.name}`, 60 scenes of seed {SEED}'s test layouts, one fleet-frame of five egos each. Change: of AP under full sharing against the first row, paired by scene."
+    ap = [Column(name, ".3f") for name in ("AP alone", "AP sharing all")]
+    gains = [Column(name, "+.3f") for name in ("cooperation", "change")]
+    return {"difficulty": Table([Column("parameter"), Column("moved to"), *ap, *gains], rows, about)}
+
+
+def _survey() -> Tables:
+    """As `sortie bench survey --scenes 40`."""
+    from sortie.perception.benchmark.dataset import SIZES, Benchmark
+    from sortie.perception.benchmark.survey import by_style, survey
+
+    bench = Benchmark()
+    rows = []
+    for split, (scenes, _) in SIZES.items():
+        counted = [survey(bench, split, k) for k in range(min(40, scenes))]
+        for style, n, c in by_style(counted):
+            rows.append([split, style, n, c.cars, c.alone, c.fleet, c.built, c.height_m, c.lot_m])
+    columns = [
+        Column("split"), Column("style"), Column("scenes", ".0f"), Column("cars in ±102.4 m", ".1f"),
+        *(Column(name, ".2f") for name in ("seen by the drone", "by any of five", "built")),
+        Column("height", ".1f", " m"), Column("lot", ".0f", " m"),
+    ]  # fmt: skip
+    return {"survey": Table(columns, rows)}
+
+
+def _paper() -> None:
+    """Writes docs/paper and its section, which `sections_of_reports` reads."""
+    _sortie(
+        "paper", "--readme", ROOT / "docs/results/claims.md", "--out", ROOT / "docs/paper", "--work", WORK / "paper"
+    )
+
+
+def _study() -> None:
+    """Measures the networks that have weights; writes docs/study and its section."""
+    _sortie("study", "run", "--work", WORK / "study")
+    report = ("--out", ROOT / "docs/study", "--readme", ROOT / "docs/results/flip.md")
+    _sortie("study", "report", WORK / "study/study.parquet", *report)
+
+
+SEED_CLAIMS = ("gain", "keep.0.1", "union.0.25")
+
+
+def _paper_seeds() -> Tables:
+    """`sortie paper` on other benchmarks and with other weights, beside docs/paper."""
+    from sortie.perception.evaluation import rows
+
+    weights = ROOT / "perception/study/weights"
+    makings = {
+        "benchmark seed 1": ("--seed", "1"),
+        "benchmark seed 2": ("--seed", "2"),
+        "training seed 0": ("--weights", weights / "full-0.safetensors"),
+        "training seed 2": ("--weights", weights / "full-2.safetensors"),
+    }
+    shipped, _ = rows.read(ROOT / "docs/paper/paper.parquet")
+    tables = {"as shipped": shipped}
+    for name, options in makings.items():
+        out = WORK / name.replace(" ", "_")
+        _sortie("paper", *options, "--out", out, "--work", WORK / "paper")
+        tables[name], _ = rows.read(out / "paper.parquet")
+    return {"paper_seeds": seeds_table(tables)}
+
+
+def seeds_table(tables: Mapping[str, Sequence[Any]]) -> Table:
+    """How many verdicts are those of the first table, and what some claims come to in each."""
+    from sortie.perception.evaluation.report import ours
+
+    first = next(iter(tables.values()))
+    verdicts = {(r.id, r.instrument): r.verdict for r in first}
+    same = [sum(verdicts.get((r.id, r.instrument)) == r.verdict for r in some) for some in tables.values()]
+    says = {r.id: r.says for r in first if r.headline and r.rule == "contrast"}
+    found: list[list[Any]] = [[f"verdicts as in the first column, of {len(first)}", *same]]
+    for claim, text in says.items():
+        mine = ([r for r in some if (r.id, r.instrument) == (claim, "zero")] for some in tables.values())
+        found.append([text, *(ours(r[0]) if r else None for r in mine)])
+    return Table([Column("the paper's instrument"), *(Column(name, ".0f") for name in tables)], found)
+
+
+# --- sorties, the bus, the host ---------------------------------------------------------------------
+
+
+def _compare() -> Tables:
+    command = ("compare", "track_target", "--policies", "worked,all-4,silence")
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "page.md"
+        page.write_text("<!-- compare:begin --><!-- compare:end -->", "utf-8")
+        _sortie(*command, "--readme", page)
+        return {"compare": _between(page.read_text("utf-8"), "compare")}
+
+
+def _hysteresis() -> Tables:
+    from sortie.sim.engine.sortie import run_sortie
+    from sortie.sim.results.outcome import outcome
+
+    rows = []
+    for band in (0.0, 0.2, 1.0):
+        record = run_sortie(load("paper_replay", ["perception.detector=none", f"policy.hysteresis={band}"]))
+        rows.append([band, record.tables["directives"].num_rows, outcome(record)["switches"]])
+    columns = [
+        Column("`policy.hysteresis`", "g"),
+        Column("directives", ",.0f"),
+        Column("switches a link and minute", ".2f"),
+    ]
+    return {"hysteresis": Table(columns, rows, "`paper_replay`, one sortie each.")}
+
+
+def _overhead() -> Tables:
+    """As `sortie overhead`."""
+    from sortie.sim.studies.overhead import FLEETS, SCENARIO, SECONDS, measure
+
+    rows = []
+    for drones in FLEETS:
+        r = measure("worked", drones)
+        rows.append([drones, r.p50_ms, r.p99_ms, r.context_bytes_per_s, r.data_bytes_per_s, r.context_share])
+    columns = [
+        Column("drones", ".0f"),
+        *(Column(name, ".0f", " µs", 1000) for name in ("a decision, median", "99th percentile")),
+        Column("context", ".1f", " kB/s", 1e-3), Column("data", ".1f", " MB/s", 1e-6),
+        Column("context of all bytes", ".2f", " %", 100),
+    ]  # fmt: skip
+    return {"overhead": Table(columns, rows, f"`worked` in `{SCENARIO}`, {SECONDS:g} s.")}
+
+
+def _live() -> Tables:
+    """As `sortie live`, in real time."""
+    from sortie.sim.live.result import overhead_rows
+    from sortie.sim.live.session import fly_live
+
+    four = ["fleet.drones=4"]
+    full = [*four, "policy.name=all-4", "policy.params={rho: 1}"]
+    one, other = fly_live(load("paper_replay", four)), fly_live(load("paper_replay", full), duration_s=30.0)
+    both = zip(overhead_rows(one), overhead_rows(other), strict=True)
+    columns = [Column(""), Column("paper"), Column("worked"), Column("all-4(rho=1)")]
+    overhead = Table(
+        columns, [[*row, there[2]] for row, there in both], "Four drones; 120 s and 30 s of `paper_replay`."
+    )
+    lossy = fly_live(load("paper_replay"), begin_s=50.0, duration_s=30.0, loss=0.3, kill=(3, 70.0))
+    dropped, heard = (sum(getattr(d, name) for d in lossy.each) for name in ("dropped_by_loss", "heard"))
+    noticed = [n for n in lossy.noticed if n.drone == 3]
+    rows: list[list[Any]] = [
+        ["descriptors dropped", f"{dropped:,} of {dropped + heard:,}"],
+        *([f"contexts that became {h.name.lower()}", sum(c.health == h for c in lossy.health)] for h in _healths()),
+        ["a capture's way to its receiver, median", f"{lossy.data_age_ms_p50:.0f} ms"],
+    ]
+    for n in noticed:
+        for what, span in (("degraded", n.degraded_s), ("detached", n.detached_s)):
+            rows.append(
+                [f"drone 3, killed, {what} at {n.by} others after", span and f"{span[0]:.2f} to {span[1]:.2f} s"]
+            )
+    return {"live": overhead, "live_losses": Table([Column("measured"), Column("value", ".0f")], rows)}
+
+
+def _healths() -> Sequence[Any]:
+    from sortie.fleet.staleness import LinkHealth
+
+    return list(LinkHealth)
+
+
+def _speed() -> Tables:
+    """As `make bench`."""
+    return {"speed": speed_table(_benchmarks("tests/benchmarks"))}
+
+
+def _benchmarks(where: str) -> list[dict[str, Any]]:
+    with tempfile.TemporaryDirectory() as folder:
+        kept = Path(folder) / "bench.json"
+        bench = ("pytest", where, "--benchmark-enable", "--benchmark-only", f"--benchmark-json={kept}", "-q")
+        subprocess.run([sys.executable, "-m", *bench], cwd=ROOT, check=True)
+        measured: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["benchmarks"]
+    return measured
+
+
+def _inference_libraries() -> Tables:
+    """Needs onnx, onnxruntime and openvino for their rows."""
+    measured = _benchmarks("tests/benchmarks/test_bench_inference_libraries.py")
+    times = [(b["params"]["way"], b["stats"]["min"], b["stats"]["median"]) for b in measured]
+    columns = [Column("method"), *(Column(name, ".1f", " ms", 1e3) for name in ("least", "median"))]
+    return {"inference_libraries": Table(columns, sorted(times, key=lambda row: row[1]))}
+
+
+def speed_table(benchmarks: Sequence[Mapping[str, Any]]) -> Table:
+    """The median time of every benchmark, by file and group."""
+
+    def median(seconds: float) -> str:
+        unit, factor = next(u for u in ((" s", 1.0), (" ms", 1e3), (" µs", 1e6)) if seconds * u[1] >= 1 or u[1] == 1e6)
+        return f"{seconds * factor:.3g}{unit}"
+
+    rows = [
+        [b["fullname"].partition("::")[0].rpartition("test_bench_")[2].removesuffix(".py"), b["group"] or "",
+         b["name"].removeprefix("test_").replace("_", " ").replace("[", ", ").removesuffix("]"), median(b["stats"]["median"]), b["stats"]["rounds"]]
+        for b in benchmarks
+    ]  # fmt: skip
+    return Table([*map(Column, ("part", "group", "what", "median")), Column("rounds", ".0f")], rows)
+
+
+# --- the list ---------------------------------------------------------------------------------------
+
+FIGURES: dict[str, Figure] = {
+    "hysteresis": Figure(0.2, _hysteresis),
+    "overhead": Figure(0.5, _overhead, timed=True),
+    "energy": Figure(0.5, _energy),
+    "flight": Figure(0.5, _flight),
+    "survey": Figure(1, _survey),
+    "compare": Figure(2, _compare),
+    "viewpoints": Figure(2, _viewpoints),
+    "where_boxes_average": Figure(3, _where_boxes_average),
+    "live": Figure(3.5, _live, timed=True),
+    "radio_scale": Figure(3, _radio_scale, timed=True),
+    "liars": Figure(4, _liars),
+    "context_forms": Figure(4, _context_forms),
+    "fusion_age": Figure(4, _fusion_age),
+    "link": Figure(5, _link),
+    "transport": Figure(6, _transport),
+    "paper": Figure(8, _paper),
+    "conditions_first": Figure(8, _conditions_first),
+    "inference_libraries": Figure(2, _inference_libraries, timed=True),
+    "speed": Figure(12, _speed, timed=True),
+    "difficulty": Figure(12, _difficulty),
+    "surrogate_in_flight": Figure(18, _surrogate_in_flight),
+    "arms": Figure(20, _arms),
+    "fusion_methods": Figure(25, _fusion_methods),
+    "paper_seeds": Figure(30, _paper_seeds),
+    "held_out": Figure(30, _held_out),
+    "study": Figure(60, _study),
+}
+"""By the name of the file, cheapest first."""
+
+
+def _sortie(*words: object) -> None:
+    subprocess.run([sys.executable, "-m", "sortie", *map(str, words)], cwd=ROOT, check=True)
+
+
+def _between(text: str, name: str) -> str:
+    return text.partition(f"<!-- {name}:begin -->")[2].partition(f"<!-- {name}:end -->")[0].strip()
+
+
+def sections_of_reports() -> dict[str, str]:
+    """The sections that are made from the reports' own tables and from the code, not from docs/results/tables."""
+    import pyarrow.parquet as pq
+
+    from sortie.perception.evaluation import report, rows
+    from sortie.perception.study import report as study
+    from sortie.perception.study.measure import from_table
+    from sortie.perception.study.plan import read_plan
+    from sortie.scenarios.reference import fields_markdown
+
+    paper = report.short(*rows.read(ROOT / "docs/paper/paper.parquet"), "../paper/README.md")
+    flip = study.short(read_plan(), from_table(pq.read_table(ROOT / "docs/study/study.parquet")), "../study/README.md")
+    return {"paper": _between(paper, "paper"), "study": _between(flip, "study"), "fields": fields_markdown().strip()}
+
+
+def all_sections() -> dict[str, str]:
+    """Every section by its name, as it should stand on its page."""
+    found = sections_of_reports()
+    for file in sorted(FOLDER.glob("*.json")):
+        found |= sections(file.stem)
+    return found
+
+
+def pages() -> list[Path]:
+    """Every page of the repository but the changelog."""
+    return sorted(
+        path
+        for path in ROOT.rglob("*.md")
+        if not {"runs", "node_modules"} & set(path.parts)
+        and not any(part.startswith(".") for part in path.relative_to(ROOT).parts)
+        and path.name != "CHANGELOG.md"
+    )
+
+
+def render() -> Iterator[Path]:
+    """Write the sections into the pages; yields those that changed."""
+    found = all_sections()
+    for page in pages():
+        old = page.read_text("utf-8")
+        if MARKED.search(old) and (new := rendered(old, found)) != old:
+            write_text(page, new)
+            yield page
+
+
+def _host() -> str:
+    from sortie.sim.studies.overhead import host_s
+    from sortie.sim.studies.plane_cost import machine
+
+    return f"{machine()}, which takes {1e3 * host_s():.0f} ms for a million additions in a loop"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--list", action="store_true")
+    parser.add_argument("--render", action="store_true")
+    asked = parser.parse_args()
+    if unknown := [name for name in asked.names if name not in FIGURES]:
+        parser.error(f"no figure is called {unknown[0]}; there are {', '.join(FIGURES)}")
+    if asked.list:
+        sys.stdout.writelines(f"{name:24}{figure.minutes:g} min\n" for name, figure in FIGURES.items())
+        return
+    for name in [] if asked.render else asked.names or FIGURES:
+        begin_s = time.monotonic()
+        found = FIGURES[name].measure()
+        if found is not None:
+            save(name, found, _host() if FIGURES[name].timed else "")
+        sys.stdout.write(f"{name} measured in {(time.monotonic() - begin_s) / 60:.1f} min\n")
+        sys.stdout.flush()
+    for page in render():
+        sys.stdout.write(f"{page.relative_to(ROOT)} written\n")
+
+
+if __name__ == "__main__":
+    main()
