@@ -454,7 +454,7 @@ def speed_table(benchmarks: Sequence[Mapping[str, Any]]) -> Table:
 
     rows = [
         [b["fullname"].partition("::")[0].rpartition("test_bench_")[2].removesuffix(".py"), b["group"] or "",
-         b["name"].removeprefix("test_").replace("_", " ").replace("[", ", ").removesuffix("]"), median(b["stats"]["median"]), b["stats"]["rounds"]]
+         b["name"].encode().decode("unicode_escape").removeprefix("test_").replace("_", " ").replace("[", ", ").removesuffix("]"), median(b["stats"]["median"]), b["stats"]["rounds"]]
         for b in benchmarks
     ]  # fmt: skip
     return Table([*map(Column, ("part", "group", "what", "median")), Column("rounds", ".0f")], rows)

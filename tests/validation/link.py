@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import csma
 import numpy as np
 import simpy
 from scipy import stats
-from stored import Table
+from stored import Column, Table
 
 from sortie.radio import Air
 from sortie.radio.channel.antenna import antenna_loss_db
@@ -90,8 +90,8 @@ def outage(frames: int) -> Rows:
                 {
                     "K, dB": k_db,
                     "below, dB": depth_db,
-                    "exact": f"{exact:.3e}",
-                    "simulated": f"{seen:.3e}",
+                    "exact": exact,
+                    "simulated": seen,
                     "standard errors off": round((seen - exact) / error, 2) if error else 0.0,
                 }
             )
@@ -191,7 +191,7 @@ def _beside(name: str, ours: list[float], reference: tuple[float, ...]) -> dict[
     return {
         "case": name,
         **{f"N = {n}": round(v, 2) for n, v in zip(SENDERS, ours, strict=True)},
-        "largest off": f"{off:.3%}",
+        "largest off": off,
     }
 
 
@@ -215,7 +215,7 @@ def contended(periods: int) -> Rows:
             row: dict[str, Any] = {"case": name, "run": rules}
             for n in SENDERS:
                 ran = csma.run([turn] * n, periods, np.random.default_rng(n), **kwargs)  # type: ignore[arg-type]
-                row[f"N = {n}"] = f"{ran.throughput_mbps / (frames * 12e-3 / one.channel_s(contention(n))) - 1:+.1%}"
+                row[f"N = {n}"] = ran.throughput_mbps / (frames * 12e-3 / one.channel_s(contention(n))) - 1
             rows.append(row)
     return rows
 
@@ -263,7 +263,11 @@ def rate_control(seconds: float) -> Rows:
             late.append(rates_mbps[at] * (1 - pers[at]) / best)
             known = now_db
         s = np.array(share[20:])
-        row = {"channel": name, "Minstrel-like": f"{s.mean():.1%}", "ideal, a frame late": f"{np.mean(late[20:]):.1%}"}
+        row: dict[str, Any] = {
+            "channel": name,
+            "Minstrel-like": float(s.mean()),
+            "ideal, a frame late": float(np.mean(late[20:])),
+        }
         if name.startswith("12"):
             edges = range(50, intervals - 50, 50)
             lag = [next(j for j in range(51) if share[k + j : k + j + 1] and share[k + j] > 0.9) for k in edges]
@@ -320,9 +324,9 @@ def goodput(seconds: float) -> Rows:
                 {
                     "sample, B": payload,
                     "channel": name,
-                    "mean reading over mean truth": f"{r.mean() / t.mean():.3f}",
-                    "RMS error over truth": f"{np.sqrt(((r - t) ** 2).mean()) / t.mean():.3f}",
-                    "lag of best correlation, frames": _lag(r, t) if name != "still" else "",
+                    "mean reading over mean truth": float(r.mean() / t.mean()),
+                    "RMS error over truth": float(np.sqrt(((r - t) ** 2).mean()) / t.mean()),
+                    "lag of best correlation, frames": _lag(r, t) if name != "still" else None,
                 }
             )
     return rows
@@ -420,7 +424,7 @@ def scale(seconds: float, sizes: tuple[int, ...]) -> Rows:
                     "µs a broadcast": round(cpu_s / c.broadcasts * 1e6, 1),
                     "ns a broadcast and neighbour": round(cpu_s / c.broadcasts / max(near, 1) * 1e9),
                     "events a broadcast": round(events / c.broadcasts, 2),
-                    "collided": f"{c.collided / c.broadcasts:.1%}",
+                    "collided": c.collided / c.broadcasts,
                 }
             )
     return rows
@@ -429,20 +433,38 @@ def scale(seconds: float, sizes: tuple[int, ...]) -> Rows:
 # --- telling -----------------------------------------------------------------------------------------
 
 
+COLUMNS = {
+    "exact": Column("exact", ".3e"),
+    "simulated": Column("simulated", ".3e"),
+    "largest off": Column("largest off", ".3f", " %", 100),
+    "Minstrel-like": Column("Minstrel-like", ".1f", " %", 100),
+    "ideal, a frame late": Column("ideal, a frame late", ".1f", " %", 100),
+    "mean reading over mean truth": Column("mean reading over mean truth", ".3f"),
+    "RMS error over truth": Column("RMS error over truth", ".3f"),
+    "collided": Column("collided", ".1f", " %", 100),
+}
+SHARES = {f"N = {n}": Column(f"N = {n}", "+.1f", " %", 100) for n in SENDERS}
+
+
+def told(rows: Rows, about: str = "", columns: Mapping[str, Column] = COLUMNS) -> Table:
+    """Rows with their numbers as people read them."""
+    return Table.of(rows, about, columns)
+
+
 def tables() -> dict[str, Table]:
     """Everything but what times the host."""
     return {
         "link_free_space": Table.of(friis()),
         "link_two_rays": Table.of(two_rays()),
-        "link_outage": Table.of(outage(20_000)),
+        "link_outage": told(outage(20_000)),
         "link_shadowing": Table.of(shadowing(24_000, 3000)),
         "link_banking": Table.of(banking()),
         "link_rates": Table.of(rates()),
-        "link_bianchi": Table.of(bianchi(), "Throughput in Mb/s; the last column is against ns-3's reference."),
-        "link_contended": Table.of(contended(12_000), "CSMA/CA run over the analytic throughput."),
+        "link_bianchi": told(bianchi(), "Throughput in Mb/s; the last column is against ns-3's reference."),
+        "link_contended": told(contended(12_000), "CSMA/CA run over the analytic throughput, less one.", SHARES),
         "link_unequal": Table.of(unequal()),
-        "link_rate_control": Table.of(rate_control(600), "Goodput over the best rate's."),
-        "link_goodput": Table.of(goodput(300)),
+        "link_rate_control": told(rate_control(600), "Goodput over the best rate's."),
+        "link_goodput": told(goodput(300)),
         "link_goodput_step": Table.of(goodput_step(), "After a step of 12 dB."),
     }
 
@@ -452,7 +474,7 @@ def scale_tables() -> dict[str, Table]:
     about = (
         "Every drone sends a descriptor of 208 B at 10 Hz for 120 s; the best of three runs, of one with 400 drones."
     )
-    return {"radio_scale": Table.of(scale(120, (5, 25, 100, 400)), about)}
+    return {"radio_scale": told(scale(120, (5, 25, 100, 400)), about)}
 
 
 def draw(path: Path) -> None:

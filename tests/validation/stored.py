@@ -30,7 +30,10 @@ Cell = str | float | None | Sequence[float]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column's head, and how its numbers are printed: times `factor`, by a format specification, with a unit."""
+    """One column's head, and how its numbers are printed: times `factor`, by a format specification, with a unit.
+
+    Without a specification whole numbers are printed as they are, others with four digits.
+    """
 
     name: str
     form: str = ""
@@ -54,7 +57,8 @@ class Column:
         return self._number(cell) + self.unit
 
     def _number(self, value: float) -> str:
-        text = f"{value * self.factor:{self.form}}"
+        form = self.form or (",d" if isinstance(value, int) and self.factor == 1 else ".4g")
+        text = f"{value if form == ',d' else value * self.factor:{form}}"
         return (text if text.strip("+-0.,%") else text.lstrip("+-")).replace("-", MINUS)
 
 
@@ -67,13 +71,14 @@ class Table:
     about: str = ""
 
     @classmethod
-    def of(cls, rows: Iterable[Mapping[str, Any]], about: str = "") -> Table:
-        """Rows that name their columns; numbers are printed with up to four digits."""
+    def of(
+        cls, rows: Iterable[Mapping[str, Any]], about: str = "", columns: Mapping[str, Column] | None = None
+    ) -> Table:
+        """Rows that name their columns; `columns` has those that are printed otherwise, by name."""
         rows = list(rows)
         names = list(dict.fromkeys(name for row in rows for name in row))
-        return cls(
-            [Column(name, ".4g") for name in names], [[row.get(name, "") for name in names] for row in rows], about
-        )
+        shown = [(columns or {}).get(name, Column(name)) for name in names]
+        return cls(shown, [[row.get(name) for name in names] for row in rows], about)
 
     def markdown(self) -> str:
         """The table with its sentence."""

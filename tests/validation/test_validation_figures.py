@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
+import figures
 import pytest
-from figures import FIGURES, all_sections, pages, speed_table
+from figures import FIGURES, all_sections, pages, seeds_table, speed_table
 from places import ROOT
 from stored import FOLDER, MARKED, Column, Table, rendered, sections, store
+
+from sortie.perception.evaluation import rows
+from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.sim.studies import conditions
+from sortie.sim.studies.conditions import Cell
 
 GENERATED = {"docs/paper/README.md", "docs/study/README.md", "sim/results/outcome.md"}
 """Pages that a command writes whole; their own tests hold them to their data."""
@@ -157,9 +165,41 @@ def test_a_stored_table_comes_back_and_goes_between_its_markers(tmp_path: Path) 
 
 def test_times_are_printed_in_the_unit_that_reads_best() -> None:
     stats = [{"median": seconds, "rounds": 3} for seconds in (1.2345, 0.0123, 8.5e-6)]
-    rows = [
+    benchmarks = [
         {"fullname": "tests/benchmarks/test_bench_fleet.py::x", "group": None, "name": "test_a_b", "stats": s}
         for s in stats
     ]
-    assert [row[3] for row in speed_table(rows).rows] == ["1.23 s", "12.3 ms", "8.5 µs"]
-    assert speed_table(rows).rows[0][:3] == ["fleet", "", "a b"]
+    assert [row[3] for row in speed_table(benchmarks).rows] == ["1.23 s", "12.3 ms", "8.5 µs"]
+    assert speed_table(benchmarks).rows[0][:3] == ["fleet", "", "a b"]
+
+
+def test_gains_over_conditions_are_split_by_phase_and_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty conditions, half of them tracking; `boxes` gains in those alone."""
+
+    def flown(flown_in: ConditionSet, policies: Sequence[str], **_: object) -> list[Cell]:
+        gain = {"silence": 0.0, "boxes": 0.2}
+        return [
+            Cell(p, c.name, 0.3 + gain[p] * (c.metric == "mission"), 1e6, 1.0, 0.01)
+            for p in policies
+            for c in flown_in.conditions
+        ]
+
+    monkeypatch.setattr(conditions, "fly_all", flown)
+    made = figures._over_conditions("conditions_fourth", ["silence", "boxes"])
+    names, (boxes, silence) = [c.name for c in made.columns], made.rows
+    assert names[2:5] == ["over silence", "searching", "tracking"]
+    assert list(silence[2:9]) == [None] * 7
+    assert boxes[3] == (0.0, 0.0, 0.0)
+    assert boxes[4] == pytest.approx((0.2, 0.2, 0.2))
+    assert boxes[2][0] == pytest.approx(0.1)  # type: ignore[index]
+    assert made.columns[2].text(boxes[2]).startswith("+10.0 [")
+
+
+def test_verdicts_of_other_seeds_are_counted_against_the_first() -> None:
+    table, _ = rows.read(ROOT / "docs/paper/paper.parquet")
+    changed = [dataclasses.replace(row, verdict="another") if row.id == "gain" else row for row in table]
+    made = seeds_table({"here": table, "there": changed})
+    assert made.rows[0][1] == len(table)
+    assert made.rows[0][2] == len(table) - sum(row.id == "gain" for row in table)
+    assert all(row[1] == row[2] for row in made.rows[1:])
+    assert len(made.rows) > 5

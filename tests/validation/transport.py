@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.compute as pc
 import simpy
 from age import Chain, mean_age_s, share_older
-from stored import Table
+from stored import Column, Table
 
 from sortie.radio import Air, Status
 from sortie.radio.settings import AirSettings
@@ -90,7 +90,7 @@ def means(results: list[dict[str, Any]], scenario: Scenario) -> dict[str, float]
     sent = [r["bytes"]["data_sent"] for r in results]
     return {
         "ap50": float(np.mean(ap)),
-        "ap50_spread": float(np.std(ap, ddof=1)) if len(ap) > 1 else 0.0,
+        "ap50_spread": float(np.std(ap, ddof=1)) if len(ap) > 1 else None,
         "goodput_mbps": float(np.mean(delivered)) * 8e-6 / scenario.duration_s,
         "arrived": float(np.sum(delivered) / np.sum(sent)),
     }
@@ -236,18 +236,46 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     plt.close(drawn)
 
 
+PERCENT = {"form": ".3g", "unit": " %", "factor": 100}
+COLUMNS = {
+    "closed": Column("(1 − q)^k", ".4f"),
+    "interval": Column("half of its 95 % interval", ".4f"),
+    "flown": Column("arrived", ".4f"),
+    "loss": Column("loss", "g"),
+    "rho": Column("ρ", "g"),
+    "ap50": Column("AP@0.5", ".3f"),
+    "ap50_spread": Column("its standard deviation over seeds", ".3f"),
+    "goodput_mbps": Column("goodput", ".3g", " Mb/s"),
+    "arrived": Column("bytes that arrived", **PERCENT),
+    "mean_age_s": Column("mean age", ".3f", " s"),
+    "degraded_share": Column("degraded", **PERCENT),
+    "detached_share": Column("detached", **PERCENT),
+    "degraded_changes_per_link_minute": Column("changes to degraded, a link and minute", ".1f"),
+    "detached_changes_per_link_minute": Column("changes to detached", ".1f"),
+    "airtime_share": Column("airtime", **PERCENT),
+    "over_others": Column("payloads over others", **PERCENT),
+    "connected_share": Column("time connected", **PERCENT),
+    "bottleneck_mbps": Column("bottleneck", ".3g", " Mb/s"),
+}
+
+
+def told(rows: list[dict[str, Any]], about: str) -> Table:
+    """Rows with the columns' names in words."""
+    return Table.of(rows, about, COLUMNS)
+
+
 def tables(picture: Path, seeds: tuple[int, ...] = (1, 2, 3)) -> dict[str, Table]:
     """Every part; `picture` shows the framings over the loss of frames."""
     lossy = framings(LOSSES, seeds, "surrogate")
     draw(lossy, picture)
     return {
-        "fragments": Table.of(fragments_table(20_000), f"q = {TABLE_Q:g}, 20,000 samples; half of the 95 % interval."),
-        "framing_loss": Table.of(lossy, f"{len(seeds)} seeds; retries are off."),
-        "framing_crowded": Table.of(crowded(seeds), f"{len(seeds)} seeds; retries are on."),
-        "framing_network": Table.of(
+        "fragments": told(fragments_table(20_000), f"q = {TABLE_Q:g}, 20,000 samples."),
+        "framing_loss": told(lossy, f"{len(seeds)} seeds; retries are off."),
+        "framing_crowded": told(crowded(seeds), f"{len(seeds)} seeds; retries are on."),
+        "framing_network": told(
             framings((0.0, 0.01, 0.1), seeds[:1], "torch", "duration_s=3"), "The torch detector, six scored frames."
         ),
-        "ages_flown": Table.of(staleness(seeds, 120), f"{len(seeds)} seeds of 120 s."),
-        "ages_closed": Table.of(closed_ages(), "Ages count from the moment of hearing."),
-        "relay": Table.of(relayed(seeds), f"{len(seeds)} seeds."),
+        "ages_flown": told(staleness(seeds, 120), f"{len(seeds)} seeds of 120 s."),
+        "ages_closed": told(closed_ages(), "Ages count from the moment of hearing."),
+        "relay": told(relayed(seeds), f"{len(seeds)} seeds."),
     }
