@@ -219,7 +219,13 @@ def _arms() -> Tables:
         found = gains(lessons, k)
         for phase in ("search", "track"):
             means = [found.get((phase, rho)) for rho in BUDGETS]
-            rows.append([arm.text, phase, *(m and (m[0], m[0] - 1.96 * m[1], m[0] + 1.96 * m[1]) for m in means)])
+            rows.append(
+                [
+                    arm.text,
+                    phase,
+                    *(m and (m[0] if m[2] < 2 else (m[0], m[0] - 1.96 * m[1], m[0] + 1.96 * m[1])) for m in means),
+                ]
+            )
     budgets = [Column(f"ρ = {rho:g}", "+.1f", factor=100) for rho in BUDGETS]
     about = f"{len(lessons)} training conditions; AP points over maps to all, ± 1.96 standard errors."
     return {"arms": Table([Column("arm"), Column("phase"), *budgets], rows, about)}
