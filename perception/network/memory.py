@@ -13,7 +13,7 @@ def keep_freed(most_bytes: int = 256 << 20, block_bytes: int = 32 << 20) -> bool
     """Have each thread's heap keep up to so much freed memory, in blocks of up to so much; whether it could be had.
 
     A network's maps are of megabytes. glibc takes such blocks from the kernel and gives them back, page by page, at every
-    layer: a tenth of a detection's time. Other C libraries are left as they are.
+    layer. Other C libraries are left as they are.
     """
     if not sys.platform.startswith("linux"):
         return False

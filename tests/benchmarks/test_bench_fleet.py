@@ -5,32 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from fleet_examples import DESCRIPTOR, DIRECTIVE
 
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.messages.auth import Inbox, Sealer, open_datagram
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
-from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
 from sortie.scenarios.schema import Battery, Fleet, Route
 
 KEY = bytes(range(32))
-DESCRIPTOR = Descriptor(
-    stamp_ns=61_300_000_001,
-    agent_id=3,
-    position_m=(-12.5, 20.25, 60.0),
-    orientation_xyzw=(0.5, 0.5, 0.5, 0.5),
-    velocity_mps=(5.0, -0.5, 0.125),
-    footprint_radius_m=42.0,
-    battery_soc=0.75,
-    cpu_headroom=0.5,
-    gpu_headroom=0.25,
-    peer_goodput_mbps=(80.0, 0.0, 12.5, 3.0),
-    coverage_grid=bytes(range(64)),
-    novelty_flags=5,
-    task_phase=TaskPhase.TRACK,
-    region=Disc(10.0, -20.0, 32.0),
-)
-DIRECTIVE = Directive(1, 4, Representation.FEATURES, 0.25, Disc(10.0, -20.0, 32.0), 5.0)
 ROUTE = Route(waypoints_m=((0, 0), (200, 0), (200, 150), (0, 150)))
 
 
