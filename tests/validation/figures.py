@@ -152,10 +152,10 @@ def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: b
     rows = summarise(cells)
     first = best_fixed(rows)
     ap = {(c.policy, c.condition): c.ap for c in cells}
-    budgets = sorted({c.rho for c in conditions.conditions})
+    budgets = sorted({c.budget for c in conditions.conditions})
     parts = [
         *([c for c in conditions.conditions if (c.metric == "mission") == tracking] for tracking in (False, True)),
-        *([c for c in conditions.conditions if c.rho == rho] for rho in budgets),
+        *([c for c in conditions.conditions if c.budget == budget] for budget in budgets),
     ]
 
     def gain(policy: str, part: Sequence[Any]) -> tuple[float, float, float] | None:
@@ -163,7 +163,7 @@ def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: b
         over = over[np.isfinite(over)]
         return (float(over.mean()), *paired_interval(over)) if len(over) else None
 
-    gains = ["searching", "tracking", *(f"ρ = {rho:g}" for rho in budgets)]
+    gains = ["searching", "tracking", *(f"budget {budget:g}" for budget in budgets)]
     return Table(
         [
             Column("policy"),
@@ -218,7 +218,7 @@ def _arms() -> Tables:
     for k, arm in enumerate(ARMS[1:], start=1):
         found = gains(lessons, k)
         for phase in ("search", "track"):
-            means = [found.get((phase, rho)) for rho in BUDGETS]
+            means = [found.get((phase, budget)) for budget in BUDGETS]
             rows.append(
                 [
                     arm.text,
@@ -226,7 +226,7 @@ def _arms() -> Tables:
                     *(m and (m[0] if m[2] < 2 else (m[0], m[0] - 1.96 * m[1], m[0] + 1.96 * m[1])) for m in means),
                 ]
             )
-    budgets = [Column(f"ρ = {rho:g}", "+.1f", factor=100) for rho in BUDGETS]
+    budgets = [Column(f"budget {budget:g}", "+.1f", factor=100) for budget in BUDGETS]
     about = f"{len(lessons)} training conditions; AP points over maps to all, ± 1.96 standard errors."
     return {"arms": Table([Column("arm"), Column("phase"), *budgets], rows, about)}
 
@@ -298,7 +298,7 @@ def _survey() -> Tables:
 
 
 def _paper() -> None:
-    """Writes docs/paper and its section, which `sections_of_reports` reads."""
+    """Writes docs/paper and its section."""
     _sortie(
         "paper", "--readme", ROOT / "docs/results/claims.md", "--out", ROOT / "docs/paper", "--work", WORK / "paper"
     )
@@ -309,9 +309,6 @@ def _study() -> None:
     _sortie("study", "run", "--work", WORK / "study")
     report = ("--out", ROOT / "docs/study", "--readme", ROOT / "docs/results/flip.md")
     _sortie("study", "report", WORK / "study/study.parquet", *report)
-
-
-SEED_CLAIMS = ("gain", "keep.0.1", "union.0.25")
 
 
 def _paper_seeds() -> Tables:
@@ -336,12 +333,13 @@ def _paper_seeds() -> Tables:
 
 def seeds_table(tables: Mapping[str, Sequence[Any]]) -> Table:
     """How many verdicts are those of the first table, and what some claims come to in each."""
+    from sortie.perception.evaluation.claims import Kind
     from sortie.perception.evaluation.report import ours
 
     first = next(iter(tables.values()))
     verdicts = {(r.id, r.instrument): r.verdict for r in first}
     same = [sum(verdicts.get((r.id, r.instrument)) == r.verdict for r in some) for some in tables.values()]
-    says = {r.id: r.says for r in first if r.headline and r.rule == "contrast"}
+    says = {r.id: r.says for r in first if r.headline and r.kind == Kind.EFFECT}
     found: list[list[Any]] = [[f"verdicts as in the first column, of {len(first)}", *same]]
     for claim, text in says.items():
         mine = ([r for r in some if (r.id, r.instrument) == (claim, "zero")] for some in tables.values())
@@ -400,10 +398,10 @@ def _live() -> Tables:
     from sortie.sim.live.session import fly_live
 
     four = ["fleet.drones=4"]
-    full = [*four, "policy.name=all-4", "policy.params={rho: 1}"]
+    full = [*four, "policy.name=all-4", "policy.params={received_budget: 1}"]
     one, other = fly_live(load("paper_replay", four)), fly_live(load("paper_replay", full), duration_s=30.0)
     both = zip(overhead_rows(one), overhead_rows(other), strict=True)
-    columns = [Column(""), Column("paper"), Column("worked"), Column("all-4(rho=1)")]
+    columns = [Column(""), Column("paper"), Column("worked"), Column("all-4(received_budget=1)")]
     overhead = Table(
         columns, [[*row, there[2]] for row, there in both], "Four drones; 120 s and 30 s of `paper_replay`."
     )
@@ -507,24 +505,50 @@ def _between(text: str, name: str) -> str:
     return text.partition(f"<!-- {name}:begin -->")[2].partition(f"<!-- {name}:end -->")[0].strip()
 
 
-def sections_of_reports() -> dict[str, str]:
-    """The sections that are made from the reports' own tables and from the code, not from docs/results/tables."""
+def _paper_section() -> str:
+    from sortie.perception.evaluation import report, rows
+
+    return _between(report.short(*rows.read(ROOT / "docs/paper/paper.parquet"), "../paper/README.md"), "paper")
+
+
+def _study_section() -> str:
     import pyarrow.parquet as pq
 
-    from sortie.perception.evaluation import report, rows
-    from sortie.perception.study import report as study
+    from sortie.perception.study import report
     from sortie.perception.study.measure import from_table
     from sortie.perception.study.plan import read_plan
+
+    table = from_table(pq.read_table(ROOT / "docs/study/study.parquet"))
+    return _between(report.short(read_plan(), table, "../study/README.md"), "study")
+
+
+def _fields_section() -> str:
     from sortie.scenarios.reference import fields_markdown
 
-    paper = report.short(*rows.read(ROOT / "docs/paper/paper.parquet"), "../paper/README.md")
-    flip = study.short(read_plan(), from_table(pq.read_table(ROOT / "docs/study/study.parquet")), "../study/README.md")
-    return {"paper": _between(paper, "paper"), "study": _between(flip, "study"), "fields": fields_markdown().strip()}
+    return fields_markdown().strip()
 
 
-def all_sections() -> dict[str, str]:
-    """Every section by its name, as it should stand on its page."""
-    found = sections_of_reports()
+OTHERS = {"paper": _paper_section, "study": _study_section, "fields": _fields_section}
+"""Sections that are made from a report's own table or from the code, not from docs/results/tables."""
+
+
+def all_sections(stale: Callable[[str, ValueError], None] | None = None) -> dict[str, str]:
+    """Every section by its name, as it should stand on its page.
+
+    Args:
+        stale: called with a report that this version cannot read, which is then left out.
+
+    Raises:
+        ValueError: such a report, if `stale` is None.
+    """
+    found = {}
+    for name, section in OTHERS.items():
+        try:
+            found[name] = section()
+        except ValueError as error:
+            if stale is None:
+                raise
+            stale(name, error)
     for file in sorted(FOLDER.glob("*.json")):
         found |= sections(file.stem)
     return found
@@ -542,11 +566,18 @@ def pages() -> list[Path]:
 
 
 def render() -> Iterator[Path]:
-    """Write the sections into the pages; yields those that changed."""
-    found = all_sections()
+    """Write the sections into the pages; yields those that changed. A report that is to be measured again stays as it is."""
+    left: list[str] = []
+
+    def stale(name: str, error: ValueError) -> None:
+        left.append(name)
+        sys.stderr.write(f"{name} stays as it is: {error}\n")
+
+    found = all_sections(stale)
     for page in pages():
         old = page.read_text("utf-8")
-        if MARKED.search(old) and (new := rendered(old, found)) != old:
+        there = {name: _between(old, name) for name in left if name in MARKED.findall(old)}
+        if MARKED.search(old) and (new := rendered(old, found | there)) != old:
             write_text(page, new)
             yield page
 

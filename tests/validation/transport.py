@@ -115,12 +115,14 @@ def framings(losses: tuple[float, ...], seeds: tuple[int, ...], detector: str, *
 def crowded(seeds: tuple[int, ...]) -> list[dict[str, Any]]:
     """Both framings where the channel, not the link, is what is short: a quarter and all of the cells to all."""
     found = []
-    for rho in (0.1, 0.25, 1.0):
+    for budget in (0.1, 0.25, 1.0):
         for framing in ("sample", "tiles"):
             scenario = fleet(
-                "perception.detector=surrogate", f"policy.params={{received_budget: {rho}}}", f"radio.framing={framing}"
+                "perception.detector=surrogate",
+                f"policy.params={{received_budget: {budget}}}",
+                f"radio.framing={framing}",
             )
-            found.append({"rho": rho, "framing": framing, **shared(scenario, seeds)})
+            found.append({"budget": budget, "framing": framing, **shared(scenario, seeds)})
     return found
 
 
@@ -242,7 +244,7 @@ COLUMNS = {
     "interval": Column("half of its 95 % interval", ".4f"),
     "flown": Column("arrived", ".4f"),
     "loss": Column("loss", "g"),
-    "rho": Column("ρ", "g"),
+    "budget": Column("received budget", "g"),
     "ap50": Column("AP@0.5", ".3f"),
     "ap50_spread": Column("its standard deviation over seeds", ".3f"),
     "goodput_mbps": Column("goodput", ".3g", " Mb/s"),
