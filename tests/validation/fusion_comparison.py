@@ -36,7 +36,8 @@ class MethodRow:
     """One method under one budget."""
 
     method: str
-    rho: float
+    received_budget: float
+    """Cells that an ego receives, as a share of full sharing; 0 where no cells are sent."""
     gain: Difference
     """The same network's drone alone (a) and with its peers (b), paired by scenes."""
     bytes_per_frame: float
@@ -113,11 +114,11 @@ def measure(weights: Mapping[str, CarNet], frames: FleetFrames) -> list[MethodRo
         found = evaluate(CarNetInstrument(net), frames, (SINGLE, *SHARING), regions=("full",)).at(TAU)
         alone = found.matched(SINGLE)
         for condition in SHARING:
-            cells = round(condition.rho * 4096)
+            cells = round(condition.received_budget * 4096)
             sent = FUSIONS[name].link_bytes(cells=cells)
             assert sent.payload + sent.index == sum(link_bytes([cells]))
             gain = compare(alone, found.matched(condition), scene)
-            rows.append(MethodRow(name, condition.rho, gain, float(sent.total * drones * (drones - 1))))
+            rows.append(MethodRow(name, condition.received_budget, gain, float(sent.total * drones * (drones - 1))))
         if name == "disconet":
             rows.append(MethodRow("none", 0.0, compare(alone, alone, scene), 0.0))
             for rule in get_args(Rule):
@@ -133,12 +134,15 @@ def table(rows: Sequence[MethodRow], about: str = "") -> Table:
     return Table(
         [
             Column("method"),
-            Column("ρ", "g"),
+            Column("received budget", "g"),
             Column("AP@0.5 alone", ".3f"),
             Column("with peers", ".3f"),
             Column("gain", "+.1f", factor=100),
             Column("a fleet-frame", ",.1f", " kB", 1e-3),
         ],
-        [[r.method, r.rho or None, r.gain.ap_a, r.gain.ap_b, points(r.gain), r.bytes_per_frame] for r in rows],
+        [
+            [r.method, r.received_budget or None, r.gain.ap_a, r.gain.ap_b, points(r.gain), r.bytes_per_frame]
+            for r in rows
+        ],
         about,
     )
