@@ -33,7 +33,7 @@ from sortie.policies.contract import (
     check_directives,
     nothing,
 )
-from sortie.policies.damping import LinkState, damp
+from sortie.policies.damping import DampedLink, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -87,7 +87,7 @@ class _OutgoingLink:
     __slots__ = ("asked", "state")
 
     def __init__(self, me: int, peer: int) -> None:
-        self.state = LinkState(nothing(me, peer, ""))
+        self.state = DampedLink(nothing(me, peer, ""))
         self.asked: Directive | None = None
 
 
@@ -227,7 +227,7 @@ class Agent:
                 self._gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             changed = asked is not link.asked and asked != link.asked
-            if changed or age_s > fresh_s or link.state.upgrade_since_s is not None:
+            if changed or age_s > fresh_s or link.state.proposals:
                 self._enforce(link, asked, age_s, now_s)
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 

@@ -3,14 +3,15 @@
 Before the policy there is a hysteresis band (`apply_hysteresis`). A value that a policy reads falls at once and rises
 only by more than the band. A threshold therefore switches up at a higher value than it switches down.
 
-After the policy there is a dwell time (`damp`). Reductions take effect at once. Upgrades take effect when they have
-been proposed without a break for the dwell time. Repeating a directive changes nothing. There are at most 1 + t / dwell
-upgrades in t seconds (average dwell time; Hespanha & Morse 1999). Both functions are pure.
+After the policy there is a dwell time (`damp`). Reductions take effect at once. An upgrade is granted as far as it was
+proposed without a break for the dwell time: the least of that time, in every part. Repeating a directive changes nothing.
+There are at most 1 + t / dwell upgrades in t seconds (average dwell time; Hespanha & Morse 1999). Both functions are pure.
 """
 
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation
@@ -72,53 +73,82 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
     )
 
 
-class LinkState(NamedTuple):
-    """The directive in force on a link, and since when an upgrade has been proposed (None: none is)."""
+class DampedLink(NamedTuple):
+    """The directive in force on a link, and what the policy has proposed since it began to propose more than that."""
 
     enforced: Directive
-    upgrade_since_s: float | None = None
+    proposals: tuple[tuple[float, Directive], ...] = ()
+    """(since when, directive), ascending in time; each was proposed until the next. Empty: no upgrade waits."""
 
 
-def damp(state: LinkState, proposed: Directive, now_s: float, dwell_s: float) -> LinkState:
+def damp(link: DampedLink, proposed: Directive, now_s: float, dwell_s: float) -> DampedLink:
     """The link's next state.
 
+    A reduction takes effect at once. An upgrade goes as far as the least that was proposed at every instant of the
+    last `dwell_s`, and the dwell time then begins anew.
+
     Args:
-        state: its present state.
+        link: its present state.
         proposed: the policy's directive, after the staleness rules.
         now_s: the drone's clock.
         dwell_s: how long an upgrade must be proposed.
 
     Returns:
-        `state` itself if nothing changes (a repeated directive restarts no timer). Otherwise a new state: its
-        directive is `proposed`, or the lower of both in every part while an upgrade waits.
+        `link` itself if nothing changes (a repeated directive restarts no timer). Otherwise a new state.
     """
-    current = state.enforced
-    if state.upgrade_since_s is not None:
+    current, proposals = link
+    if proposals:
         if proposed == current:
-            return LinkState(current)
+            return DampedLink(current)
     elif proposed is current:
-        return state
+        return link
     elif _level(proposed) == _level(current):
         # A disc that follows its target, a deadline: no step on the ladder.
-        return state if _is_small_move(proposed, current) else LinkState(proposed)
+        return link if _is_small_move(proposed, current) else DampedLink(proposed)
     lower = _lower_of(current, proposed)
     if lower == proposed:
-        return LinkState(proposed)
-    since_s = now_s if state.upgrade_since_s is None else state.upgrade_since_s
-    if now_s - since_s >= dwell_s - EPSILON_S:
-        return LinkState(proposed)
-    if lower == current and since_s == state.upgrade_since_s:
-        return state
+        return DampedLink(proposed)
+    proposals = _with(proposals, proposed, now_s)
+    if now_s - proposals[0][0] >= dwell_s - EPSILON_S:
+        proposals = _since(proposals, now_s - dwell_s + EPSILON_S)
+        least = reduce(_lower_of, [directive for _, directive in proposals])
+        if least == proposed:
+            return DampedLink(proposed)
+        if _level(least) != _level(lower):  # more than now: `lower` bounds it from below
+            return DampedLink(least, ((now_s, proposed),))
+    if lower == current and proposals == link.proposals:
+        return link
     # The reason in force stays while only an upgrade waits; a reduction brings its own.
-    return LinkState(current if lower == current else lower, since_s)
+    return DampedLink(current if lower == current else lower, proposals)
+
+
+def _with(
+    proposals: tuple[tuple[float, Directive], ...], proposed: Directive, now_s: float
+) -> tuple[tuple[float, Directive], ...]:
+    """The proposals and one more; the last one's time stays if only its disc, deadline or reason changed."""
+    if not proposals:
+        return ((now_s, proposed),)
+    since_s, last = proposals[-1]
+    if _level(proposed) != _level(last):
+        return (*proposals, (now_s, proposed))
+    return proposals if proposed == last else (*proposals[:-1], (since_s, proposed))
+
+
+def _since(proposals: tuple[tuple[float, Directive], ...], begin_s: float) -> tuple[tuple[float, Directive], ...]:
+    """Those that still stood after `begin_s`."""
+    first = sum(1 for since_s, _ in proposals[1:] if since_s <= begin_s)
+    return proposals[first:]
 
 
 def _lower_of(current: Directive, proposed: Directive) -> Directive:
     """The lower of two directives in every part: what may take effect at once."""
-    if current.representation == _NONE:
-        # Nothing flows, so the duty cycle alone can be lowered.
+    if current.representation == _NONE or proposed.representation == _NONE:
+        # Nothing flows, so the duty cycle alone is left to lower.
         duty = min(current.duty_percent, proposed.duty_percent)
-        return current if duty == current.duty_percent else current._replace(duty_percent=duty, reason=proposed.reason)
+        if current.representation == _NONE and duty == current.duty_percent:
+            return current
+        rest = proposed if proposed.representation == _NONE else current
+        return rest if duty == rest.duty_percent else rest._replace(duty_percent=duty, reason=proposed.reason)
     if proposed.representation < current.representation:
         rho, roi = proposed.rho, proposed.roi  # the budget of another rung does not bound this one
     else:
@@ -149,6 +179,8 @@ def _is_small_move(proposed: Directive, current: Directive) -> bool:
 
 def _level(d: Directive) -> tuple[float, ...]:
     _, _, rung, rho, roi, rate_hz, _, weight, duty_percent, _ = d
+    if rung == _NONE:
+        return rung, duty_percent
     return rung, rho, math.inf if roi is None else roi.radius_m, rate_hz, duty_percent, weight
 
 

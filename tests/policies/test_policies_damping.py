@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
-from sortie.policies.damping import LinkState, apply_hysteresis, damp
+from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
@@ -19,7 +19,7 @@ DWELL_S = 1.0
 
 
 def run(start: Directive, asked: list[Directive], step_s: float = 0.1) -> list[Directive]:
-    state, enforced = LinkState(start), []
+    state, enforced = DampedLink(start), []
     for i, directive in enumerate(asked):
         state = damp(state, directive, i * step_s, DWELL_S)
         enforced.append(state.enforced)
@@ -27,10 +27,10 @@ def run(start: Directive, asked: list[Directive], step_s: float = 0.1) -> list[D
 
 
 def test_a_repeated_directive_changes_nothing_and_restarts_nothing() -> None:
-    state = LinkState(FULL)
+    state = DampedLink(FULL)
     assert damp(state, FULL, 0.0, DWELL_S) is state
     assert damp(state, FULL._replace(reason="other words"), 5.0, DWELL_S) is state
-    waiting = damp(LinkState(BOXES), FULL, 0.0, DWELL_S)
+    waiting = damp(DampedLink(BOXES), FULL, 0.0, DWELL_S)
     assert damp(waiting, FULL, 0.5, DWELL_S) is waiting, "asking again must not restart the dwell"
     assert damp(waiting, FULL, 1.0, DWELL_S).enforced == FULL
 
@@ -96,7 +96,7 @@ def above(a: Directive, b: Directive) -> bool:
 @given(st.lists(directives, min_size=1, max_size=60), st.floats(0.05, 3.0))
 def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Directive], dwell_s: float) -> None:
     """Average dwell time: no more than 1 + t / dwell upgrades in t seconds; never above what is asked now."""
-    state, upgrades = LinkState(NOTHING), []
+    state, upgrades = DampedLink(NOTHING), []
     for i, directive in enumerate(asked):
         now_s = i * 0.1
         after = damp(state, directive, now_s, dwell_s)
@@ -108,6 +108,134 @@ def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Direc
     assert all(b - a >= dwell_s - 1e-6 for a, b in itertools.pairwise(upgrades))
 
 
+def test_one_frame_at_the_end_of_the_dwell_does_not_lift_the_grant() -> None:
+    little = FULL._replace(rho=0.02, rate_hz=2.0, reason="little")
+    enforced = run(NOTHING, [little] * 10 + [FULL] + [little] * 20)
+    assert enforced[:10] == [NOTHING] * 10
+    assert enforced[10:] == [little] * 21
+    assert enforced[10].reason == "little", "the reason is of the request that is granted"
+
+
+def test_what_flickers_is_granted_at_its_least() -> None:
+    asked = [FULL._replace(rate_hz=(5.0, 10.0)[i // 3 % 2], rho=(0.5, 0.1)[i // 4 % 2]) for i in range(40)]
+    assert run(BOXES, asked)[10:] == [FULL._replace(rate_hz=5.0, rho=0.1)] * 30
+
+
+def test_what_rises_after_a_grant_waits_a_dwell_from_there() -> None:
+    enforced = run(BOXES, [HALF] * 9 + [FULL] * 20)
+    assert [d.rate_hz for d in enforced] == [2.0] * 10 + [5.0] * 10 + [10.0] * 9
+
+
+def test_a_part_that_flickers_does_not_hold_up_a_steady_one() -> None:
+    """The rate falls back at 0.6 s; ρ has been asked for since 0.4 s and is granted a dwell after that."""
+    start = FULL._replace(rho=0.1, rate_hz=2.0)
+    asked = [start._replace(rho=1.0 if i >= 4 else 0.1, rate_hz=10.0 if i < 6 else 2.0) for i in range(20)]
+    assert [d.rho for d in run(start, asked)] == [0.1] * 14 + [1.0] * 6
+
+
+def least(asked: list[Directive]) -> Directive:
+    """The least of several directives in turn, in every part; a lower representation comes with its own ρ and disc."""
+    rung = min(d.representation for d in asked)
+    if rung == Representation.NONE:
+        return NOTHING._replace(duty_percent=min(d.duty_percent for d in asked))
+    own = next(i for i, d in enumerate(asked) if d.representation == rung)
+    radii_m = [d.roi.radius_m for d in asked[own:] if d.roi is not None]
+    return FULL._replace(
+        representation=rung,
+        rho=min(d.rho for d in asked[own:]),
+        roi=Disc(0.0, 0.0, min(radii_m)) if radii_m else None,
+        rate_hz=min(d.rate_hz for d in asked),
+        fusion_weight=min(d.fusion_weight for d in asked),
+        duty_percent=min(d.duty_percent for d in asked),
+    )
+
+
+def by_hand(start: Directive, asked: list[Directive], dwell: int) -> list[Directive]:
+    """What is in force at each tick, from the whole history: an upgrade to the least of the last `dwell` ticks, and no
+    two upgrades closer."""
+    enforced, in_force, upgraded = [], start, 0
+    for k, now in enumerate(asked):
+        lowered = least([in_force, now])
+        throughout = least(asked[max(0, k - dwell) : k + 1])
+        if k - dwell >= upgraded and throughout != lowered:
+            upgraded = k
+            in_force = throughout
+        else:
+            in_force = lowered
+        enforced.append(in_force)
+    return enforced
+
+
+def asks_at_least(asked: Directive, granted: Directive) -> bool:
+    """Whether a directive asks for as much as another one in every part. ρ and disc are parts of a representation."""
+    if granted.representation == Representation.NONE:
+        return asked.duty_percent >= granted.duty_percent
+    if asked.representation == granted.representation:
+        wide = asked.roi is None or (granted.roi is not None and granted.roi.radius_m <= asked.roi.radius_m)
+        if not wide or asked.rho < granted.rho:
+            return False
+    return (
+        asked.representation >= granted.representation
+        and asked.rate_hz >= granted.rate_hz
+        and asked.fusion_weight >= granted.fusion_weight
+        and asked.duty_percent >= granted.duty_percent
+    )
+
+
+flowing = directives.map(
+    lambda d: d._replace(deadline_s=0.1) if d.representation else NOTHING._replace(duty_percent=d.duty_percent)
+)
+"""Directives of one deadline, without rate and ρ where nothing flows."""
+held = st.tuples(flowing, st.integers(1, 8)).map(lambda several: [several[0]] * several[1])
+histories = st.lists(held, min_size=1, max_size=12).map(lambda several: list(itertools.chain.from_iterable(several)))
+"""What a policy proposes, tick by tick: each directive for one to eight ticks."""
+
+
+def without_place(d: Directive) -> Directive:
+    return d if d.roi is None else d._replace(roi=Disc(0.0, 0.0, d.roi.radius_m))
+
+
+@given(histories, st.integers(0, 12))
+def test_damping_agrees_with_the_whole_history(asked: list[Directive], dwell: int) -> None:
+    state, enforced = DampedLink(NOTHING), []
+    for i, directive in enumerate(asked):
+        state = damp(state, directive, 0.1 * i, 0.1 * dwell)
+        enforced.append(without_place(state.enforced))
+    assert enforced == by_hand(NOTHING, [without_place(d) for d in asked], dwell)
+
+
+@given(histories, st.integers(1, 12))
+def test_no_more_is_granted_than_was_asked_for_throughout_the_dwell(asked: list[Directive], dwell: int) -> None:
+    state = DampedLink(NOTHING)
+    for i, directive in enumerate(asked):
+        after = damp(state, directive, 0.1 * i, 0.1 * dwell)
+        assert asks_at_least(directive, after.enforced), "more is in force than is asked for now"
+        if not asks_at_least(state.enforced, after.enforced):
+            assert i >= dwell, "an upgrade before the dwell is over"
+            assert all(asks_at_least(d, after.enforced) for d in asked[i - dwell : i + 1])
+        state = after
+
+
+@given(histories, flowing, st.integers(1, 12))
+def test_a_steady_request_is_granted_a_dwell_after_it_or_after_the_last_upgrade(
+    before: list[Directive], steady: Directive, dwell: int
+) -> None:
+    asked = before + [steady] * (2 * dwell + 1)
+    state, began = DampedLink(NOTHING), len(before)
+    for i, directive in enumerate(asked):
+        after = damp(state, directive, 0.1 * i, 0.1 * dwell)
+        if i >= len(before) and not asks_at_least(state.enforced, after.enforced):
+            began = i
+        state = after
+        if i >= began + dwell:
+            assert without_place(state.enforced) == without_place(steady)
+    settled = damp(DampedLink(NOTHING), steady, 0.0, 0.1 * dwell)
+    ticks = [settled := damp(settled, steady, 0.1 * i, 0.1 * dwell) for i in range(1, dwell + 1)]
+    assert ticks[-1].enforced == steady
+    if steady.representation:
+        assert not any(link.enforced.representation for link in ticks[:-1]), "from a link at rest after exactly a dwell"
+
+
 def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
     resting = NOTHING._replace(duty_percent=20)
     assert run(NOTHING, [resting]) == [resting]
@@ -117,7 +245,7 @@ def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
 
 
 def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
-    state = LinkState(FULL._replace(roi=Disc(0, 0, 32)))
+    state = DampedLink(FULL._replace(roi=Disc(0, 0, 32)))
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
     assert damp(state, FULL._replace(roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)

@@ -34,7 +34,7 @@ from sortie.policies.contract import (
     Representation,
     check_directives,
 )
-from sortie.policies.damping import LinkState, damp
+from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.conformance import RULES, full_view, raised_part
@@ -346,7 +346,7 @@ def test_memory_between_calls_is_caught() -> None:
 def test_repeating_a_directive_restarts_no_timer_anywhere() -> None:
     """The bug that the paper names: a repeated directive restarted the publisher's timer, which then never fired."""
     gate, sent = Gate(), 0
-    state = LinkState(Directive(0, 1, Representation.FEATURES, 0.5, None, 2.0))
+    state = DampedLink(Directive(0, 1, Representation.FEATURES, 0.5, None, 2.0))
     more = state.enforced._replace(rate_hz=5.0)
     raised_s = None
     for frame in range(100):
