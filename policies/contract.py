@@ -20,6 +20,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from sortie.scenarios.disc import AGENT_IDS as AGENT_IDS  # policies import this and the next two from here
 from sortie.scenarios.disc import Disc as Disc
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.link_state import LinkState as LinkState
+from sortie.scenarios.link_state import state_of
 from sortie.scenarios.representation import Representation as Representation
 
 COVERAGE_CELLS = 16
@@ -73,7 +75,7 @@ class Descriptor(NamedTuple):
     cpu_headroom: float
     gpu_headroom: float
     peer_goodput_mbps: tuple[float, ...]
-    """To every other drone of the roster by ascending id, as measured by this drone; 0 where unmeasured."""
+    """To every other drone of the roster by ascending id, as measured by this drone; `link_state` says what 0 means."""
     coverage_grid: bytes
     """64 B, four cells a byte, lowest bits first, row by row from south-west."""
     novelty_flags: int
@@ -89,8 +91,12 @@ class Descriptor(NamedTuple):
         half = COVERAGE_CELLS // 2
         return math.floor(y_m / COVERAGE_CELL_M) - half, math.floor(x_m / COVERAGE_CELL_M) - half
 
+    def link_state(self, peer: int) -> LinkState:
+        """Whether this drone ever measured its link to `peer`, and whether anything got through the last time."""
+        return state_of(self.goodput_to(peer))
+
     def goodput_to(self, peer: int) -> float:
-        """Goodput to `peer`, Mb/s, as this drone measured it (0 if it is not on the roster)."""
+        """Goodput to `peer`, Mb/s, as this drone measured it (0 before the first measurement and off the roster)."""
         me, known = self.agent_id, self.peer_goodput_mbps
         slot = peer - (peer > me)
         return known[slot] if peer != me and slot < len(known) else 0.0

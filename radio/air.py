@@ -34,6 +34,7 @@ from sortie.radio.relay import Routes
 from sortie.radio.sample import IntArray, Sample, Service
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
+from sortie.scenarios.link_state import SILENT_MBPS
 from sortie.scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
@@ -377,6 +378,7 @@ class Air:
     def goodput_mbps(self, sender: int) -> tuple[float, ...]:
         """Goodput to every other drone, ascending by id, as the sender measured it; see `sortie.radio.goodput`.
 
+        0 to a drone to which nothing was measured; at least `SILENT_MBPS` to any other.
         Samples that are still in service or queued lower it already by how little has got through so far. Where a
         payload would go over others, it is the goodput of its hops in sequence.
         """
@@ -403,7 +405,7 @@ class Air:
                 else:
                     since, bits = s.t_queued_s, drained - s.drained_bits
                 if now - since >= _WINDOW_S:
-                    known[s.receiver] = min(known[s.receiver], bits / (now - since) * 1e-6)
+                    known[s.receiver] = min(known[s.receiver], max(bits / (now - since) * 1e-6, SILENT_MBPS))
         return known
 
     def _book(self, s: Sample) -> None:

@@ -10,7 +10,8 @@ payload bits over time in service.
 **The estimate** of a link falls to a lower measurement at once and rises to a higher one by `RISE` of the gap.
 A sample that expires or is replaced half-way counts with what was acknowledged so far. One that never came to
 be served was held up by its own sender's queue, and the rate at which that queue moved bounds the estimate.
-A link never measured reports 0.
+A link never measured reports 0. A measured one reports at least `SILENT_MBPS`, which says that nothing got through
+(`sortie.scenarios.link_state`).
 
 **Bias and lag** were measured (`tests/validation/link.py`, see the README): none on a still link; some 5 % low under
 shadowing, because falling is quicker than rising; a drop shows in the next frame, a recovery in eight.
@@ -18,27 +19,27 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
+from sortie.scenarios.link_state import SILENT_MBPS
+
 RISE = 0.3
 
 
 class Goodput:
-    """The estimates of every ordered link, Mb/s."""
+    """The estimates of every ordered link, Mb/s; 0 is a link without a measurement."""
 
     def __init__(self, n_drones: int) -> None:
         self._mbps = [[0.0] * n_drones for _ in range(n_drones)]
-        self._known = [[False] * n_drones for _ in range(n_drones)]
 
     def measured(self, sender: int, receiver: int, mbps: float) -> None:
         """A measurement: down at once, up by `RISE` of the gap; the first one is taken as it is."""
-        row, known = self._mbps[sender], self._known[sender]
+        row = self._mbps[sender]
         before = row[receiver]
-        row[receiver] = before + RISE * (mbps - before) if known[receiver] and mbps > before else mbps
-        known[receiver] = True
+        row[receiver] = before + RISE * (mbps - before) if 0.0 < before < mbps else max(mbps, SILENT_MBPS)
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
         """A link cannot be said to be better than this now; an unmeasured link stays unmeasured."""
-        if self._known[sender][receiver] and mbps < self._mbps[sender][receiver]:
-            self._mbps[sender][receiver] = mbps
+        row = self._mbps[sender]
+        row[receiver] = min(row[receiver], max(mbps, SILENT_MBPS))
 
     def read(self, sender: int) -> list[float]:
         """The estimates to all drones (0 where unmeasured, and to itself)."""

@@ -36,7 +36,7 @@ RHOS = (0.02, 0.1, 0.25, 1.0)
 RATES_HZ = (2.0, 5.0, 10.0)
 CHOICES = (len(RUNGS), len(RHOS), len(RATES_HZ), 2)
 """Choices of an action for each link: representation, ρ (the share of the feature cells), rate, and whether it is confined to the region."""
-ROW = 24
+ROW = 25
 """Numbers of one drone in an observation; `_row` says which."""
 LIMIT = 10.0
 COST_PER_MB, COST_PER_KJ = 0.01, 0.01
@@ -54,7 +54,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     | | |
     |---|---|
     | agents | `drone_0` …; one that lands or is lost terminates, at the scenario's end all are truncated |
-    | observation | float32 [N, 24]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
+    | observation | float32 [N, 25]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
     | action | for each other drone by ascending id: rung, ρ, rate, region (`CHOICES`) |
     | reward | AP@0.5 of the drone's own fusions in the step (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
     """
@@ -167,8 +167,8 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
 
 def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
     """Heard; age, s; place from the ego, 100 m, and velocity, 10 m/s; footprint, 100 m; charge, headrooms, goodput from
-    the ego, 100 Mb/s; phase, one-hot; region: there, place from the ego, radius, 100 m; share of the grid seen well;
-    whether it reports targets."""
+    the ego, 100 Mb/s, and its state (0 never measured, 0.5 silent, 1 measured); phase, one-hot; region: there, place
+    from the ego, radius, 100 m; share of the grid seen well; whether it reports targets."""
     place = [(a - b) / 100 for a, b in zip(d.position_m, me.position_m, strict=True)]
     phase = [float(d.task_phase == p) for p in TaskPhase]
     region = [0.0] * 4
@@ -178,7 +178,7 @@ def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
     cells = np.unpackbits(np.frombuffer(d.coverage_grid, np.uint8), bitorder="little").reshape(-1, 2) @ (1, 2)
     return [
         1.0, age_s, *place, *(v / 10 for v in d.velocity_mps), d.footprint_radius_m / 100, d.battery_soc,
-        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, *phase, *region,
+        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, me.link_state(d.agent_id) / 2, *phase, *region,
         float((cells >= Coverage.WELL).mean()), float(bool(d.priority_target_ids)),
     ]  # fmt: skip
 

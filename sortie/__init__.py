@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         Directive,
         Disc,
         FleetView,
+        LinkState,
         Policy,
         PolicyError,
         Reposition,
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
 __all__ = [
     "load", "fly", "compare", "campaign", "check", "env", "open_run",
     "Run", "Comparison", "CampaignResult", "Scenario",
-    "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition", "looks_from",
-    "SortieError", "ScenarioError", "PolicyError", "RunError",
+    "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
+    "Reposition", "looks_from", "SortieError", "ScenarioError", "PolicyError", "RunError",
     "__version__",
 ]  # fmt: skip
 
@@ -48,8 +49,8 @@ _HOMES = {
     "sortie._api": ("load", "fly", "compare", "campaign", "check", "env", "open_run", "Comparison", "CampaignResult"),
     "sortie._run": ("Run",),
     "sortie.policies.contract": (
-        "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "Reposition",
-        "looks_from", "PolicyError",
+        "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
+        "Reposition", "looks_from", "PolicyError",
     ),
     "sortie.scenarios.errors": ("SortieError",),
     "sortie.scenarios.reading.nodes": ("ScenarioError",),

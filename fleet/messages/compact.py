@@ -3,7 +3,8 @@
     header 4 B (0xC0, cells a side, bits a cell, bits a number) · stamp 8 B · agent, phase, flags, peers, targets 1 B each
     · numbers, cells and target ids, bit by bit, the last byte filled with zeros
 
-Numbers are fixed point over their field's range, saturating (`_RANGES`); 32 bits are IEEE floats. A coarse cell stands
+Numbers are fixed point over their field's range, saturating (`_RANGES`); 32 bits are IEEE floats. A goodput's lowest
+number is a link never measured, the next one a silent link (`sortie.scenarios.link_state`). A coarse cell stands
 for a block of fine ones and is as most of them are. The format says itself how it is to be read, so that fleets need
 agree on nothing; what a policy reads has the shape of the full descriptor either way.
 """
@@ -20,6 +21,7 @@ import numpy as np
 from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
+from sortie.scenarios.link_state import SILENT_MBPS
 
 MAGIC = 0xC0
 MARK = bytes([MAGIC])
@@ -68,7 +70,7 @@ FULL = Form()
 
 
 def _step(bounds: tuple[float, float], bits: int) -> float:
-    return (bounds[1] - bounds[0]) / ((1 << bits) - 1)
+    return (bounds[1] - bounds[0]) / ((1 << bits) - 1 - (bounds is _GOODPUT))
 
 
 def encode_compact(d: Descriptor, form: Form) -> bytes:
@@ -161,7 +163,9 @@ def _to_int(value: float, bounds: tuple[float, float], bits: int) -> int:
         (as_int,) = struct.unpack("<I", struct.pack("<f", value))
         return int(as_int)
     low, high = bounds
-    steps = round((min(max(value, low), high) - low) / _step(bounds, bits))
+    if bounds is _GOODPUT and value <= 0.0:
+        return 0
+    steps = round((min(max(value, low), high) - low) / _step(bounds, bits)) + (bounds is _GOODPUT)
     # a radius of a region is above 0, however coarse
     return max(steps, 1) if bounds is _REGION[2] else steps
 
@@ -170,6 +174,8 @@ def _to_float(number: int, bounds: tuple[float, float], bits: int) -> float:
     if bits == 32:
         (as_float,) = struct.unpack("<f", struct.pack("<I", number))
         return float(as_float)
+    if bounds is _GOODPUT:
+        return max(SILENT_MBPS, (number - 1) * _step(bounds, bits)) if number else 0.0
     return bounds[0] + number * _step(bounds, bits)
 
 

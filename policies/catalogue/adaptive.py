@@ -24,6 +24,7 @@ from sortie.policies.contract import (
     Descriptor,
     Directive,
     FleetView,
+    LinkState,
     Representation,
     TaskPhase,
     nothing,
@@ -96,7 +97,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
 
     Samples beyond that would wait for one another and miss their deadlines.
     """
-    measured = [mbps for mbps in map(me.goodput_to, peers) if mbps > 0.0]
+    measured = [me.goodput_to(peer) for peer in peers if me.link_state(peer) == LinkState.MEASURED]
     if not measured:
         return 1.0
     share = CARRIED * fsum(measured) / len(measured) / (len(peers) * FEATURE_MAP_MEGABITS * RATE_HZ)

@@ -15,6 +15,7 @@ from sortie.policies.catalogue.worked import (
     HIGH_BATTERY,
     LOW_BATTERY,
     MIN_GOODPUT_MBPS,
+    NO_GOODPUT,
     SLOW_RATE_HZ,
 )
 from sortie.policies.contract import AGENT_IDS, Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
@@ -50,7 +51,8 @@ def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> 
     weight = freshness(view.age_s[peer], view.period_s)
     goodput_mbps = me.goodput_to(peer)
     if me.battery_soc < LOW_BATTERY or goodput_mbps < MIN_GOODPUT_MBPS:
-        cause = "battery < 30 %" if me.battery_soc < LOW_BATTERY else f"goodput {goodput_mbps:.1f} Mb/s"
+        weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+        cause = "battery < 30 %" if me.battery_soc < LOW_BATTERY else weak
         return Directive(
             view.ego, peer, Representation.DETECTIONS, 0.0, roi, SLOW_RATE_HZ, SLOW_DEADLINE_S, weight,
             reason=f"{why}, {cause}",
@@ -75,7 +77,7 @@ def _appointed(view: FleetView, receiver: int) -> list[int]:
 
 
 def _link(goodput_mbps: float) -> float:
-    """1 for a good link, ¼ for a bad or unmeasured one."""
+    """1 for a good link, ¼ for a bad one or one without a goodput."""
     return min(1.0, max(0.25, goodput_mbps / GOOD_GOODPUT_MBPS))
 
 

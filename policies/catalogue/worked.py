@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sortie.policies.contract import Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.contract import Directive, FleetView, LinkState, Representation, TaskPhase, nothing
 from sortie.policies.geometry import peers_by_overlap
 
 HIGH_BATTERY = 0.60
@@ -12,6 +12,11 @@ MIN_GOODPUT_MBPS = 5.0
 TOP_PEERS = 2
 TRACK = TaskPhase.TRACK
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS  # slow to look up, each time
+NO_GOODPUT = {
+    LinkState.NEVER_MEASURED: "goodput not measured yet",
+    LinkState.SILENT: "goodput: link silent, nothing got through",
+}
+"""Reasons for links without a goodput to name."""
 NOT_CHOSEN = f"not among the {TOP_PEERS} most overlapping peers"
 
 
@@ -44,7 +49,7 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
         if peer not in chosen:
             directives.append(nothing(ego, peer, NOT_CHOSEN))
         elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
-            weak = f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+            weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
             low = min(rung, DETECTIONS)
             directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
         else:

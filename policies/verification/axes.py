@@ -37,6 +37,7 @@ FIELDS: dict[str, Axis | None] = {
     "gpu_headroom": Axis.PLATFORM,
     "peer_goodput_mbps": Axis.PLATFORM,
     "goodput_to": Axis.PLATFORM,
+    "link_state": Axis.PLATFORM,
     "coverage_grid": Axis.SCENE,
     "coverage_corner": Axis.SCENE,  # the place of the grid, to one cell: without it the grid means nothing
     "novelty_flags": Axis.SCENE,

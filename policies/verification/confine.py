@@ -28,7 +28,14 @@ ALLOWED = frozenset({
     "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that only use their arguments; a policy may use them."""
-SHARED = frozenset({"sortie.scenarios.disc", "sortie.scenarios.representation", "sortie.scenarios.streams"})
+SHARED = frozenset(
+    {
+        "sortie.scenarios.disc",
+        "sortie.scenarios.link_state",
+        "sortie.scenarios.representation",
+        "sortie.scenarios.streams",
+    }
+)
 """Modules of another room that a policy may use: two types, and random draws that depend on their key alone."""
 FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"

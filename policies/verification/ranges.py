@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
-from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.scenarios.disc import disc_overlap
@@ -132,6 +132,9 @@ class DescriptorOfRanges:
         path, me, high = self._system.path, self.agent_id, _SEARCHED_UP_TO["goodput"]
         slots = range(self._system.drones - 1)
         return tuple(path.number(f"goodput of drone {me} to slot {slot}", 0.0, high) for slot in slots)
+
+    def link_state(self, peer: int) -> LinkState:
+        return Descriptor.link_state(self, peer)  # type: ignore[arg-type]
 
     def goodput_to(self, peer: int) -> Any:
         found = Descriptor.goodput_to(self, peer)  # type: ignore[arg-type]

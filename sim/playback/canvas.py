@@ -23,6 +23,7 @@ DRONE_COLOURS: tuple[Rgba, ...] = (
 )  # fmt: skip
 FOUND, MISSED, FALSE = (70, 220, 90, 255), (255, 200, 40, 255), (255, 60, 60, 255)
 IDLE, FALLEN, BROKEN = (150, 155, 165, 90), (120, 120, 120, 255), (255, 40, 60, 255)
+UNMEASURED = (185, 190, 200, 255)
 WARNING = (255, 225, 90, 255)
 MISSION, TARGET = (255, 80, 220, 255), (255, 40, 60, 255)
 SENT: dict[str, Rgba] = {
@@ -47,11 +48,12 @@ def drone_colour(drone: int) -> Rgba:
 
 
 def goodput_colours(mbps: Floats) -> NDArray[np.uint8]:
-    """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above."""
+    """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above; grey if never measured."""
     level = np.clip(np.log10(np.maximum(mbps, 1e-3)) / 2.0, 0.0, 1.0)
     red, green = np.clip(2.0 - 2.0 * level, 0.0, 1.0), np.clip(2.0 * level, 0.0, 1.0)
     colour = np.stack([50 + 205 * red, 45 + 185 * green, np.full_like(red, 60), np.full_like(red, 255)], axis=-1)
-    return colour.astype(np.uint8)
+    never_measured = np.expand_dims(mbps <= 0.0, -1)
+    return np.where(never_measured, UNMEASURED, colour).astype(np.uint8)
 
 
 def packed(rgba: NDArray[np.uint8]) -> NDArray[np.uint32]:

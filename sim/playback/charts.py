@@ -99,7 +99,7 @@ class Charts:
     # --- plots -----------------------------------------------------------------------------------
 
     def _goodput(self, descriptors: pa.Table) -> None:
-        """The mean goodput of each drone's measured links; a gap where none is."""
+        """The mean goodput of each drone's links that were ever measured; a gap before the first measurement."""
         drone, t_s = descriptors["drone"].to_numpy(), descriptors["t_s"].to_numpy()
         links = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, self._n - 1))
         if self._n < 2:

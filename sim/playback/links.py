@@ -35,7 +35,6 @@ class LinkArrows:
         self._senders, self._receivers = pairs[:, 0], pairs[:, 1]
         self._frames = 0
         self._goodput: Floats = np.zeros((n, n))
-        self._measured = np.zeros((n, n), bool)
         self._crossed: list[tuple[int, int]] = []
         self._recent: Floats = np.zeros((0, 4))
 
@@ -73,13 +72,10 @@ class LinkArrows:
         self._canvas.columns("world/links", t_s, links.partition(shown.sum(axis=1)))
 
     def _broken(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], goodput: Floats) -> None:
-        """Cross out each pair of drones of which one measured the link and now knows it to be all but gone."""
-        known = np.logical_or.accumulate(np.concatenate([self._measured[None], goodput > 0]), axis=0)[1:]
-        broken = known & (goodput < BROKEN_MBPS)
+        """Cross out each pair of drones between which a link was measured and is all but gone."""
+        broken = (goodput > 0) & (goodput < BROKEN_MBPS)
         i, j = np.triu_indices(self._n, 1)
         crossed = (broken | broken.swapaxes(1, 2))[:, i, j] & airborne[:, i] & airborne[:, j]
-        if len(t_s):
-            self._measured = known[-1]
         middle = (position[:, i] + position[:, j]) / 2
         for k, frame in enumerate(crossed):
             now = list(zip(i[frame].tolist(), j[frame].tolist(), strict=True))

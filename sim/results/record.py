@@ -77,7 +77,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
 }  # fmt: skip
 ABOUT = {
     "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU.",
-    "descriptors": "A descriptor published. Goodput to each other drone by ascending id, 0 where unmeasured.",
+    "descriptors": "A descriptor published. Goodput to each other drone by ascending id, Mb/s; 0 is never measured, at most 2⁻¹⁰ is silent: nothing got through.",
     "drops": "A descriptor refused at a receiver, with the reason.",
     "directives": "A change of what a gate enforces, with the reason that decided it.",
     "interventions": 'A directive that the shield replaced ("shield"), or that breaks an invariant all the same '

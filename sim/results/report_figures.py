@@ -51,7 +51,7 @@ def figures(record: SortieRecord) -> dict[str, str]:
         ("What each drone sent on its best link, and when it changed", 0.4 + 0.34 * (_drones(record) + 1), _lanes),
         ("Accuracy of all drones over the last five seconds, AP@0.5", 2.2, _accuracy),
         ("Traffic by representation and fate, Mb/s", 2.2, _traffic),
-        ("Goodput, mean of each drone's measured links, Mb/s", 2.2, _goodput),
+        ("Goodput, mean of each drone's links that were ever measured, Mb/s", 2.2, _goodput),
         ("Battery, %", 2.0, _battery),
         ("Age of descriptors when a policy read them, 99th percentile, ms", 1.8, _age),
         ("The way over the ground, m: drones, and the target with its mission disc", 4.2, _map),

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.contract import Descriptor, Directive, Disc, LinkState, Representation, TaskPhase
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.scenarios.link_state import SILENT_MBPS, state_of
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
@@ -303,6 +304,12 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
         if before <= u <= before * (1 + band) * (1 - 1e-12):
             assert v == before
     assert read([u for u in values for _ in range(3)], band=band)[::3] == seen
+
+
+@given(st.lists(st.sampled_from([0.0, SILENT_MBPS, 0.002, 4.0, 80.0]), min_size=1, max_size=20), st.floats(0, 3))
+def test_the_band_never_hides_that_a_link_was_measured(values: list[float], band: float) -> None:
+    for heard, seen in zip(values, read(values, band=band), strict=True):
+        assert (state_of(seen) == LinkState.NEVER_MEASURED) == (state_of(heard) == LinkState.NEVER_MEASURED)
 
 
 def test_an_answer_is_kept_for_who_asks_the_same_alone() -> None:

@@ -18,6 +18,7 @@ from sortie.radio import Air, Status, Transmission
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import losses
+from sortie.scenarios.link_state import SILENT_MBPS
 
 DEFAULT = AirSettings()
 STILL = AirSettings(shadowing_sigma_db=0.0)
@@ -166,7 +167,7 @@ def test_a_dead_link_costs_a_few_tries_and_says_so() -> None:
     fates = Counter((r.receiver, r.status, r.reason) for r in f.rows)
     assert fates == {(1, Status.LOST, "no_link"): 10, (2, Status.DELIVERED, ""): 10}
     assert all(r.airtime_s < 10e-3 and r.mcs == -1 and r.wire_bytes == 0 for r in f.rows if r.receiver == 1)
-    assert f.air.goodput_mbps(0)[0] == 0.0
+    assert f.air.goodput_mbps(0)[0] == SILENT_MBPS
     assert f.air.goodput_mbps(0)[1] > 100
 
 
@@ -283,7 +284,7 @@ def test_small_samples_show_that_a_link_has_recovered() -> None:
 
     f.fly(4.0, tick)
     assert read[0.9] > 100
-    assert read[1.9] == 0.0
+    assert read[1.9] == SILENT_MBPS
     assert read[2.6] > 5
 
 

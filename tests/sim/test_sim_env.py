@@ -59,7 +59,7 @@ def test_sharing_shows_in_reward_and_observation() -> None:
             rewards.append(sum(reward.values()))
         totals[name] = sum(rewards[1:])
         row = seen["drone_1"]
-        assert row.shape == (3, 24)
+        assert row.shape == (3, 25)
         assert row[:, 0].tolist() == [1, 1, 1], "heard"
         assert row[0, 2:5].tolist() == [0, 0, 0], "the ego is where it is"
         assert 15 < 100 * np.hypot(*row[1, 2:4]) < 45, "a neighbour's slot"

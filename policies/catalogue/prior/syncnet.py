@@ -10,6 +10,7 @@ from __future__ import annotations
 from math import exp
 
 from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.catalogue.worked import NO_GOODPUT
 from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView
 
 TRUSTED_FOR_S = 0.5
@@ -25,9 +26,10 @@ def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED
         return []
     directives = []
     for peer in view.peers:
-        goodput_mbps = me.goodput_to(peer)
-        delay_s = rho * FEATURE_MAP_MEGABITS / goodput_mbps if goodput_mbps > 0 else float("inf")
-        weight = max(1, round(STEPS * exp(-delay_s / trusted_for_s))) / STEPS
-        why = f"{delay_s:.1g} s late"
+        weight, why = 1 / STEPS, NO_GOODPUT.get(me.link_state(peer), "")
+        if not why:
+            delay_s = rho * FEATURE_MAP_MEGABITS / me.goodput_to(peer)
+            weight = max(1, round(STEPS * exp(-delay_s / trusted_for_s))) / STEPS
+            why = f"{delay_s:.1g} s late"
         directives.append(full_sharing(view.ego, peer, rho, why)._replace(fusion_weight=weight))
     return directives

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 from fleet_examples import DESCRIPTOR, descriptors
@@ -21,10 +23,12 @@ from sortie.fleet.messages.compact import (
     decode_compact,
     encode_compact,
 )
-from sortie.fleet.messages.wire import decode_descriptor
-from sortie.policies.contract import Coverage
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.policies.contract import Coverage, Descriptor, LinkState
+from sortie.scenarios.link_state import SILENT_MBPS
 
 forms = st.builds(Form, st.sampled_from(GRID_CELLS), st.sampled_from(GRID_BITS), st.sampled_from(NUMBER_BITS))
+FORMS = [Form(number_bits=bits) for bits in NUMBER_BITS]
 SANE = DESCRIPTOR._replace(priority_target_ids=(7, 65535), novelty_flags=3)
 
 
@@ -46,6 +50,16 @@ def test_numbers_come_back_to_half_a_step(bits: int) -> None:
     assert math.isclose(math.hypot(*back.orientation_xyzw), 1.0)
     exact = ("stamp_ns", "agent_id", "task_phase", "novelty_flags", "priority_target_ids", "coverage_grid")
     assert all(getattr(back, f) == getattr(SANE, f) for f in exact)
+
+
+@pytest.mark.parametrize("encode", [encode_descriptor, *(partial(encode_compact, form=f) for f in FORMS)])
+def test_every_form_keeps_the_state_of_a_link(encode: Callable[[Descriptor], bytes]) -> None:
+    """Never measured, silent, measured; what rounds to nothing is silent, and never a link that was not measured."""
+    d = DESCRIPTOR._replace(agent_id=0, peer_goodput_mbps=(0.0, SILENT_MBPS, 0.01, 80.0))
+    back = decode_descriptor(encode(d))
+    assert [back.link_state(i) for i in (1, 2, 4)] == list(LinkState)
+    assert back.link_state(3) != LinkState.NEVER_MEASURED
+    assert decode_descriptor(encode(back)).peer_goodput_mbps == back.peer_goodput_mbps
 
 
 def test_numbers_beyond_their_range_are_its_end() -> None:

@@ -9,6 +9,7 @@ from policies_examples import fleet_of
 from sortie.policies.catalogue import adaptive as a
 from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.contract import Coverage, Disc, FleetView, Representation, TaskPhase
+from sortie.scenarios.link_state import SILENT_MBPS
 
 BOXES, FEATURES, NONE = Representation.DETECTIONS, Representation.FEATURES, Representation.NONE
 
@@ -44,6 +45,7 @@ def test_no_more_is_sent_than_the_air_carries() -> None:
     assert a.carried(fleet_of(5, goodput=52.0).descriptors[0], (1, 2, 3, 4)) == pytest.approx(0.125 / 2**0.5)
     assert a.carried(fleet_of(5, goodput=1e6).descriptors[0], (1, 2, 3, 4)) == 1.0
     assert a.carried(fleet_of(5, goodput=0.0).descriptors[0], (1, 2, 3, 4)) == 1.0, "unmeasured is not weak"
+    assert a.carried(fleet_of(5, goodput=SILENT_MBPS).descriptors[0], (1, 2, 3, 4)) == 1.0, "silent links carry no map"
     some = me._replace(peer_goodput_mbps=(0.0, 104.8576, 0.0, 0.0))
     assert a.carried(some, (1, 2, 3, 4)) == pytest.approx(0.25), "by the links that were measured"
     tight = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.4, "")

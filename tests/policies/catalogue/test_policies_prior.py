@@ -30,6 +30,7 @@ from sortie.policies.contract import (
 from sortie.policies.registry import POLICIES, handshake_bytes, missing_parts, own_fusion, resolve
 from sortie.policies.verification.axes import FIELDS, Axis, decisions_of, method_table, observe
 from sortie.policies.verification.views import draw_views
+from sortie.scenarios.link_state import SILENT_MBPS
 
 PAPER = """\
 | method | Mis. | Scene | Plat. | Geom. | decides |
@@ -210,7 +211,8 @@ def test_syncnet_weighs_by_the_delay_that_goodput_lets_expect() -> None:
     assert weight(1e6) == 1.0
     half = FEATURE_MAP_MEGABITS / (0.5 * math.log(2))  # exp(−t/0.5 s) is a half there
     assert weight(half) == 0.5
-    assert weight(0.0) == 0.25
+    assert weight(0.0) == weight(SILENT_MBPS) == 0.25
+    assert syncnet(fleet_of(2, goodput=0.0))[0].reason == "goodput not measured yet"
     assert [weight(g) for g in (1, 5, 10, 20, 50, 100)] == sorted(weight(g) for g in (1, 5, 10, 20, 50, 100))
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import pytest
 from policies_examples import fleet_of
 
+from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import (
     Directive,
     Disc,
     FleetView,
+    LinkState,
+    Policy,
     PolicyError,
     Representation,
     TaskPhase,
@@ -17,6 +20,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import parameters, resolve
+from sortie.scenarios.link_state import SILENT_MBPS
 
 
 def to_peer_1(view: FleetView) -> Directive:
@@ -45,6 +49,24 @@ def test_a_weak_link_carries_detections(goodput: float, rung: Representation) ->
     d = to_peer_1(fleet_of(5, goodput=goodput))
     assert d.representation == rung
     assert d.rate_hz == (10.0 if rung == Representation.FEATURES else 2.0)
+
+
+@pytest.mark.parametrize(
+    ("goodput", "state", "reason"),
+    [
+        (0.0, LinkState.NEVER_MEASURED, "goodput not measured yet"),
+        (SILENT_MBPS, LinkState.SILENT, "goodput: link silent, nothing got through"),
+        (3.14, LinkState.MEASURED, "goodput 3.1 < 5 Mb/s"),
+    ],
+)
+@pytest.mark.parametrize("policy", [worked, deputies])
+def test_a_reason_says_what_is_known_of_the_link(policy: Policy, goodput: float, state: LinkState, reason: str) -> None:
+    view = fleet_of(5, goodput=goodput)
+    assert view.me is not None
+    assert view.me.link_state(1) == state
+    (d,) = [d for d in policy(view) if d.destination == 1]
+    assert d.reason.endswith(reason)
+    assert (d.representation, d.rate_hz) == (Representation.DETECTIONS, 2.0), "the paper's line for less than 5 Mb/s"
 
 
 def test_a_weak_link_never_raises_the_rate() -> None:

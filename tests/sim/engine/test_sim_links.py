@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
+from sortie.scenarios.link_state import LinkState, state_of
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.expectations import check
 from sortie.sim.engine.sortie import run_sortie
@@ -92,6 +94,20 @@ def test_a_trace_of_one_link_leaves_the_others_as_they_are(power_dbm: int, gaine
     before, after = (r.tables["medium"]["connected_drones"].to_pylist() for r in (alone, traced))
     assert min(before) < 5
     assert after == [k + gained for k in before]
+
+
+def test_a_link_is_first_not_measured_then_measured_then_silent() -> None:
+    """Drone 1's links break at 4 s. What each descriptor says of its link to drone 0, and why drone 0 sends what."""
+    record = run_sortie(example("events=[{kind: link_drop, at_s: 4, drone: 1, loss_db: 90}]"))
+    said = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1]
+    states = [(d["t_s"], state_of(d["goodput_mbps"][0])) for d in said]
+    order = [states[0][1], *(b for (_, a), (_, b) in pairwise(states) if b != a)]
+    assert order == [LinkState.NEVER_MEASURED, LinkState.MEASURED, LinkState.SILENT]
+    assert max(t_s for t_s, state in states if state == LinkState.NEVER_MEASURED) > 0.3
+    reasons = [r["reason"] for r in record.tables["directives"].to_pylist() if r["drone"] == 1]
+    assert reasons[0] == "goodput not measured yet"
+    assert "goodput: link silent, nothing got through" in reasons
+    assert not any("goodput 0.0" in reason for reason in reasons)
 
 
 def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:

@@ -18,6 +18,7 @@ from rerun.chunk import RrdReader
 from sim_examples import example
 
 from sortie.perception.budget import CELL_M
+from sortie.scenarios.link_state import SILENT_MBPS
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -395,8 +396,8 @@ def test_links_of_a_lost_drone_are_gone(rows: Rows) -> None:
 
 
 def test_goodput_runs_from_red_by_yellow_to_green() -> None:
-    colours = goodput_colours(np.array([0.0, 1.0, 10.0, 100.0, 1000.0]))[:, :2].tolist()
-    assert colours == [[255, 45], [255, 45], [255, 230], [50, 230], [50, 230]]
+    colours = goodput_colours(np.array([0.0, SILENT_MBPS, 1.0, 10.0, 100.0, 1000.0]))[:, :2].tolist()
+    assert colours == [[185, 190], [255, 45], [255, 45], [255, 230], [50, 230], [50, 230]]
 
 
 def test_the_disc_and_the_target_follow_the_mission(rows: Rows, record: SortieRecord) -> None:
