@@ -194,6 +194,7 @@ class _Flight:
         self._error: Exception | None = None
         self._new: dict[str, pa.Table] = {}
         self._mission: pa.Table | None = None
+        self._spent_j: dict[int, float] = {}
         self._mine, self._theirs = threading.Semaphore(0), threading.Semaphore(0)
         self._closing = False
         self._thread = threading.Thread(target=self._fly, args=(seed, replication), daemon=True)
@@ -285,8 +286,9 @@ class _Flight:
         return float(np.nan_to_num(ap)) - COST_PER_MB * sent_mb - COST_PER_KJ * self._spent_kj(drone)
 
     def _spent_kj(self, drone: int) -> float:
-        """Electric energy over the second's frames: voltage × current × time."""
-        states = self._new["states"]
-        rows = states.filter(pc.equal(states["drone"], drone))
-        watts = pc.multiply(rows["voltage_v"], rows["current_a"])
-        return float(pc.sum(watts).as_py() or 0.0) * self._scenario.frame_s / 1e3
+        """What left the drone's pack in the step, by the ledger; it is in the states, and at the end in `energy`."""
+        table, column = ("energy", "energy_j") if self.done else ("states", "spent_j")
+        rows = self._new[table].filter(pc.equal(self._new[table]["drone"], drone))
+        spent_j = float(pc.sum(rows[column]).as_py() if self.done else rows[column][-1].as_py())
+        before_j, self._spent_j[drone] = self._spent_j.get(drone, 0.0), spent_j
+        return (spent_j - before_j) / 1e3

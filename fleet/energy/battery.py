@@ -99,6 +99,11 @@ class FleetBatteries:
         """In words, for whom the pack brought down."""
         self._kept = [1.0] * n  # of what a trace says, after faults
 
+    @property
+    def spent_j(self) -> list[float]:
+        """Energy that left each drone's pack since take-off, J: the ledger's sum over all causes."""
+        return [sum(causes) for causes in zip(*self.energy_j.values(), strict=True)]
+
     def step(
         self, dt_s: float, rotor_w: Sequence[float], duty: Sequence[float], airtime_share: Sequence[float]
     ) -> None:

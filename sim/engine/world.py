@@ -200,7 +200,15 @@ class World:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
         airborne = [status.airborne for status in self.drones]
         rows["states"].append(
-            (now_s, frame, batteries.soc.copy(), batteries.voltage_v.copy(), batteries.current_a.copy(), airborne)
+            (
+                now_s,
+                frame,
+                batteries.soc.copy(),
+                batteries.voltage_v.copy(),
+                batteries.current_a.copy(),
+                batteries.spent_j,
+                airborne,
+            )
         )
         phase, region, target = self.now
         rows["mission"].append((now_s, phase, *(region or _NO_DISC), *(target or _NOWHERE)))

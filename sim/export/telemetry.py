@@ -33,11 +33,11 @@ ORIGIN = Origin(47.397742, 8.545594, 488.0)
 
 
 class Telemeter:
-    """Turns rows of the record into telemetry; charge used and load are kept from slice to slice."""
+    """Turns rows of the record into telemetry; load is kept from slice to slice."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._frame_s, n = scenario.frame_s, scenario.fleet.drones
-        self._used_j, self._load = np.zeros(n), np.zeros(n)
+        self._frame_s = scenario.frame_s
+        self._load = np.zeros(scenario.fleet.drones)
 
     def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[int, Telemetry]]:
         """Each drone's state in each frame of the tables `states` and `descriptors`, in order of time."""
@@ -56,7 +56,6 @@ class Telemeter:
     def _telemetry(self, row: dict[str, Any]) -> Telemetry:
         drone, landed = row["drone"], not row["airborne"]
         still = (0.0, 0.0, 0.0)
-        self._used_j[drone] += row["voltage_v"] * row["current_a"] * self._frame_s
         return Telemetry(
             time_s=row["t_s"],
             position_m=(row["x_m"], row["y_m"], row["z_m"]),
@@ -66,7 +65,7 @@ class Telemeter:
             soc=row["soc"],
             voltage_v=row["voltage_v"],
             current_a=row["current_a"],
-            energy_used_j=float(self._used_j[drone]),
+            energy_used_j=row["spent_j"],
             cpu_load=float(np.clip(self._load[drone], 0.0, 1.0)),
             landed=landed,
         )

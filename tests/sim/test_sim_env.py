@@ -10,7 +10,9 @@ pettingzoo = pytest.importorskip("pettingzoo")
 
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
-from sortie.sim.env import CHOICES, SortieEnv  # noqa: E402
+from sortie.sim.engine.sortie import run_sortie  # noqa: E402
+from sortie.sim.env import CHOICES, COST_PER_KJ, SortieEnv  # noqa: E402
+from sortie.sim.results.outcome import outcome  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 SHORT = ("duration_s=4", "fleet.drones=3", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.3")
@@ -158,6 +160,25 @@ def test_a_step_is_the_whole_frames_nearest_to_a_second(rate_hz: float, frames: 
         assert e._flight is not None
         flown.append(e._flight._new["states"].num_rows // 3)
     assert (len(flown), set(flown[:-1])) == (steps, {frames})
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 1.5])
+def test_rewards_charge_for_what_the_ledger_says(rate_hz: float) -> None:
+    """Nobody shares and nothing is scored, so that energy alone is rewarded; ohmic loss and a fault are part of it."""
+    pack = (
+        "fleet.battery.cell_resistance_mohm=40",
+        "fleet.battery.polarisation.resistance_mohm=20",
+        f"context.rate_hz={rate_hz}",
+    )
+    sets = (*SHORT, *pack, "events=[{kind: battery_fault, drone: 1, at_s: 1.2, lost_fraction: 0.01}]")
+    e, totals = env(*sets), dict.fromkeys(range(3), 0.0)
+    e.reset(seed=3)
+    while e.agents:
+        for agent, reward in e.step({})[1].items():
+            totals[int(agent[-1])] -= reward / COST_PER_KJ
+    spent = outcome(run_sortie(example(*sets), "silence", 3))
+    assert spent["energy_j"]["ohmic"] > 0.05 * spent["energy_j"]["total"]
+    assert [1e3 * totals[i] for i in range(3)] == pytest.approx([d["energy_j"] for d in spent["drones"].values()])
 
 
 def test_what_went_wrong_in_the_sortie_is_said_each_time(monkeypatch: pytest.MonkeyPatch) -> None:

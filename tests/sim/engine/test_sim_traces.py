@@ -73,6 +73,22 @@ def test_cells_drop_out_until_the_drone_lands() -> None:
     assert faults["energy_j"][0].as_py() > 0.9 * 0.95 * 130 * 3600
 
 
+def test_states_say_what_the_ledger_of_a_sortie_to_there_says() -> None:
+    """With ohmic loss, polarisation and a fault; a drone that landed spends no more."""
+    sets = (
+        "fleet.battery.cell_resistance_mohm=40", "fleet.battery.polarisation.resistance_mohm=20",
+        "mission.phases=[{at_s: 0, phase: search}]",
+        "events=[{kind: battery_fault, drone: 1, at_s: 0.5, lost_fraction: 0.01}, {kind: drone_lost, drone: 2, at_s: 0.7}]",
+    )  # fmt: skip
+    states = run_sortie(example(*sets)).tables["states"].to_pylist()
+    for until_s in (0.8, 1.1, 4.0):
+        at = [row["spent_j"] for row in states if row["t_s"] == pytest.approx(until_s)]
+        shorter = outcome(run_sortie(example(*sets, f"duration_s={until_s}")))
+        assert at == pytest.approx([d["energy_j"] for d in shorter["drones"].values()], rel=1e-12)
+        assert sum(at) == pytest.approx(shorter["energy_j"]["total"], rel=1e-12)
+        assert shorter["energy_j"]["ohmic"] > 0
+
+
 def test_everything_at_once_keeps_the_ledger() -> None:
     """Cold, old, polarising packs with payload under momentum theory, and a lost cell: the record's causes are what
     left the packs."""
