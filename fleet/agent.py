@@ -168,6 +168,7 @@ class Agent:
         self._decide()
         duty = self._gate.duty_percent
         self.status.perceiving = (frame + 1) * duty // 100 > frame * duty // 100
+        self.status.work.looks += self.status.perceiving
         if self.status.perceiving:
             self._env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
 
@@ -229,6 +230,7 @@ class Agent:
             changed = asked is not link.asked and asked != link.asked
             if changed or age_s > fresh_s or link.state.proposals:
                 self._enforce(link, asked, age_s, now_s)
+        self.status.work.decisions += 1
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
     def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
@@ -262,6 +264,7 @@ class Agent:
                 made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
             payload = made[what]
             if payload is not None:
+                self.status.work.payload_bytes += payload.size_bytes
                 self._modem.send(directive.destination, payload, capture, directive.deadline_s)
 
     def _shake_hands(self, size_bytes: int, capture: Capture) -> None:
@@ -269,4 +272,5 @@ class Agent:
         limit_s = self._period_s * self._rules.detached_after_periods
         for peer, age_s in self.memory.ages_s(self._env.now).items():
             if peer != self.drone and age_s <= limit_s:
+                self.status.work.payload_bytes += size_bytes
                 self._modem.handshake(peer, size_bytes, capture, self._rules.period_s)

@@ -12,6 +12,7 @@ from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, disc
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
 from sortie.policies.damping import apply_hysteresis
+from sortie.scenarios.representation import MAPS
 
 
 class Received(NamedTuple):
@@ -71,6 +72,8 @@ class PeerMemory:
         """Keep a peer's payload, unless a newer capture of that peer arrived before it."""
         peer = received.capture.drone
         held = self.held.get(peer)
+        self.status.work.payload_bytes += received.payload.size_bytes
+        self.status.work.maps += received.payload.representation in MAPS
         if self._rules.trust:
             took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
             self._arrivals.setdefault(peer, []).append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sortie.fleet.computer import Work
 from sortie.fleet.messages.compact import FULL, Form
 from sortie.policies.contract import Descriptor
 
@@ -53,6 +54,8 @@ class DroneStatus:
     """Whether perception runs in the current frame."""
     clock_skew_s: float = 0.0
     """Error of the drone's clock."""
+    work: Work = field(default_factory=Work)
+    """What the drone's computer did so far."""
     lies: dict[int, Callable[[Descriptor], Descriptor]] = field(default_factory=dict)
     """Falsifications of the drone's descriptors, by the index of the scenario event that causes them."""
 

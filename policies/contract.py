@@ -73,7 +73,9 @@ class Descriptor(NamedTuple):
     footprint_radius_m: float
     battery_soc: float
     cpu_headroom: float
+    """Share of the companion computer's processor that was left over the last frame, 0 … 1."""
     gpu_headroom: float
+    """The same of its accelerator."""
     peer_goodput_mbps: tuple[float, ...]
     """To every other drone of the roster by ascending id, as measured by this drone; `link_state` says what 0 means."""
     coverage_grid: bytes

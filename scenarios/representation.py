@@ -24,5 +24,6 @@ REPRESENTATION_OF: dict[str, Representation] = {name: representation for represe
 BOXES = (Representation.TRACKS, Representation.DETECTIONS)
 """Small lists of objects. They are sent reliably, and a receiver joins them to its own boxes (late fusion)."""
 BOX_NAMES = tuple(NAME_OF[r] for r in BOXES)
-MAP_NAMES = tuple(NAME_OF[r] for r in (Representation.FEATURES, Representation.RAW))
+MAPS = (Representation.FEATURES, Representation.RAW)
 """What a receiver fuses as feature maps."""
+MAP_NAMES = tuple(NAME_OF[r] for r in MAPS)

@@ -22,6 +22,7 @@ from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import (
     Airframe,
     Battery,
+    Computer,
     DroneOverride,
     Fleet,
     Formation,
@@ -44,6 +45,7 @@ __all__ = [
     "Bursts",
     "CellFailure",
     "ClockSkew",
+    "Computer",
     "Context",
     "DecisionExpectation",
     "DescriptorForm",

@@ -156,6 +156,29 @@ class Battery(Section):
         return self
 
 
+class Computer(Section):
+    """The companion computer: what its headrooms follow from (fleet/computer.py); a Jetson AGX Orin, as the paper's."""
+
+    cpu_cores: int = Field(12, ge=1, le=256, description="Cores of the processor.")
+    decision_s: float = Field(
+        0.0001, ge=0, le=1, description="Processor time of a decision; the paper's median on the Orin."
+    )
+    payload_mbps: float = Field(
+        19500.0,
+        gt=0,
+        description="Payload that one core sends or receives; from the paper's prototype on the Orin (fleet/README.md).",
+    )
+    driving_cores: float = Field(
+        1.0, ge=0, le=256, description="Cores that are busy while the accelerator works, feeding it and waiting for it."
+    )
+    fusion_s: float = Field(
+        0.00032,
+        ge=0,
+        le=1,
+        description="Accelerator time to fuse one received feature map; a look takes compute_delay_s.",
+    )
+
+
 class DroneOverride(Section):
     drone: DroneId = Field(description="Whose battery or load differs.")
     initial_soc: Soc | None = Field(None, description="As fleet.battery.initial_soc.")
@@ -177,6 +200,7 @@ class Fleet(Section):
         json_schema_extra=Airframe.names_in_schema,
     )
     battery: Battery = Battery()
+    computer: Computer = Computer()
     overrides: tuple[DroneOverride, ...] = Field(
         (), description="Drones whose battery or payload differs from the fleet's."
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Platform, Task
+from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
@@ -92,8 +94,9 @@ class World:
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
         self._frame = 0
+        self._work = [Work()] * n
+        self._headrooms = [(1.0, 1.0)] * n
         self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
-        self.airtime_share = [0.0] * n
         self.now = plan.at(0.0)
         """The mission in this frame: the ground station's cue comes with the frame."""
 
@@ -114,6 +117,8 @@ class World:
         for frame in range(scenario.frames):
             yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
             self.drain()
+            if frame:
+                self._measure_headrooms()
             self._frame = frame
             self.now = self.plan.at(env.now)
             if before_frame is not None:
@@ -123,6 +128,14 @@ class World:
             if frame % frames_a_second == 0:
                 self._write_medium()
                 on_second(env.now)
+
+    def _measure_headrooms(self) -> None:
+        scenario, before = self._scenario, self._work
+        self._work = [replace(status.work) for status in self.drones]
+        self._headrooms = [
+            headrooms(scenario.fleet.computer, scenario.perception.compute_delay_s, a, b, scenario.frame_s)
+            for a, b in zip(before, self._work, strict=True)
+        ]
 
     def reroute(self, motion: Trajectories) -> None:
         """Replace the motion from the present frame on; earlier frames must be equal."""
@@ -138,13 +151,13 @@ class World:
             return
         self._stepped_to_s = self.env.now
         airtime_s = list(self.air.airtime_s)
-        self.airtime_share = [min(1.0, (a - b) / dt_s) for a, b in zip(airtime_s, self._airtime_s, strict=True)]
+        airtime_share = [min(1.0, (a - b) / dt_s) for a, b in zip(airtime_s, self._airtime_s, strict=True)]
         self._airtime_s = airtime_s
         self.batteries.step(
             dt_s,
             self._rotor_w[self._frame],
             [self.busy_sensing if d.perceiving else 0.0 for d in self.drones],
-            self.airtime_share,
+            airtime_share,
         )
         self.ground_landed()
 
@@ -238,9 +251,8 @@ class World:
         return self._flight.at(frame)[drone]
 
     def platform(self, drone: int) -> Platform:
-        """Charge, and headrooms: the processor's share not spent on the radio, the accelerator's not on perception."""
-        sensing = self.busy_sensing if self.drones[drone].perceiving else 0.0
-        return Platform(self.batteries.soc[drone], 1.0 - self.airtime_share[drone], 1.0 - sensing)
+        """Charge, and headrooms over the frame that ended."""
+        return Platform(self.batteries.soc[drone], *self._headrooms[drone])
 
 
 class OwnSenses:

@@ -71,6 +71,8 @@ def test_units_stand_in_names() -> None:
         "drone",
         "peer",
         "cells",
+        "cpu_cores",
+        "driving_cores",
         "initial_soc",
         "drivetrain_efficiency",
         "landing_soc",

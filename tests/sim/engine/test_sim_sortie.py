@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +13,7 @@ import pytest
 from places import HELPERS
 from sim_examples import example
 
-from sortie.policies.contract import Directive, PolicyError
+from sortie.policies.contract import Directive, FleetView, PolicyError, Representation
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
@@ -333,6 +334,29 @@ def test_an_event_with_a_frame_leaves_the_others_headrooms_alone() -> None:
         said.append([d["cpu_headroom"] for d in told if d["drone"] != 3])
     assert said[0] == pytest.approx(said[1])
     assert min(said[0]) < 1.0
+
+
+def test_headrooms_are_of_the_work_of_the_frame_and_not_of_the_radio() -> None:
+    """From a full map in each direction and frame of four links, by hand; and from silence, perception resting or not."""
+
+    def published(policy: Callable[[FleetView], list[Directive]], *sets: str) -> list[tuple[float, float]]:
+        rows = run_sortie(example("duration_s=3", *sets), policy).tables["descriptors"].to_pylist()
+        return [(d["cpu_headroom"], d["gpu_headroom"]) for d in rows if d["drone"] == 0 and d["t_s"] > 1.5]
+
+    def saying(**decided: object) -> Callable[[FleetView], list[Directive]]:
+        return lambda view: [Directive(view.ego, p, **decided) for p in view.peers]  # type: ignore[arg-type]
+
+    looking = 1 - (30 + 0.1) / (12 * 100), 1 - 0.3
+    assert published(saying()) == [pytest.approx(looking)] * 15
+    assert published(saying(), "radio.tx_power_dbm=0", "radio.bandwidth_mhz=20") == [pytest.approx(looking)] * 15
+    rests = [pytest.approx((1 - 0.1 / (12 * 100), 1.0)), pytest.approx(looking)]
+    assert published(saying(duty_percent=50))[1:5] in (rests * 2, rests[::-1] * 2)
+    maps = saying(representation=Representation.FEATURES, rho=0.05, rate_hz=10.0)
+    bytes_each = run_sortie(example("duration_s=3"), maps).tables["transmissions"]["payload_bytes"][-1].as_py()
+    accelerator_ms = 30 + 4 * 0.32
+    cpu_ms = accelerator_ms + 0.1 + 8 * bytes_each * 8e-6 / 19.5
+    usual = sorted(published(maps))[7]
+    assert usual == pytest.approx((1 - cpu_ms / (12 * 100), 1 - accelerator_ms / 100))
 
 
 def test_the_end_of_a_link_drop_names_the_link() -> None:
