@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sortie.sim.check.checking import Checked
     from sortie.sim.engine.sortie import Observer
     from sortie.sim.env import SortieEnv
+    from sortie.sim.results.summary import Summary
     from sortie.sim.studies.compare import Compared, Gain
 
 ScenarioLike = str | Path | Mapping[str, object] | Scenario
@@ -146,18 +147,44 @@ class Comparison:
     """One a policy and seed; seed by seed, policies in the order in which they were named."""
     gains: tuple[Gain, ...]
     """AP@0.5 of every policy but the first, minus the first's, with a paired 95 % interval. `Gain.over` says what
-    the interval covers."""
+    the interval covers. Empty where `perception.detector` is none: nothing is scored then, while bytes, energy and
+    delays in `table` are compared all the same."""
 
     @cached_property
     def table(self) -> pa.Table:
         """A row a sortie: `policy`, `seed`, then every metric of the outcome by its dotted name."""
         import pyarrow as pa
 
-        from sortie._run import _numbers
+        from sortie._run import numbers
 
-        rows = [{"policy": s.policy, "seed": s.outcome["seed"], **dict(_numbers("", s.outcome))} for s in self.sorties]
+        rows = [{"policy": s.policy, "seed": s.outcome["seed"], **dict(numbers(s.outcome))} for s in self.sorties]
         names = list(dict.fromkeys(name for row in rows for name in row))
         return pa.table({name: [row.get(name) for row in rows] for name in names})
+
+    def summary(self) -> Summary:
+        """The policies side by side and why their figures differ, as `sortie compare` prints it.
+
+        A notebook shows it, `rich` prints it, and `str` gives plain text.
+        """
+        from sortie.sim.results.summary import Summary
+        from sortie.sim.studies.comparison_text import comparison_table, explanations
+
+        return Summary(comparison_table(self.sorties), *explanations(self.sorties))
+
+    def save_recording(self, path: str | Path) -> Path:
+        """Save the policies' sorties side by side as one Rerun recording.
+
+        Raises:
+            RunError: the file cannot be written, or several seeds were flown, of which no records are kept.
+        """
+        from sortie.sim.playback.recording import save_comparison
+
+        place = as_path("path", path)
+        records = [(s.policy, s.record) for s in self.sorties if s.record is not None]
+        if not records:
+            raise RunError(f"{place}: a recording shows one flight, compare with one seed for it")
+        save_comparison(records, place)
+        return place
 
 
 def compare(
@@ -166,6 +193,7 @@ def compare(
     overrides: Overrides = (),
     *,
     seeds: Iterable[int] | None = None,
+    own_fusion: bool = False,
     progress: Callable[[str, int, float], None] | None = None,
 ) -> Comparison:
     """Fly a scenario under several policies, with the same seeds and draws.
@@ -175,6 +203,7 @@ def compare(
         policies: one or more; gains are over the first.
         seeds: None flies the scenario's own seed alone. The interval then covers the instants of that one flight. With
             several seeds it covers flights.
+        own_fusion: prior methods fly with the fusion that they were published with, in place of `perception.fusion`.
         progress: called with the policy's label, the seed and the simulated time (s).
 
     Raises:
@@ -192,6 +221,8 @@ def compare(
     if isinstance(policies, str) or not isinstance(policies, Iterable):
         raise PolicyError(f"policies: {policies!r}, must be a list of policies: ['worked', 'silence']")
     flown = [Contender(_label(policy), *_with_policy(base, policy)) for policy in policies]
+    if own_fusion:
+        flown = [contender.with_own_fusion() for contender in flown]
     labels = [contender.label for contender in flown]
     if not flown or len(set(labels)) < len(labels):
         how = "; give functions of one name, such as lambdas, a __name__ of their own"

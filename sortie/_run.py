@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sortie.scenarios.errors import SortieError
+from sortie.scenarios.reading.nodes import nearest
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
@@ -19,6 +22,27 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from sortie.scenarios.schema import Scenario
+    from sortie.sim.results.summary import Summary
+
+
+class UnknownMetricError(SortieError, KeyError):
+    """A metric that a run does not have."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # a KeyError's own text is in quotes
+
+
+class Metrics(dict[str, float]):
+    """Numbers by their dotted names.
+
+    Raises:
+        UnknownMetricError: no such number, with the name that was probably meant.
+    """
+
+    def __missing__(self, name: str) -> float:
+        near = nearest(name, self)
+        meant = f"did you mean {near}?" if near else "`sorted(run.metrics)` lists the names"
+        raise UnknownMetricError(f"{name}: this run has no such metric, {meant}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +109,43 @@ class Run:
         return outcome(self.record)
 
     @property
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> Metrics:
         """The outcome's numbers by their dotted names, as `expect`, `compare` and campaigns use them.
+
+        Ratios of nothing are left out. A name that is not there raises a `SortieError` that is a `KeyError` too.
 
         Example:
             >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
             >>> run.metrics["bytes.data_sent"] == run.outcome["bytes"]["data_sent"]
             True
         """
-        return dict(_numbers("", self.outcome))
+        return Metrics(numbers(self.outcome))
+
+    def summary(self) -> Summary:
+        """What the fleet saw and what it cost, as the table that `sortie fly` prints.
+
+        A notebook shows it, `rich` prints it, and `str` gives plain text.
+
+        Example:
+            >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+            >>> "data plane" in str(run.summary())
+            True
+        """
+        from sortie.sim.results.summary import Summary, outcome_table
+
+        return Summary(outcome_table(self.outcome))
+
+    def decisions(self) -> Summary:
+        """What the links carried from when on and why, with the events, as the table that `sortie fly` prints.
+
+        Example:
+            >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+            >>> "decisions and events" in str(run.decisions())
+            True
+        """
+        from sortie.sim.results.summary import Summary, transitions_table
+
+        return Summary(transitions_table(self.outcome))
 
     def save(self, path: str | Path, *, recording: bool = True) -> Path:
         """Write the run's folder: outcome, tables as Parquet, scenario and, unless `recording` is False, `sortie.rrd`.
@@ -139,6 +191,9 @@ class Run:
     def picture(self, path: str | Path, at_s: float = 0.0) -> Path:
         """Save what the viewer shows at simulated time `at_s` as a PNG file. It needs no screen.
 
+        Warns:
+            UserWarning: what a view of the viewer could not draw.
+
         Raises:
             RunError: the viewer cannot draw here, or the file cannot be written.
         """
@@ -146,7 +201,8 @@ class Run:
 
         place = as_path("path", path)
         with tempfile.TemporaryDirectory() as made:
-            take_picture(self._recording(Path(made)), place, at_s)
+            for complaint in take_picture(self._recording(Path(made)), place, at_s):
+                warnings.warn(complaint, stacklevel=2)
         return place
 
     def _recording(self, made: Path) -> Path:
@@ -173,9 +229,10 @@ def as_path(name: str, value: object) -> Path:
     return Path(value)
 
 
-def _numbers(prefix: str, value: Any) -> list[tuple[str, float]]:
+def numbers(value: Any, prefix: str = "") -> list[tuple[str, float]]:
+    """The numbers of an outcome with their dotted names."""
     if isinstance(value, Mapping):
-        return [pair for key, inner in value.items() for pair in _numbers(f"{prefix}.{key}" if prefix else key, inner)]
+        return [pair for key, inner in value.items() for pair in numbers(inner, f"{prefix}.{key}" if prefix else key)]
     if isinstance(value, list):
-        return [pair for i, inner in enumerate(value) for pair in _numbers(f"{prefix}.{i}", inner)]
+        return [pair for i, inner in enumerate(value) for pair in numbers(inner, f"{prefix}.{i}")]
     return [(prefix, value)] if isinstance(value, int | float) and not isinstance(value, bool) else []

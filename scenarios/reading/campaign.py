@@ -62,7 +62,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
     Raises:
         ScenarioError: one line that says which file, line and field, what is wrong and the bound; also of the base.
     """
-    text, source = read(path_or_name)
+    text, source = read(path_or_name, campaigns())
     root = tree(text, source)
     if isinstance(root.value, dict) and "campaign" not in root.value and "name" in root.value:
         raise ScenarioError(f"{source}: is a scenario, a campaign begins with `campaign: its_name` and names its base")

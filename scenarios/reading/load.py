@@ -85,14 +85,22 @@ def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
     return validated(root, Scenario)
 
 
-def read(path_or_name: str | Path) -> tuple[str, str]:
-    """A file's text and its path; a bare name is looked up in the library first. Raises ScenarioError."""
+def read(path_or_name: str | Path, wanted: Mapping[str, Path] | None = None) -> tuple[str, str]:
+    """A file's text and its path; a bare name is looked up in the library first.
+
+    Args:
+        wanted: the library's files of the kind that is read, which an error offers; None is scenarios, and a near miss of
+            any kind.
+
+    Raises:
+        ScenarioError: no such file, or one that is no text.
+    """
     path = {**library(), **campaigns(), **condition_sets()}.get(str(path_or_name), Path(path_or_name))
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ScenarioError(f"{path}: no such file, {_nearby(path)}") from None
+        raise ScenarioError(f"{path}: no such file, {_nearby(path, wanted)}") from None
     except IsADirectoryError:
         raise ScenarioError(f"{path}: is a directory, must be a scenario file") from None
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
@@ -220,11 +228,13 @@ def _first(issues: Sequence[Issue]) -> ScenarioError:
     return ScenarioError(f"{first}{more}")
 
 
-def _nearby(path: Path) -> str:
+def _nearby(path: Path, wanted: Mapping[str, Path] | None) -> str:
     try:
         here = sorted(p.name for p in path.parent.glob("*.y*ml"))
     except (OSError, ValueError):
         here = []
-    known = {Path(name).stem: name for name in [*library(), *campaigns(), *condition_sets(), *here]}
+    kinds = [*library(), *campaigns(), *condition_sets()] if wanted is None else [*wanted]
+    known = {Path(name).stem: name for name in [*kinds, *here]}
     near = nearest(path.stem, known)
-    return f"did you mean {known[near]}?" if near else f"the library has {', '.join(library())}"
+    there = ", ".join(library() if wanted is None else wanted)
+    return f"did you mean {known[near]}?" if near else f"the library has {there}"

@@ -8,18 +8,15 @@ from typing import Annotated
 
 import typer
 
+import sortie
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import POLICIES
-from sortie.policies.registry import own_fusion as own_fusion_of
 from sortie.scenarios.reading.load import load_conditions
-from sortie.scenarios.schema import Scenario
-from sortie.sim.cli import tables
 from sortie.sim.cli.conditions import compare_conditions, refuse
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
-from sortie.sim.studies.compare import Contender
-from sortie.sim.studies.compare import compare as compare_policies
+from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 
 
 def compare(
@@ -52,40 +49,28 @@ def compare(
         return compare_conditions(conditions, chosen, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
-    flown = [Contender(p, loaded(scenario, set_, p)) for p in _split_policies(policies)]
+    labels = _split_policies(policies)
+    lasts_s = {label: loaded(scenario, set_, label).duration_s for label in labels}
     ensure_files(out_file, recording)
-    ensure_between(readme, tables.COMPARE_BEGIN, tables.COMPARE_END)
-    if own_fusion:
-        flown = [c._replace(scenario=_with_own_fusion(c.scenario)) for c in flown]
+    ensure_between(readme, BEGIN, END)
     with bars() as bar:
-        each = {c.label: bar(c.label, c.scenario.duration_s) for c in flown}
-        flown_seed = flown[0].scenario.seed if seed is None else seed
-        rows, _ = compare_policies(flown, [flown_seed], progress=lambda label, _, t_s: each[label](t_s))
-    out.print(tables.comparison_table(rows))
-    for line in tables.explanations(rows):
-        out.print(line)
+        each = {label: bar(label, duration_s) for label, duration_s in lasts_s.items()}
+        compared = sortie.compare(
+            scenario, labels, set_ or [], seeds=None if seed is None else [seed], own_fusion=own_fusion,
+            progress=lambda label, _, t_s: each[label](t_s),
+        )  # fmt: skip
+    out.print(compared.summary())
     if out_file is not None:
-        told = {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in rows}
+        told = {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in compared.sorties}
         write_text(out_file, json.dumps(told, indent=2) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
     if readme is not None:
-        command = tables.compare_command(scenario, policies, seed, set_ or [], own_fusion=own_fusion)
-        section = tables.comparison_markdown(rows, command)
-        put_between(readme, section, tables.COMPARE_BEGIN, tables.COMPARE_END)
+        command = compare_command(scenario, policies, seed, set_ or [], own_fusion=own_fusion)
+        put_between(readme, comparison_markdown(compared.sorties, command), BEGIN, END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
-        from sortie.sim.playback.recording import save_comparison
-
-        save_comparison([(r.policy, r.record) for r in rows if r.record is not None], recording)
+        compared.save_recording(recording)
         out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
-
-
-def _with_own_fusion(scenario: Scenario) -> Scenario:
-    fusion = own_fusion_of(scenario.policy.name)
-    if fusion is None:
-        return scenario
-    perception = scenario.perception.model_copy(update={"fusion": fusion})
-    return scenario.model_copy(update={"perception": perception})
 
 
 def _split_policies(text: str) -> list[str]:

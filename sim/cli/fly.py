@@ -80,8 +80,8 @@ def fly(
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
     instead = run_folder.in_place_of(path, flight.fingerprint)
     flight.save(path, recording=recording)
-    out.print(tables.outcome_table(flight.outcome))
-    out.print(tables.transitions_table(flight.outcome))
+    out.print(flight.summary())
+    out.print(flight.decisions())
     report(flight.outcome)
     see = f", see it with: sortie view {path}" if recording else ""
     out.print(f"kept in [bold]{path}[/bold]{escape(instead)}{see}", soft_wrap=True)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+import sortie
 from sortie.sim.cli.console import err, out
 from sortie.sim.folders import RunError
-from sortie.sim.results import run_folder
 
 
 def view(
@@ -21,20 +22,16 @@ def view(
         float, typer.Option("--at", help="With --picture: the simulated time that it shows, s.", min=0)
     ] = 0.0,
 ) -> None:
-    """Open a run's recording in the Rerun viewer. A missing recording is made again."""
-    from sortie.sim.playback.recording import save_rrd
-    from sortie.sim.playback.viewer import open_viewer
-
+    """Open a run's recording in the Rerun viewer; where the run has none, it is made for the occasion."""
     if at_s and picture is None:
         raise RunError("--at goes with --picture: the viewer has a time line of its own")
-    path = run / run_folder.RECORDING
-    if not path.is_file():
-        save_rrd(run_folder.load(run), path)
+    opened = sortie.open_run(run)
     if picture is None:
-        open_viewer(path)
+        opened.view()
         return
-    from sortie.sim.playback.picture import take_picture
-
-    for complaint in take_picture(path, picture, at_s):
-        err.print(complaint, soft_wrap=True)
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always", UserWarning)
+        opened.picture(picture, at_s)
+    for complaint in complaints:
+        err.print(str(complaint.message), soft_wrap=True)
     out.print(f"kept in [bold]{picture}[/bold]", soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import compare as bootstrap
 from sortie.policies.contract import Policy
-from sortie.policies.registry import resolve
+from sortie.policies.registry import own_fusion, resolve
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import matched, outcome
@@ -28,6 +28,14 @@ class Contender(NamedTuple):
     """With this policy in it; otherwise alike among contenders."""
     function: Policy | None = None
     """Decides in place of the scenario's policy; None where the scenario names it."""
+
+    def with_own_fusion(self) -> Contender:
+        """The same with the fusion that its method was published with, where it is a prior method."""
+        fusion = None if self.function is not None else own_fusion(self.scenario.policy.name)
+        if fusion is None:
+            return self
+        perception = self.scenario.perception.model_copy(update={"fusion": fusion})
+        return self._replace(scenario=self.scenario.model_copy(update={"perception": perception}))
 
 
 @dataclass(frozen=True, slots=True)

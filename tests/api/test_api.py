@@ -14,10 +14,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from places import ROOT
 from threadpoolctl import threadpool_info
+from typer.testing import CliRunner
 
 import sortie
 from sortie import _api, _run
+from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
@@ -111,6 +114,48 @@ def test_metrics_are_the_outcomes_numbers_by_dotted_name() -> None:
     assert run.metrics["ap50.full_scene"] == run.outcome["ap50"]["full_scene"]
     assert run.metrics["phases.0.data_rate_mbps"] == run.outcome["phases"][0]["data_rate_mbps"]
     assert all(isinstance(v, int | float) and not isinstance(v, bool) for v in run.metrics.values())
+
+
+def test_a_summary_is_text_and_shows_itself_in_a_notebook() -> None:
+    run = sortie.fly("track_target", SURROGATE)
+    compared = sortie.compare("track_target", ["worked", "silence"], SURROGATE)
+    for summary, words in (
+        (run.summary(), ("track_target · worked · seed 1", "AP@0.5", "data plane")),
+        (run.decisions(), ("decisions and events", "→")),
+        (compared.summary(), ("worked", "silence", "deadlines missed", "silence: sent nothing")),
+    ):
+        assert all(word in str(summary) for word in words)
+        assert set(summary._repr_mimebundle_([], [])) == {"text/plain", "text/html"}
+
+
+def test_the_command_line_prints_the_summaries_of_the_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made: list[str] = []
+    monkeypatch.setattr(sortie.Run, "summary", lambda self: made.append("run") or "SUMMARY")
+    monkeypatch.setattr(sortie.Comparison, "summary", lambda self: made.append("comparison") or "SUMMARY")
+    monkeypatch.setattr(sortie.Run, "picture", lambda self, path, at_s: made.append(f"picture at {at_s:g}"))
+    settings = [arg for key, value in SHORT.items() for arg in ("--set", f"{key}={value}")]
+    for command in (
+        ["fly", "track_target", *settings, "--out", "a", "--no-recording"],
+        ["compare", "track_target", "--policies", "worked,silence", *settings],
+        ["view", "a", "--picture", "a.png", "--at", "1"],
+    ):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+    assert made == ["run", "comparison", "picture at 1"]
+
+
+@pytest.mark.parametrize("name", ["fly_and_look", "write_and_verify_a_policy"])
+def test_a_notebook_flies_by_the_public_interface(name: str) -> None:
+    text = (ROOT / "notebooks" / f"{name}.ipynb").read_text()
+    assert "sortie.sim" not in text
+    assert "import sortie" in text
+
+
+def test_prior_methods_fly_with_their_own_fusion_when_asked() -> None:
+    compared = sortie.compare("track_target", ["worked", "v2vnet-style"], SHORT, own_fusion=True)
+    flown = [s.record.scenario.perception.fusion for s in compared.sorties if s.record is not None]
+    assert flown == ["disconet", "v2vnet"]
 
 
 @pytest.mark.parametrize(
@@ -257,7 +302,10 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "a number of seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=3), sortie.ScenarioError, "seeds: 3, must be a list of seeds: range(3)"),  # type: ignore[arg-type]
     "no run": (lambda: sortie.open_run("nowhere"), sortie.RunError, "nowhere: no run there (outcome.json is missing)"),
     "a number for a path": (lambda: sortie.open_run(7), sortie.RunError, "path: 7, must be a path"),  # type: ignore[arg-type]
-    "unknown campaign": (lambda: sortie.campaign("nope"), sortie.ScenarioError, "nope: no such file"),
+    "unknown campaign": (lambda: sortie.campaign("nope"), sortie.ScenarioError, "nope: no such file, the library has link_battery"),
+    "a near miss of a campaign": (lambda: sortie.campaign("link_batery"), sortie.ScenarioError, "did you mean link_battery?"),
+    "unknown metric": (lambda: sortie.fly("track_target", SHORT).metrics["bytes.data_snt"], sortie.SortieError, "bytes.data_snt: this run has no such metric, did you mean bytes.data_sent?"),
+    "a metric like no other": (lambda: sortie.fly("track_target", SHORT).metrics["§"], KeyError, "§: this run has no such metric, `sorted(run.metrics)` lists the names"),
     "negative workers": (lambda: sortie.campaign("link_battery", workers=-1), sortie.RunError, "workers: -1, must be a whole number from 0 on, or None"),
     "nothing to check": (lambda: sortie.check("nope"), sortie.ScenarioError, "nope: no such file"),
     "a lone drone": (lambda: sortie.env({"name": "a", "fleet": {"drones": 1}}), sortie.RunError, "fleet.drones is 1, must be at least 2 to share"),

@@ -12,9 +12,10 @@ from sim_examples import example
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.scenarios.report_text import points
 from sortie.sim.check.expectations import Verdict
-from sortie.sim.cli.tables import transitions_table, verdict_table
+from sortie.sim.cli.tables import verdict_table
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.summary import transitions_table
 
 REASON = "as in [roi] and [/roi]"
 """Which the terminal's markup would swallow, or stumble over."""

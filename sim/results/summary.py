@@ -1,0 +1,136 @@
+"""What is printed of a run: tables for a terminal, a notebook or plain text."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.jupyter import JupyterMixin
+from rich.markup import escape
+from rich.table import Table
+
+from sortie.scenarios.report_text import number, percent, size
+
+MAX_TRANSITIONS = 24
+WIDTH = 110
+"""Columns of a summary as plain text."""
+
+
+class Summary(JupyterMixin):
+    """Tables and lines in their order.
+
+    A notebook shows it as it is, `rich` prints it with colours, and `str` gives plain text.
+    """
+
+    def __init__(self, *parts: RenderableType) -> None:
+        self._parts = parts
+
+    def __rich__(self) -> Group:
+        return Group(*self._parts)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=WIDTH)
+        console.print(self)
+        assert isinstance(console.file, io.StringIO)  # noqa: S101
+        return console.file.getvalue()
+
+
+def outcome_table(result: dict[str, Any]) -> Table:
+    """One sortie: what the fleet saw and what it cost."""
+    table = Table(title=f"{result['scenario']} · {result['policy']} · seed {result['seed']}", show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    ap, data, mission = result["ap50"], result["bytes"], result["mission"]
+    if mission["flown_share"] < 1.0:
+        table.add_row("flown", f"{percent(mission['flown_share'])} of drone-seconds")
+    if ap["detector"] != "none":
+        model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else f"; {ap['detector']}"
+        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{model}"
+        table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
+        if mission["flown_share"] < 1.0:
+            blind = ap["grounded_blind"]
+            table.add_row(
+                "  grounded drones blind",
+                f"{number(blind['full_scene'])} full scene, {number(blind['mission'])} mission",
+            )
+        for phase in result["phases"]:
+            seen = phase["ap50"]
+            payload = (
+                "" if phase["feature_payload_bytes"] is None else f", {size(phase['feature_payload_bytes'])} a payload"
+            )
+            table.add_row(
+                f"  {phase['phase']} {phase['begin_s']:g}–{phase['end_s']:g} s",
+                f"{number(seen['full_scene'])} full, {number(seen['mission'])} mission, "
+                f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {percent(phase['deadline_miss_rate'])} missed",
+            )
+    if seen_of_mission := _mission_in_words(mission):
+        table.add_row("mission", seen_of_mission)
+    table.add_row(
+        "context plane",
+        f"{size(data['context_sent'])} ({percent(result['context_share'])} of all bytes), "
+        f"age {number(result['age_s']['p50'])} s median, {number(result['age_s']['p99'])} s p99",
+    )
+    fates = ", ".join(
+        f"{size(data[f'data_{s}'])} {s.replace('_', ' ')}" for s in ("delivered", "lost", "expired", "in_flight")
+    )
+    table.add_row("data plane", f"{size(data['data_sent'])} sent: {fates}")
+    table.add_row(
+        "deadlines",
+        f"{percent(result['deadline_miss_rate'])} missed; medium busy {percent(result['medium_busy_fraction'])}",
+    )
+    energy = result["energy_j"]
+    causes = ", ".join(f"{c} {energy[c] / 1e3:.1f}" for c in energy if c != "total" and energy[c] > 0)
+    table.add_row("energy", f"{energy['total'] / 1e3:.1f} kJ ({causes})")
+    left = "  ".join(f"{i}: {percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["drones"].items())
+    table.add_row("charge left", left)
+    if result["descriptor_drops"]:
+        table.add_row("descriptors refused", ", ".join(f"{n} {r}" for r, n in result["descriptor_drops"].items()))
+    table.add_row("switches", f"{number(result['switches'], '.2f')} a link-minute")
+    table.add_row(
+        "decision",
+        f"{number(result['policy_eval_us']['p50'], '.0f', 'µs')} median, {number(result['policy_eval_us']['p99'], '.0f', 'µs')} p99",
+    )
+    table.add_row(
+        "wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(result['realtime_factor'], '.1f')} × real time"
+    )
+    if result["own_files"]:
+        table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
+    table.add_row("fingerprint", result["fingerprint"][:16])
+    return table
+
+
+def _mission_in_words(mission: dict[str, Any]) -> str:
+    """What the fleet saw of its region and its target; empty where it has neither."""
+    told = []
+    if mission["region_observed_share"] is not None:
+        told.append(f"{percent(mission['region_observed_share'])} of the region in view")
+    for what, share, gap in (("in view", "in_view", "out_of_view"), ("detected", "detected", "undetected")):
+        if mission[f"target_{share}_share"] is not None:
+            gap_s = mission[f"target_longest_{gap}_s"]
+            told.append(
+                f"target {what} {percent(mission[f'target_{share}_share'])} of the time, longest gap {gap_s:.1f} s"
+            )
+    return "; ".join(told)
+
+
+def transitions_table(result: dict[str, Any]) -> Table:
+    """What the gates switched, when and why, drones that do alike in one row; events among them."""
+    frame_s = result["frame_s"]
+    alike: dict[tuple[int, str, str], tuple[float, list[str]]] = {}
+    for t in result["transitions"]:
+        key = (int(t["t_s"] / frame_s + 1e-6), f"{t['from']} → {t['to']}", t["reason"])
+        alike.setdefault(key, (t["t_s"], []))[1].append(f"{t['drone']}→{','.join(map(str, t['peers']))}")
+    rows = [(t_s, "  ".join(sorted(who)), what, why) for (_, what, why), (t_s, who) in alike.items()]
+    rows += [
+        (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), f"[yellow]{e['kind']}[/yellow]", e["text"])
+        for e in result["events"]
+    ]
+    rows.sort(key=lambda row: row[0])
+    more = len(rows) - MAX_TRANSITIONS
+    table = Table(title="decisions and events", caption=f"and {more} more in outcome.json" if more > 0 else None)
+    for column in ("t (s)", "who", "what", "why"):
+        table.add_column(column, justify="right" if column == "t (s)" else "left")
+    for t_s, who, what, why in rows[:MAX_TRANSITIONS]:
+        table.add_row(f"{t_s:.2f}", who, what, escape(why))  # a policy's own words, in which brackets are brackets
+    return table
