@@ -146,18 +146,21 @@ class Comparison:
     sorties: tuple[Compared, ...]
     """One a policy and seed; seed by seed, policies in the order in which they were named."""
     gains: tuple[Gain, ...]
-    """AP@0.5 of every policy but the first, minus the first's, with a paired 95 % interval. `Gain.over` says what
-    the interval covers. Empty where `perception.detector` is none: nothing is scored then, while bytes, energy and
+    """AP@0.5 of every policy but the first, minus the first's, with a paired 95 % interval. Several seeds give the mean
+    of the sorties' own differences, and the interval covers sorties: `Gain.over` says so. Empty where `perception.detector` is none: nothing is scored then, while bytes, energy and
     delays in `table` are compared all the same."""
 
     @cached_property
     def table(self) -> pa.Table:
-        """A row a sortie: `policy`, `seed`, then every metric of the outcome by its dotted name."""
+        """A row a sortie: `policy`, `seed`, `town_seed` (its `perception.scene.seed`), then every metric of the outcome by its dotted name."""
         import pyarrow as pa
 
         from sortie._run import numbers
 
-        rows = [{"policy": s.policy, "seed": s.outcome["seed"], **dict(numbers(s.outcome))} for s in self.sorties]
+        rows = [
+            {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **dict(numbers(s.outcome))}
+            for s in self.sorties
+        ]
         names = list(dict.fromkeys(name for row in rows for name in row))
         return pa.table({name: [row.get(name) for row in rows] for name in names})
 
@@ -167,23 +170,22 @@ class Comparison:
         A notebook shows it, `rich` prints it, and `str` gives plain text.
         """
         from sortie.sim.results.summary import Summary
+        from sortie.sim.studies.compare import Flown
         from sortie.sim.studies.comparison_text import comparison_table, explanations
 
-        return Summary(comparison_table(self.sorties), *explanations(self.sorties))
+        flown = Flown(self.sorties, self.gains)
+        return Summary(comparison_table(flown), *explanations(flown))
 
     def save_recording(self, path: str | Path) -> Path:
-        """Save the policies' sorties side by side as one Rerun recording.
+        """Save the policies' sorties of the first seed side by side as one Rerun recording.
 
         Raises:
-            RunError: the file cannot be written, or several seeds were flown, of which no records are kept.
+            RunError: the file cannot be written.
         """
         from sortie.sim.playback.recording import save_comparison
 
         place = as_path("path", path)
-        records = [(s.policy, s.record) for s in self.sorties if s.record is not None]
-        if not records:
-            raise RunError(f"{place}: a recording shows one flight, compare with one seed for it")
-        save_comparison(records, place)
+        save_comparison([(s.policy, s.record) for s in self.sorties if s.record is not None], place)
         return place
 
 
@@ -192,7 +194,7 @@ def compare(
     policies: Iterable[PolicyLike],
     overrides: Overrides = (),
     *,
-    seeds: Iterable[int] | None = None,
+    seeds: int | Iterable[int] | None = None,
     own_fusion: bool = False,
     progress: Callable[[str, int, float], None] | None = None,
 ) -> Comparison:
@@ -201,8 +203,10 @@ def compare(
     Args:
         scenario, overrides: as `sortie.load` takes them.
         policies: one or more; gains are over the first.
-        seeds: None flies the scenario's own seed alone. The interval then covers the instants of that one flight. With
-            several seeds it covers flights.
+        seeds: the seeds to fly, or how many from the scenario's own on. None flies eight where the detector is the
+            surrogate, whose sorties take seconds, and one for any other. Each of several has a town and random draws of
+            its own, the same for all policies, and intervals cover sorties. One flies in the scenario's own town, as
+            `sortie.fly` does, and intervals cover the instants of that one flight alone.
         own_fusion: prior methods fly with the fusion that they were published with, in place of `perception.fusion`.
         progress: called with the policy's label, the seed and the simulated time (s).
 
@@ -211,10 +215,11 @@ def compare(
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "surrogate"}
-        >>> sortie.compare("track_target", ["worked", "silence"], short).table["policy"].to_pylist()
-        ['worked', 'silence']
+        >>> compared = sortie.compare("track_target", ["worked", "silence"], short, seeds=2)
+        >>> compared.table.select(["policy", "seed", "town_seed"]).to_pylist()[2:]
+        [{'policy': 'worked', 'seed': 2, 'town_seed': 8}, {'policy': 'silence', 'seed': 2, 'town_seed': 8}]
     """
-    from sortie.sim.studies.compare import Contender
+    from sortie.sim.studies.compare import Contender, chosen_seeds
     from sortie.sim.studies.compare import compare as compare_policies
 
     base = load(scenario, overrides)
@@ -227,10 +232,14 @@ def compare(
     if not flown or len(set(labels)) < len(labels):
         how = "; give functions of one name, such as lambdas, a __name__ of their own"
         raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
-    if seeds is not None and not isinstance(seeds, Iterable):
-        raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds: range({seeds!r})")
-    chosen = [base.seed] if seeds is None else list(seeds)
-    chosen = [_whole("seeds", seed) or 0 for seed in chosen]
+    if (
+        not isinstance(seeds, int | Iterable | None)
+        or isinstance(seeds, bool)
+        or (isinstance(seeds, int) and seeds < 1)
+    ):
+        raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds or how many, 1 or more")
+    listed = seeds if isinstance(seeds, Iterable) else chosen_seeds(base, count=seeds)
+    chosen = [_whole("seeds", seed) or 0 for seed in listed]
     _ensure_callable("progress", progress)
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,6 +17,7 @@ from sortie.sim.cli.conditions import compare_conditions, refuse
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+from sortie.sim.studies.compare import Flown, chosen_seeds
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 
 
@@ -28,12 +30,22 @@ def compare(
         ),
     ],
     seed: SeedOption = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            help="Fly this many seeds, from --seed or the scenario's own on, each in a town of its own. Left out: 8 with "
+            "the surrogate and no --seed, else 1.",
+            min=1,
+        ),
+    ] = None,
     set_: SetOption = None,
     own_fusion: Annotated[
         bool, typer.Option("--own-fusion", help="Fly each prior method with the fusion that it was published with.")
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
-    recording: Annotated[Path | None, typer.Option(help="Save all sorties side by side as a Rerun recording.")] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="Save the first seed's sorties side by side as a Rerun recording.")
+    ] = None,
     readme: Annotated[
         Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")
     ] = None,
@@ -44,33 +56,45 @@ def compare(
     """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison."""
     conditions = load_conditions(scenario)
     if conditions is not None:
-        refuse({"seed": seed, "own-fusion": own_fusion or None, "recording": recording, "readme": readme})
-        chosen = list(POLICIES) if policies == "all" else _split_policies(policies)
-        return compare_conditions(conditions, chosen, set_ or [], out_file, by_torch=by_torch)
+        refuse(
+            {"seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "readme": readme}
+        )
+        named = list(POLICIES) if policies == "all" else _split_policies(policies)
+        return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     labels = _split_policies(policies)
-    lasts_s = {label: loaded(scenario, set_, label).duration_s for label in labels}
+    base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
+    chosen = chosen_seeds(base, seed, seeds)
     ensure_files(out_file, recording)
     ensure_between(readme, BEGIN, END)
     with bars() as bar:
-        each = {label: bar(label, duration_s) for label, duration_s in lasts_s.items()}
+        each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}
         compared = sortie.compare(
-            scenario, labels, set_ or [], seeds=None if seed is None else [seed], own_fusion=own_fusion,
-            progress=lambda label, _, t_s: each[label](t_s),
+            scenario, labels, set_ or [], seeds=chosen, own_fusion=own_fusion,
+            progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
         )  # fmt: skip
     out.print(compared.summary())
     if out_file is not None:
-        told = {r.policy: {**r.outcome, "gain_over_first": r.gain} for r in compared.sorties}
-        write_text(out_file, json.dumps(told, indent=2) + "\n")
+        write_text(out_file, json.dumps(_plain(compared), indent=2) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
     if readme is not None:
-        command = compare_command(scenario, policies, seed, set_ or [], own_fusion=own_fusion)
-        put_between(readme, comparison_markdown(compared.sorties, command), BEGIN, END)
+        command = compare_command(scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion)
+        section = comparison_markdown(Flown(compared.sorties, compared.gains), command)
+        put_between(readme, section, BEGIN, END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
         compared.save_recording(recording)
         out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
+
+
+def _plain(compared: sortie.Comparison) -> dict[str, Any]:
+    """What `--out` holds."""
+    sorties = [
+        {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, "gain_over_first": s.gain, "outcome": s.outcome}
+        for s in compared.sorties
+    ]
+    return {"gains": [asdict(gain) for gain in compared.gains], "sorties": sorties}
 
 
 def _split_policies(text: str) -> list[str]:

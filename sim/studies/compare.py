@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sortie.perception.metrics.ap import Matched
+from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.perception.metrics.bootstrap import compare as bootstrap
 from sortie.policies.contract import Policy
 from sortie.policies.registry import own_fusion, resolve
+from sortie.scenarios.intervals import SHARE, Estimate, mean_interval
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import matched, outcome
 from sortie.sim.results.record import SortieRecord
 
+SEEDS = 8
+"""Sorties a policy where nothing else is asked and the detector is quick."""
+TOWNS = 2**63
 AREAS = {"full_scene": False, "mission": True}
 """Where AP is scored: its name in the outcome, and whether it is the mission's disc."""
 
@@ -43,17 +47,24 @@ class Compared:
     """One policy's sortie under one seed, and its accuracy against the first policy's."""
 
     policy: str
+    seed: int
+    town_seed: int
+    """`perception.scene.seed`: the town that it flew in."""
     outcome: dict[str, Any]
-    gain: dict[str, tuple[float, float, float] | None]
-    """AP@0.5 minus the first policy's and its 95 % interval over the sortie's instants, `full_scene` and `mission`;
-    None where it is not defined."""
+    gain: dict[str, float | None]
+    """AP@0.5 minus the first policy's in this sortie, `full_scene` and `mission`, over the fusions that both policies
+    made; None where it is not defined."""
     record: SortieRecord | None
-    """None where several seeds were flown: their records would fill the memory."""
+    """None but for the first seed: the records of all of them would fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """One policy's AP@0.5 minus the first policy's, over all seeds."""
+    """One policy's AP@0.5 minus the first policy's.
+
+    With several seeds it is the mean over sorties of each sortie's own difference, not the difference of two APs that
+    pool the fusions of all sorties: a sortie with many cars counts as much as one with few.
+    """
 
     policy: str
     metric: str
@@ -61,31 +72,36 @@ class Gain:
     gain: float
     low: float
     high: float
-    """The 95 % interval, by a paired bootstrap over what `over` names."""
+    """The paired 95 % interval over what `over` names."""
     over: str
-    """`instants of one sortie` or `sorties`: what was resampled, and so what the interval covers."""
+    """What the interval covers: `sorties` (Student's over the sorties' differences, which have towns and draws of their
+    own), or `instants of one sortie` (a bootstrap within this town and this flight)."""
+    count: int
+    """How many of these: sorties or instants in which both policies have an AP."""
 
 
-class PairedFusions:
-    """Fusions that the first policy and another one both scored, and what the bootstrap must not part."""
+class Flown(NamedTuple):
+    """All sorties of a comparison, and what they come to."""
 
-    def __init__(self) -> None:
-        self._first: list[Matched] = []
-        self._other: list[Matched] = []
-        self._groups: list[int] = []
+    sorties: tuple[Compared, ...]
+    """Seed by seed, policies in the order in which they were named."""
+    gains: tuple[Gain, ...]
+    """Of every policy but the first, where there is something to find."""
 
-    def add(self, first: Sequence[Matched], other: Sequence[Matched], groups: Sequence[int]) -> None:
-        """Add what the two sorties of one seed both scored."""
-        self._first += first
-        self._other += other
-        self._groups += groups
 
-    def gain(self) -> tuple[float, float, float] | None:
-        """AP of the other minus the first's with its interval; None where there was nothing to find."""
-        if not all(any(m.truths for m in arm) for arm in (self._first, self._other)):
-            return None
-        gain = bootstrap(self._first, self._other, self._groups)
-        return gain.delta, gain.low, gain.high
+def chosen_seeds(scenario: Scenario, first: int | None = None, count: int | None = None) -> range:
+    """The seeds that a comparison flies when they are not listed.
+
+    Args:
+        scenario: what is flown.
+        first: None is the scenario's own seed.
+        count: None is eight for the surrogate's sorties, which take seconds, where no first seed is named either. It is
+            one for all others.
+    """
+    surrogate = scenario.perception.detector == "surrogate" and first is None
+    count = (SEEDS if surrogate else 1) if count is None else count
+    begin = scenario.seed if first is None else first
+    return range(begin, begin + count)
 
 
 def compare(
@@ -93,14 +109,13 @@ def compare(
     seeds: Sequence[int],
     *,
     progress: Callable[[str, int, float], None] | None = None,
-) -> tuple[tuple[Compared, ...], tuple[Gain, ...]]:
+) -> Flown:
     """Fly a scenario under several policies on the same seeds.
 
     Args:
+        seeds: one flies in the scenario's own town, as `sortie fly` does. Of several, each has a town of its own as well as
+            random draws of its own: as far from the scenario's town seed as it is from the scenario's seed.
         progress: called with the label, the seed and the simulated time.
-
-    Returns:
-        One `Compared` a seed and policy, seed by seed; and the gains of every policy but the first over all seeds.
 
     Raises:
         PolicyError: an unknown policy or parameter, before anything is flown.
@@ -109,26 +124,51 @@ def compare(
         if contender.function is None:
             resolve(contender.scenario.policy.name, contender.scenario.policy.params)
     flown: list[Compared] = []
-    several = len(seeds) > 1
-    pairs = {(c.label, name): PairedFusions() for c in contenders[1:] for name in AREAS}
-    for k, seed in enumerate(seeds):
+    within: list[Gain] = []
+    for seed in seeds:
         first: SortieRecord | None = None
-        for label, scenario, function in contenders:
+        for label, own_town, function in contenders:
+            scenario = own_town if len(seeds) == 1 else in_town_of(own_town, seed)
             watch = None if progress is None else functools.partial(progress, label, seed)
             record = run_sortie(scenario, function, seed, progress=watch)
-            gains: dict[str, tuple[float, float, float] | None] = dict.fromkeys(AREAS)
-            if first is not None:
-                for name, mission in AREAS.items():
-                    theirs, ours, instants = pair_up([first], [record], mission=mission)
-                    here = PairedFusions()
-                    here.add(theirs, ours, instants)
-                    gains[name] = here.gain()
-                    pairs[label, name].add(theirs, ours, [k] * len(ours) if several else instants)
+            gains: dict[str, float | None] = dict.fromkeys(AREAS)
+            for name, mission in AREAS.items():
+                if first is None:
+                    continue
+                pairs = pair_up([first], [record], mission=mission)
+                if not all(any(m.truths for m in arm) for arm in pairs[:2]):
+                    continue
+                gains[name] = average_precision(pairs[1]) - average_precision(pairs[0])
+                if len(seeds) == 1:
+                    d = bootstrap(*pairs)
+                    count = len(set(pairs[2]))
+                    within.append(Gain(label, f"ap50.{name}", d.delta, d.low, d.high, "instants of one sortie", count))
             first = record if first is None else first
-            flown.append(Compared(label, outcome(record), gains, None if several else record))
-    over = "sorties" if several else "instants of one sortie"
-    over_all = {key: pair.gain() for key, pair in pairs.items()}
-    return tuple(flown), tuple(Gain(label, f"ap50.{name}", *g, over) for (label, name), g in over_all.items() if g)
+            town_seed = scenario.perception.scene.seed
+            kept = record if seed == seeds[0] else None
+            flown.append(Compared(label, seed, town_seed, outcome(record), gains, kept))
+    return Flown(tuple(flown), tuple(within if len(seeds) == 1 else _over_sorties(flown)))
+
+
+def _over_sorties(flown: Sequence[Compared]) -> Iterator[Gain]:
+    for label in dict.fromkeys(f.policy for f in flown[1:] if f.policy != flown[0].policy):
+        for name in AREAS:
+            gains = [gain for f in flown if f.policy == label and (gain := f.gain[name]) is not None]
+            if gains:
+                e = over_sorties(gains)
+                yield Gain(label, f"ap50.{name}", e.mean, e.low, e.high, "sorties", e.count)
+
+
+def over_sorties(gains: Sequence[float]) -> Estimate:
+    """The gain that a comparison of several seeds prints: the mean of the sorties' own, and its 95 % interval."""
+    return mean_interval(gains, SHARE.of_differences())
+
+
+def in_town_of(scenario: Scenario, seed: int) -> Scenario:
+    """The scenario in the town that a seed has when several are compared; its own seed has its own town."""
+    scene = scenario.perception.scene
+    moved = scene.model_copy(update={"seed": (scene.seed + seed - scenario.seed) % TOWNS})
+    return scenario.model_copy(update={"perception": scenario.perception.model_copy(update={"scene": moved})})
 
 
 def pair_up(

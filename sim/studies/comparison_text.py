@@ -4,102 +4,155 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
-from sortie.sim.studies.compare import Compared
+from sortie.sim.studies.compare import Compared, Flown, Gain
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
 
-def comparison_table(rows: Sequence[Compared]) -> Table:
+def comparison_table(flown: Flown) -> Table:
     """Policies side by side, a column each; gains are over the first, in AP points with paired 95 % intervals."""
-    first = rows[0].outcome
-    table = Table(title=f"{first['scenario']} · seed {first['seed']} · gains over {rows[0].policy}, AP points, 95 %")
+    first = flown.sorties[0]
+    table = Table(title=f"{first.outcome['scenario']} · {_seeds(flown)}", caption=_what_gains_are(flown) or None)
     table.add_column("", style="bold")
-    for row in rows:
-        table.add_column(row.policy, justify="right")
-    for name, cells in _side_by_side(rows).items():
+    for policy in _by_policy(flown):
+        table.add_column(policy, justify="right")
+    for name, cells in _side_by_side(flown).items():
         table.add_row(name, *cells)
     return table
 
 
-def comparison_markdown(rows: Sequence[Compared], command: str) -> str:
-    """The same for a README, between its markers, with why the figures differ."""
-    first = rows[0].outcome
-    head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, seed {first['seed']}"
+def comparison_markdown(flown: Flown, command: str) -> str:
+    """The same for a Markdown file, between its markers, with why the figures differ."""
+    first = flown.sorties[0].outcome
+    head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, {_seeds(flown)}"
     if first["ap50"]["scored_fusions"]:
-        rate_hz = first["ap50"]["sample_rate_hz"]
-        head += f", accuracy scored at {rate_hz:g} Hz, gains over {rows[0].policy} in AP points, paired, 95 %"
-    cells = ((name.strip(), *values) for name, values in _side_by_side(rows).items())
-    lines = [f"{head}.", "", *table(("", *(r.policy for r in rows)), cells)]
-    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(rows)]
-    return "\n".join([BEGIN, "", *lines, "", *(f"- {line}" for line in why), "", END])
+        head += f", accuracy scored at {first['ap50']['sample_rate_hz']:g} Hz by `{first['ap50']['detector']}`"
+    what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
+    cells = ((name.strip(), *values) for name, values in _side_by_side(flown).items())
+    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(flown)]
+    lines = [BEGIN, "", what, "", *table(("", *_by_policy(flown)), cells), "", *(f"- {line}" for line in why), "", END]
+    return "\n".join(lines)
 
 
 def compare_command(
-    scenario: str, policies: str, seed: int | None, overrides: Sequence[str], *, own_fusion: bool
+    scenario: str, policies: str, seed: int | None, seeds: int | None, overrides: Sequence[str], *, own_fusion: bool
 ) -> str:
     """The command that gives the same comparison again."""
     said = ["sortie", "compare", scenario, "--policies", policies]
     said += [] if seed is None else ["--seed", str(seed)]
+    said += [] if seeds is None else ["--seeds", str(seeds)]
     said += [x for override in overrides for x in ("--set", override)]
     return shlex.join(said + ["--own-fusion"] * own_fusion)
 
 
-def _side_by_side(rows: Sequence[Compared]) -> dict[str, list[str]]:
-    """What is compared, a row each: its name and a cell a policy."""
-    figures: dict[str, Callable[[Compared], str]] = {
-        "AP@0.5 full scene": lambda r: number(r.outcome["ap50"]["full_scene"]),
-        "  gain": lambda r: _gain(r.gain["full_scene"]),
-        "AP@0.5 mission": lambda r: number(r.outcome["ap50"]["mission"]),
-        "  gain ": lambda r: _gain(r.gain["mission"]),
-        "data sent": lambda r: size(r.outcome["bytes"]["data_sent"]),
-        "data delivered": lambda r: size(r.outcome["bytes"]["data_delivered"]),
-        "  handshakes": lambda r: size(r.outcome["bytes"]["handshakes_sent"]),
-        "deadlines missed": lambda r: percent(r.outcome["deadline_miss_rate"]),
-        "medium busy": lambda r: percent(r.outcome["medium_busy_fraction"]),
-        "context sent": lambda r: size(r.outcome["bytes"]["context_sent"]),
-        "data age, median": lambda r: number(r.outcome["data_age_s"]["p50"], ".2f", "s"),
-        "energy": lambda r: f"{r.outcome['energy_j']['total'] / 1e3:.2f} kJ",
-        "  radio": lambda r: f"{r.outcome['energy_j']['radio'] / 1e3:.2f} kJ",
-        "  compute": lambda r: f"{r.outcome['energy_j']['compute'] / 1e3:.2f} kJ",
-        "charge left, least": lambda r: percent(min(r.outcome["battery"].values(), default=None)),
-    }
-    if any(r.outcome["mission"]["flown_share"] < 1.0 for r in rows):
-        figures = {"flown": lambda r: percent(r.outcome["mission"]["flown_share"])} | _with_blind(figures)
-    return {name: [figure(r) for r in rows] for name, figure in figures.items()}
-
-
-def _with_blind(figures: dict[str, Callable[[Compared], str]]) -> dict[str, Callable[[Compared], str]]:
-    """The rows, with the AP that counts grounded drones as blind below each AP."""
-    blind = {
-        "AP@0.5 full scene": ("  grounded drones blind", "full_scene"),
-        "AP@0.5 mission": ("  grounded drones blind ", "mission"),
-    }
-    out: dict[str, Callable[[Compared], str]] = {}
-    for name, figure in figures.items():
-        out[name] = figure
-        if name in blind:
-            row, area = blind[name]
-            out[row] = lambda r, area=area: number(r.outcome["ap50"]["grounded_blind"][area])  # type: ignore[misc]
-    return out
-
-
-def _gain(gain: tuple[float, float, float] | None) -> str:
-    return "" if gain is None else points(gain, "+.1f")
-
-
-def explanations(rows: Sequence[Compared]) -> Iterator[str]:
-    """Why the figures differ, a line a policy, from the record."""
-    for r in rows:
-        fates = r.outcome["payload_fates"]
+def explanations(flown: Flown) -> Iterator[str]:
+    """Why the figures differ, a line a policy, from the records of all its sorties."""
+    for policy, sorties in _by_policy(flown).items():
+        fates: dict[str, int] = {}
+        for s in sorties:
+            for fate, n in s.outcome["payload_fates"].items():
+                fates[fate] = fates.get(fate, 0) + n
         total = sum(fates.values())
         if not total:
-            yield f"[bold]{r.policy}[/bold]: sent nothing; every drone saw with its own eyes only"
+            yield f"[bold]{policy}[/bold]: sent nothing; every drone saw with its own eyes only"
             continue
         parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
-        age = r.outcome["data_age_s"]["p50"]
+        age = _mean(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
-        yield f"[bold]{r.policy}[/bold]: {total} payloads, {parts}; {fused}"
+        yield f"[bold]{policy}[/bold]: {total} payloads, {parts}; {fused}"
+
+
+def _by_policy(flown: Flown) -> dict[str, list[Compared]]:
+    found: dict[str, list[Compared]] = {}
+    for s in flown.sorties:
+        found.setdefault(s.policy, []).append(s)
+    return found
+
+
+def _seeds(flown: Flown) -> str:
+    """What was flown, and so how far the figures reach."""
+    seeds = list(dict.fromkeys(s.seed for s in flown.sorties))
+    if len(seeds) == 1:
+        return f"seed {seeds[0]}, in this town, this flight"
+    listed = (
+        f"{seeds[0]} to {seeds[-1]}" if seeds == list(range(seeds[0], seeds[-1] + 1)) else ", ".join(map(str, seeds))
+    )
+    return f"means of {len(seeds)} sorties, seeds {listed}, each with a town and random draws of its own"
+
+
+def _what_gains_are(flown: Flown) -> str:
+    if not flown.gains:
+        return ""
+    covers = {
+        "sorties": "the mean over sorties of each sortie's difference in AP, with Student's 95 % interval over sorties",
+        "instants of one sortie": "with a 95 % interval over the instants of this one flight, which says nothing of others",
+    }[flown.gains[0].over]
+    return f"Gains are in AP points over {flown.sorties[0].policy}, paired: {covers}."
+
+
+def _side_by_side(flown: Flown) -> dict[str, list[str]]:
+    """What is compared, a row each: its name and a cell a policy. Figures are means over the policy's sorties."""
+    gains = {(g.policy, g.metric): g for g in flown.gains}
+    sorties = {s.seed for s in flown.sorties}
+
+    def mean(*path: str, text: Callable[[Any], str]) -> list[str]:
+        return [text(_mean(_at(s.outcome, path) for s in of)) for of in _by_policy(flown).values()]
+
+    def gain(metric: str) -> list[str]:
+        return [_gain(gains.get((policy, metric)), len(sorties)) for policy in _by_policy(flown)]
+
+    grounded = any(s.outcome["mission"]["flown_share"] < 1.0 for s in flown.sorties)
+    blind = {
+        area: mean("ap50", "grounded_blind", area, text=number) if grounded else []
+        for area in ("full_scene", "mission")
+    }
+    rows = {
+        "flown": mean("mission", "flown_share", text=percent) if grounded else [],
+        "AP@0.5 full scene": mean("ap50", "full_scene", text=number),
+        "  grounded drones blind": blind["full_scene"],
+        "  gain": gain("ap50.full_scene"),
+        "AP@0.5 mission": mean("ap50", "mission", text=number),
+        "  grounded drones blind ": blind["mission"],
+        "  gain ": gain("ap50.mission"),
+        "data sent": mean("bytes", "data_sent", text=size),
+        "data delivered": mean("bytes", "data_delivered", text=size),
+        "  handshakes": mean("bytes", "handshakes_sent", text=size),
+        "deadlines missed": mean("deadline_miss_rate", text=percent),
+        "medium busy": mean("medium_busy_fraction", text=percent),
+        "context sent": mean("bytes", "context_sent", text=size),
+        "data age, median": mean("data_age_s", "p50", text=lambda v: number(v, ".2f", "s")),
+        "energy": mean("energy_j", "total", text=_kilojoules),
+        "  radio": mean("energy_j", "radio", text=_kilojoules),
+        "  compute": mean("energy_j", "compute", text=_kilojoules),
+    }
+    least = [[min(s.outcome["battery"].values(), default=None) for s in of] for of in _by_policy(flown).values()]
+    rows["charge left, least"] = [percent(_mean(values)) for values in least]
+    return {name: cells for name, cells in rows.items() if cells}
+
+
+def _at(result: Any, path: Sequence[str]) -> float | None:
+    for part in path:
+        result = result[part]
+    return None if result is None else float(result)
+
+
+def _mean(values: Iterator[float | None] | Sequence[float | None]) -> float | None:
+    kept = [v for v in values if v is not None]
+    return float(np.mean(kept)) if kept else None
+
+
+def _kilojoules(value: float) -> str:
+    return f"{value / 1e3:.2f} kJ"
+
+
+def _gain(gain: Gain | None, sorties: int) -> str:
+    if gain is None:
+        return ""
+    some = f" ({gain.count} of {sorties})" if gain.over == "sorties" and gain.count < sorties else ""
+    return points((gain.gain, gain.low, gain.high), "+.1f") + some

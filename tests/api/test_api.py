@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import doctest
 import gc
 import json
@@ -15,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from places import ROOT
+from scipy import stats
 from threadpoolctl import threadpool_info
 from typer.testing import CliRunner
 
@@ -23,6 +25,7 @@ from sortie import _api, _run
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
+from sortie.sim.studies.compare import chosen_seeds
 
 SHORT = {"duration_s": 2, "perception.detector": "none", "expect": [], "expect_decisions": []}
 SURROGATE = SHORT | {"perception.detector": "surrogate"}
@@ -194,17 +197,72 @@ def test_a_run_is_saved_and_read_back(tmp_path: Path) -> None:
 
 
 def test_a_comparison_has_a_row_a_sortie_and_says_what_its_intervals_cover() -> None:
-    one = sortie.compare("track_target", ["worked", quiet], SURROGATE)
+    one = sortie.compare("track_target", ["worked", quiet], SURROGATE, seeds=[1])
     assert isinstance(one.table, pa.Table)
     assert one.table["policy"].to_pylist() == ["worked", "quiet"]
-    assert {gain.over for gain in one.gains} == {"instants of one sortie"}
+    assert [(gain.over, gain.count) for gain in one.gains] == [("instants of one sortie", 4)]
+    assert "seed 1, in this town, this flight" in _line(one)
     three = sortie.compare("track_target", ["worked", quiet], SURROGATE, seeds=range(3))
-    assert three.table.select(["policy", "seed"]).to_pylist() == [
-        {"policy": policy, "seed": seed} for seed in range(3) for policy in ("worked", "quiet")
+    assert three.table.select(["policy", "seed", "town_seed"]).to_pylist() == [
+        {"policy": policy, "seed": seed, "town_seed": 6 + seed} for seed in range(3) for policy in ("worked", "quiet")
     ]
     (gain,) = three.gains
-    assert (gain.policy, gain.metric, gain.over) == ("quiet", "ap50.full_scene", "sorties")
-    assert gain.low <= gain.gain <= gain.high
+    assert (gain.policy, gain.metric, gain.over, gain.count) == ("quiet", "ap50.full_scene", "sorties", 3)
+    assert "means of 3 sorties, seeds 0 to 2, each with a town and random draws of its own" in _line(three)
+
+
+def _line(compared: sortie.Comparison) -> str:
+    return " ".join(str(compared.summary()).split())
+
+
+def test_a_gain_over_sorties_is_the_mean_of_the_sorties_own_with_students_interval() -> None:
+    compared = sortie.compare("track_target", ["worked", "silence"], SURROGATE, seeds=4)
+    own = [s.gain["full_scene"] for s in compared.sorties if s.policy == "silence"]
+    ap = compared.table["ap50.full_scene"].to_pylist()
+    assert own == pytest.approx([b - a for a, b in zip(ap[::2], ap[1::2], strict=True)])
+    (gain,) = compared.gains
+    assert gain.gain == pytest.approx(np.mean(own))
+    student = stats.t.interval(0.95, 3, np.mean(own), stats.sem(own))
+    assert (gain.low, gain.high) == pytest.approx(student, abs=1e-4)  # the ends of AP, -1 and 1, are far away
+
+
+def test_each_of_several_seeds_has_a_town_of_its_own_and_flies_as_when_it_is_flown_alone() -> None:
+    two = sortie.compare("track_target", ["silence"], SURROGATE, seeds=[1, 5])
+    own, other = (s.outcome["fingerprint"] for s in two.sorties)
+    assert own == sortie.fly("track_target", SURROGATE, policy="silence", seed=1).fingerprint
+    moved = SURROGATE | {"perception.scene.seed": 11}
+    assert other == sortie.fly("track_target", moved, policy="silence", seed=5).fingerprint
+    (alone,) = sortie.compare("track_target", ["silence"], SURROGATE, seeds=[5]).sorties
+    assert alone.outcome["fingerprint"] == sortie.fly("track_target", SURROGATE, policy="silence", seed=5).fingerprint
+
+
+@pytest.mark.parametrize(
+    ("detector", "seed", "seeds", "flown"),
+    [
+        ("surrogate", None, None, range(1, 9)),
+        ("torch", None, None, range(1, 2)),
+        ("none", None, None, range(1, 2)),
+        ("surrogate", 4, None, range(4, 5)),
+        ("torch", None, 3, range(1, 4)),
+        ("torch", 4, 3, range(4, 7)),
+    ],
+)
+def test_how_many_seeds_are_flown(detector: str, seed: int | None, seeds: int | None, flown: range) -> None:
+    assert chosen_seeds(sortie.load("track_target", {"perception.detector": detector}), seed, seeds) == flown
+
+
+def test_the_command_line_flies_the_seeds_of_the_api(tmp_path: Path) -> None:
+    settings = [arg for key, value in SURROGATE.items() for arg in ("--set", f"{key}={value}")]
+    command = ["compare", "track_target", "--policies", "worked,silence", *settings, "--out", str(tmp_path / "c.json")]
+    for more, seeds in ((["--seed", "3", "--seeds", "2"], [3, 4]), ([], None)):
+        done = CliRunner().invoke(app, [*command, *more])
+        assert done.exit_code == 0, done.output
+        kept = json.loads((tmp_path / "c.json").read_text())
+        ours = sortie.compare("track_target", ["worked", "silence"], SURROGATE, seeds=seeds)
+        assert [s["outcome"]["fingerprint"] for s in kept["sorties"]] == [
+            s.outcome["fingerprint"] for s in ours.sorties
+        ]
+        assert kept["gains"] == [dataclasses.asdict(gain) for gain in ours.gains]
 
 
 CAMPAIGN = """
@@ -299,7 +357,8 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "an observer that is none": (lambda: sortie.fly("track_target", SHORT, observer=print), sortie.ScenarioError, "must have the methods begin and second"),  # type: ignore[arg-type]
     "a run saved nowhere": (lambda: sortie.fly("track_target", SHORT).save(None), sortie.RunError, "path: None, must be a path"),  # type: ignore[arg-type]
     "two policies of one name": (lambda: sortie.compare("track_target", [lambda view: [], lambda view: []]), sortie.PolicyError, "give functions of one name, such as lambdas, a __name__ of their own"),
-    "a number of seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=3), sortie.ScenarioError, "seeds: 3, must be a list of seeds: range(3)"),  # type: ignore[arg-type]
+    "no seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=0), sortie.ScenarioError, "seeds: 0, must be a list of seeds or how many, 1 or more"),
+    "seeds and a half": (lambda: sortie.compare("track_target", ["worked"], seeds=1.5), sortie.ScenarioError, "seeds: 1.5, must be a list of seeds or how many"),  # type: ignore[arg-type]
     "no run": (lambda: sortie.open_run("nowhere"), sortie.RunError, "nowhere: no run there (outcome.json is missing)"),
     "a number for a path": (lambda: sortie.open_run(7), sortie.RunError, "path: 7, must be a path"),  # type: ignore[arg-type]
     "unknown campaign": (lambda: sortie.campaign("nope"), sortie.ScenarioError, "nope: no such file, the library has link_battery"),

@@ -357,9 +357,11 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
     assert "old" not in readme
     assert "sent nothing; every drone saw with its own eyes only" in done.stdout
     kept = json.loads((tmp_path / "c.json").read_text())
-    assert list(kept) == ["worked", "all-4(received_budget=0.1)", "silence"]
-    assert kept["silence"]["bytes"]["data_sent"] == 0
-    assert kept["all-4(received_budget=0.1)"]["bytes"]["data_sent"] > 0
+    assert kept["gains"] == []  # no detector flew
+    sent = {sortie["policy"]: sortie["outcome"]["bytes"]["data_sent"] for sortie in kept["sorties"]}
+    assert list(sent) == ["worked", "all-4(received_budget=0.1)", "silence"]
+    assert sent["silence"] == 0
+    assert sent["all-4(received_budget=0.1)"] > 0
 
 
 @pytest.mark.parametrize(

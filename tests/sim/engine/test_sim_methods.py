@@ -37,12 +37,13 @@ def test_where_there_is_nothing_to_find_there_is_no_gain() -> None:
         "mission.phases=[{at_s: 0, phase: search}]",
     ]
     bare += [f"perception.scene.{name}=0" for name in ("parked_density", "moving_cars_per_km")]
-    rows, _ = compare(
+    rows, gains = compare(
         [Contender(name, example(f"policy.name={name}", "policy.params={}", *bare)) for name in ("silence", "all-4")],
         [1],
     )
     assert [r.outcome["ap50"]["scored_fusions"] for r in rows] == [20, 20]
     assert [r.gain for r in rows] == [{"full_scene": None, "mission": None}] * 2
+    assert gains == ()
 
 
 def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
@@ -86,7 +87,7 @@ def test_own_fusion_flies_the_methods_own_network(tmp_path: Path) -> None:
         command = ["compare", "track_target", "--policies", "v2vnet-style(rho=0.02),disconet-style(rho=0.02)"]
         done = CliRunner().invoke(app, [*command, *flags, "--out", str(path), *more])
         assert done.exit_code == 0, done.output
-        return {name: o["ap50"]["full_scene"] for name, o in json.loads(path.read_text()).items()}
+        return {s["policy"]: s["outcome"]["ap50"]["full_scene"] for s in json.loads(path.read_text())["sorties"]}
 
     one, own = seen(), seen("--own-fusion")
     assert one["v2vnet-style(rho=0.02)"] == one["disconet-style(rho=0.02)"] == own["disconet-style(rho=0.02)"]
