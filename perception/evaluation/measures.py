@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing, Unsent
 from sortie.perception.evaluation.verdict import MeasuredValue
-from sortie.perception.metrics.bootstrap import interval, p_value
+from sortie.scenarios.intervals import p_value, percentile_interval
 
 Region = Literal["full", "mission"]
 Floats = NDArray[np.float64]
@@ -333,4 +333,4 @@ def _interval(value: float, draws: Floats, note: str = "", *, test: bool = True)
     if not np.isfinite(draws).any():
         return MeasuredValue(value, note=note)
     p = p_value(draws) if test else None
-    return MeasuredValue(value, *interval(draws), *interval(draws, 0.90), p, note)
+    return MeasuredValue(value, *percentile_interval(draws), *percentile_interval(draws, 0.90), p, note)

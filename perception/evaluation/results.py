@@ -8,7 +8,7 @@ from typing import Literal
 from sortie.perception.evaluation.condition import CellsBy, Unsent
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
 from sortie.perception.evaluation.scores import Bootstrap, By
-from sortie.perception.metrics.bootstrap import DRAWS
+from sortie.scenarios.intervals import DRAWS
 
 TAU = 0.1
 """Score threshold: UAV3D's head drops boxes below it, and so does a scenario unless it says otherwise."""

@@ -18,7 +18,7 @@ from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, Kind, c
 from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.measures import ApOf, Elsewhere, Region, Scores
 from sortie.perception.evaluation.verdict import ClaimVerdict, MeasuredValue
-from sortie.perception.metrics.bootstrap import benjamini_hochberg
+from sortie.scenarios.intervals import benjamini_hochberg
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
 """How cells that were not sent count, and the heading of that column."""

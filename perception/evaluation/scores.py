@@ -11,7 +11,8 @@ from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
 from sortie.perception.evaluation.matched import Evaluation
 from sortie.perception.evaluation.matched import Region as Evaluated
 from sortie.perception.evaluation.measures import Floats, Region, under
-from sortie.perception.metrics.bootstrap import DRAWS, Ranked, rank, resamples
+from sortie.perception.metrics.bootstrap import Ranked, rank
+from sortie.scenarios.intervals import DRAWS, resamples
 from sortie.scenarios.streams import stream
 
 By = Literal["frame", "scene"]

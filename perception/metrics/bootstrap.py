@@ -1,4 +1,4 @@
-"""Uncertainty of an AP: a paired percentile bootstrap, its p-values, and Benjamini and Hochberg's correction. Free of torch.
+"""AP of resampled frames, and the paired difference of two APs. `sortie.scenarios.intervals` reads the draws. Free of torch.
 
 One set of resamples serves a whole table: the same frames are drawn for every condition, so that every difference is
 paired, and any arithmetic of APs has its interval by doing it to every draw.
@@ -10,15 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sortie.perception.metrics.ap import Matched, area, average_precision
-from sortie.scenarios.streams import stream
+from sortie.scenarios.intervals import DRAWS, Floats, p_value, percentile_interval, resamples
 
-Floats = NDArray[np.float64]
 BINS = 2000
 """Points of the curve that a draw is worked out at."""
-DRAWS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,38 +83,6 @@ def rank(units: Sequence[Matched], groups: ArrayLike | None = None, bins: int = 
     return replace(plain, offset=average_precision(units) - float(plain.ap(np.ones((1, many)))[0]))
 
 
-def resamples(groups: int, draws: int = DRAWS, seed: int = 0) -> Floats:
-    """[draws, groups]: how often each group is drawn when as many as there are are drawn with replacement."""
-    if groups == 0:
-        return np.zeros((draws, 0))
-    rng = stream(seed, 0, (), "ap.bootstrap")
-    return rng.multinomial(groups, np.full(groups, 1.0 / groups), size=draws).astype(np.float64)
-
-
-def interval(draws: Floats, level: float = 0.95) -> tuple[float, float]:
-    """The percentile interval of bootstrapped values; NaN draws (nothing to find) are left out."""
-    tail = 50 * (1 - level)
-    low, high = np.nanpercentile(draws, [tail, 100 - tail])
-    return float(low), float(high)
-
-
-def p_value(draws: Floats) -> float:
-    """Two-sided p of "no difference": twice the smaller part of draws on either side of 0, the observed one counted in.
-
-    Never below 2 / (draws + 1) (Davison and Hinkley, *Bootstrap Methods and their Application*, 1997, 4.2).
-    """
-    draws = draws[~np.isnan(draws)]
-    tail = min(np.count_nonzero(draws <= 0), np.count_nonzero(draws >= 0))
-    return min(1.0, 2.0 * (tail + 1) / (len(draws) + 1))
-
-
-def benjamini_hochberg(p: Sequence[float]) -> list[float]:
-    """Adjusted p-values: below q, at most a part q of the differences called real are expected to be none."""
-    from scipy.stats import false_discovery_control  # here: it takes most of a second to import
-
-    return [float(q) for q in false_discovery_control(p)] if len(p) else []
-
-
 @dataclass(frozen=True, slots=True)
 class Difference:
     """AP of b minus AP of a, with its paired 95 % interval; `ap_a` and `ap_b` are on all frames."""
@@ -149,4 +115,4 @@ def compare(
     weights = resamples(len(ranked[0].truths), draws, seed)
     gain = ranked[1].ap(weights) - ranked[0].ap(weights)
     ap_a, ap_b = average_precision(a), average_precision(b)
-    return Difference(ap_a, ap_b, ap_b - ap_a, *interval(gain), p_value(gain))
+    return Difference(ap_a, ap_b, ap_b - ap_a, *percentile_interval(gain), p_value(gain))

@@ -16,8 +16,8 @@ from sortie.perception.evaluation.results import TAU
 from sortie.perception.evaluation.scores import Bootstrap
 from sortie.perception.evaluation.verdict import MeasuredValue as Measurement
 from sortie.perception.metrics.ap import Matched
-from sortie.perception.metrics.bootstrap import interval
 from sortie.perception.study.plan import MeasuredGrid, Tau, Variant
+from sortie.scenarios.intervals import percentile_interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def _figures(m: Measurement) -> Figures:
 
 def _between(a: Bootstrap, b: Bootstrap, condition: Sharing) -> Figures:
     """AP of one condition under a minus under b, 0 … 1, on the same resamples."""
-    low, high = interval(a.draws(condition, "full") - b.draws(condition, "full"))
+    low, high = percentile_interval(a.draws(condition, "full") - b.draws(condition, "full"))
     return a.ap(condition, "full") - b.ap(condition, "full"), low, high
 
 

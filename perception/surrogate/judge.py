@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from sortie.perception.metrics.ap import Matched, average_precision, match
-from sortie.perception.metrics.bootstrap import compare, interval, rank, resamples
+from sortie.perception.metrics.bootstrap import compare, rank
 from sortie.perception.surrogate.collect import DetectorRuns
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
 from sortie.perception.surrogate.plan import THRESHOLD, DetectorJob, scene_model
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.intervals import percentile_interval, resamples
 from sortie.scenarios.schema import Perception
 
 WITHIN = 0.02
@@ -124,7 +125,7 @@ def _level(
     torch, surrogate = rank(theirs, scenes), rank(ours, drawn)
     weights = resamples(len(torch.truths))
     a, b = average_precision(theirs), average_precision(ours)
-    low, high = interval(surrogate.ap(weights) - torch.ap(weights))
+    low, high = percentile_interval(surrogate.ap(weights) - torch.ap(weights))
     return LevelError(name, a, b, b - a, low, high, len(theirs))
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from sortie.scenarios.intervals import mean_interval
 from sortie.sim.campaign.engine import Engine
 from sortie.sim.campaign.plan import CampaignPlan
-from sortie.sim.campaign.statistics import RunningMean, t_interval
 from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task
+from sortie.sim.results.outcome_fields import possible
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ class Stop:
 
     def __init__(self, plan: CampaignPlan) -> None:
         self._plan, self._rule = plan, plan.campaign.stop_when
-        self._means = [RunningMean() for _ in plan.policies]
+        self._means: list[list[float]] = [[] for _ in plan.policies]
         self._open: list[list[float]] = [[] for _ in plan.policies]
         self._unit = 0
 
@@ -134,12 +135,15 @@ class Stop:
         if rows["run"][-1].as_py() + 1 == self._plan.runs:
             self._close()
         compared = self._means[1:] if rule.difference else self._means
-        return all(m.count >= rule.at_least and t_interval(m, rule.confidence) <= rule.half_width for m in compared)
+        if min(map(len, compared)) < rule.at_least:
+            return False
+        within = possible(rule.metric).of_differences() if rule.difference else possible(rule.metric)
+        return all(mean_interval(m, within, rule.confidence).half_width <= rule.half_width for m in compared)
 
     def _close(self) -> None:
         means = [float(np.mean(v)) if v else math.nan for v in self._open]
         for kept, value in zip(self._means, means, strict=True):
             value -= means[0] if self._rule is not None and self._rule.difference else 0.0
             if not math.isnan(value):
-                kept.add(value)
+                kept.append(value)
         self._open = [[] for _ in self._open]

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from sortie.scenarios.intervals import Estimate, Floats, mean_interval
 from sortie.sim.campaign.rows import CampaignRows, is_accuracy
-from sortie.sim.campaign.statistics import estimate
+from sortie.sim.results.outcome_fields import possible
 
 MAX_METRICS, MAX_FIELDS = 8, 6
 APART = 0.012
@@ -65,11 +66,14 @@ def draw_varied(rows: CampaignRows, path: Path) -> bool:
             apart = APART * (max(places) - min(places) or 1.0)
             for p, label in enumerate(rows.plan.policies):
                 aside = apart * (p - (len(rows.plan.policies) - 1) / 2)
-                points = [(x + aside, estimate(_column(rows.by_unit(metric, mask), p))) for _, x, mask in bins]
+                points = [
+                    (x + aside, mean_interval(_column(rows.by_unit(metric, mask), p), possible(metric)))
+                    for _, x, mask in bins
+                ]
                 ax.errorbar(
                     [x for x, _ in points],
                     [e.mean for _, e in points],
-                    [0.0 if np.isnan(e.half_width) else e.half_width for _, e in points],
+                    whiskers([e for _, e in points]),
                     marker="o",
                     markersize=3,
                     capsize=2,
@@ -96,10 +100,16 @@ def draw_pareto(rows: CampaignRows, path: Path) -> bool:
     for r, accuracy in enumerate(accuracies):
         for c, price in enumerate(prices):
             ax = axes[r][c]
-            xs = [estimate(_column(rows.by_unit(price), p)) for p in range(len(rows.plan.policies))]
-            ys = [estimate(_column(rows.by_unit(accuracy), p)) for p in range(len(rows.plan.policies))]
+            xs = [
+                mean_interval(_column(rows.by_unit(price), p), possible(price)) for p in range(len(rows.plan.policies))
+            ]
+            ys = [
+                mean_interval(_column(rows.by_unit(accuracy), p), possible(accuracy))
+                for p in range(len(rows.plan.policies))
+            ]
             for p, label in enumerate(rows.plan.policies):
-                ax.errorbar(xs[p].mean, ys[p].mean, ys[p].half_width, xs[p].half_width, "o", capsize=2, label=label)
+                x, y = [xs[p]], [ys[p]]
+                ax.errorbar(x[0].mean, y[0].mean, whiskers(y), whiskers(x), "o", capsize=2, label=label)
             front = on_front([x.mean for x in xs], [y.mean for y in ys])
             line = sorted((x.mean, y.mean) for x, y, f in zip(xs, ys, front, strict=True) if f)
             ax.plot([x for x, _ in line], [y for _, y in line], color="0.6", zorder=0)
@@ -108,6 +118,12 @@ def draw_pareto(rows: CampaignRows, path: Path) -> bool:
     axes[0][0].legend(fontsize="small")
     figure.savefig(path)
     return True
+
+
+def whiskers(estimates: Sequence[Estimate]) -> Floats:
+    """[2, estimates]: how far each interval reaches below and above its mean; 0 where there is none or it has no end."""
+    reach = np.array([(e.mean - e.low, e.high - e.mean) for e in estimates]).T
+    return np.where(np.isfinite(reach), reach, 0.0)
 
 
 def _column(means: Any, policy: int) -> Any:

@@ -10,15 +10,16 @@ from typing import Any
 
 import pyarrow.compute as pc
 
+from sortie.scenarios.intervals import Estimate, Floats, Paired, mean_interval, paired
 from sortie.scenarios.report_text import NONE, number, prefixed, table
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
 from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
-from sortie.sim.campaign.statistics import Estimate, Floats, Paired, estimate, paired
 from sortie.sim.campaign.store import CampaignTable
 from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.folders import RunError, write_text
+from sortie.sim.results.outcome_fields import possible
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
 MAX_FAILED = 20
@@ -100,7 +101,7 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
     yield "\n## Metrics by policy\n"
     yield from table(
         ("metric", *labels),
-        ((metric, *(_mean(rows, m) for m in rows.by_unit(metric).T)) for metric in rows.plan.campaign.metrics),
+        ((metric, *(_mean(rows, metric, m) for m in rows.by_unit(metric).T)) for metric in rows.plan.campaign.metrics),
     )
     valued = with_values(rows)
     if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
@@ -110,7 +111,10 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
         others = range(1, len(labels))
         yield from table(
             ("metric", *labels[1:]),
-            ((metric, *(_difference(paired(*rows.pair(metric, 0, p))) for p in others)) for metric in valued),
+            (
+                (metric, *(_difference(paired(*rows.pair(metric, 0, p), possible(metric))) for p in others))
+                for metric in valued
+            ),
         )
 
 
@@ -129,7 +133,7 @@ def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
         yield from table(
             (metric, "part", *rows.plan.policies),
             (
-                (field, label, *(_interval(estimate(m)) for m in rows.by_unit(metric, mask).T))
+                (field, label, *(_interval(mean_interval(m, possible(metric))) for m in rows.by_unit(metric, mask).T))
                 for field in rows.plan.campaign.vary
                 for label, _, mask in rows.bins(field)
             ),
@@ -147,7 +151,7 @@ def _pareto(rows: CampaignRows, picture: bool) -> Iterator[str]:
         yield f"![accuracy against cost]({PARETO})\n"
     for accuracy in accuracies:
         for price in prices:
-            x, y = ([estimate(c).mean for c in rows.by_unit(m).T] for m in (price, accuracy))
+            x, y = ([mean_interval(c).mean for c in rows.by_unit(m).T] for m in (price, accuracy))
             front = [label for label, on in zip(rows.plan.policies, on_front(x, y), strict=True) if on]
             yield f"- {accuracy} against {price}: no policy is better in both than {', '.join(front)}"
 
@@ -239,7 +243,10 @@ def _intervals(rows: CampaignRows) -> str:
         return (
             f"One {unit} gives no interval: ask for more, by `{'sample.count' if unit == 'draw' else 'replications'}`."
         )
-    return f"Intervals are 95 %, Student's, over {unit}s; differences are paired."
+    return (
+        f"Intervals are 95 %, Student's, over {unit}s, on a scale in which no rate leaves 0 … 1 and no amount falls below 0; "
+        "differences are paired."
+    )
 
 
 def _stopped(rows: CampaignRows) -> bool:
@@ -251,8 +258,8 @@ def _stopped(rows: CampaignRows) -> bool:
     return enough and count < rows.plan.runs
 
 
-def _mean(rows: CampaignRows, values: Floats) -> str:
-    result = estimate(values)
+def _mean(rows: CampaignRows, metric: str, values: Floats) -> str:
+    result = mean_interval(values, possible(metric))
     return _interval(result) if _sampled(rows) else prefixed(result.mean)[0]
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.scenarios.intervals import Floats
 from sortie.sim.campaign.rows import CampaignRows
 from sortie.sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
-from sortie.sim.campaign.statistics import Floats
 from sortie.sim.folders import RunError
 
 COLUMNS = {

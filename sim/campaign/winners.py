@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.scenarios.intervals import LEVEL, Estimate, Floats, mean_interval
 from sortie.sim.campaign.rows import CampaignRows, sign
-from sortie.sim.campaign.statistics import LEVEL, Estimate, Floats, estimate
+from sortie.sim.results.outcome_fields import possible
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ def other_winners(rows: CampaignRows, metric: str) -> list[OtherWinner]:
             continue
         here = _first(means)
         if here != best:
-            gain = estimate(means[:, here] - means[:, best], level)
+            gain = mean_interval(means[:, here] - means[:, best], possible(metric).of_differences(), level)
             others.append(OtherWinner(field, label, policies[here], gain))
     return others
 
@@ -98,7 +99,7 @@ def rule(rows: CampaignRows, metric: str) -> Rule | None:
     if below == above:
         return None
     labels = rows.plan.policies
-    return Rule(field, threshold, labels[below], labels[above], estimate(gains))
+    return Rule(field, threshold, labels[below], labels[above], mean_interval(gains, possible(metric).of_differences()))
 
 
 def _cells(rows: CampaignRows, metric: str) -> tuple[NDArray[np.int64], dict[str, Floats], Floats]:

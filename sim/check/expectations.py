@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
 from sortie.sim.results.outcome import describe
+from sortie.sim.results.outcome_fields import possible
 from sortie.sim.results.record import SortieRecord
 
 TOLERANCE = 1e-9
@@ -113,7 +114,7 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
 
 
 def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
-    """The mean over replications lies within each bound with the expectation's confidence: Student's one-sided limit.
+    """The mean over replications lies within each bound with the confidence asked for, by one end of an interval alone.
 
     An expectation that the replications leave open fails; more replications may settle it.
     """
@@ -129,24 +130,15 @@ def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
         values.append(float(value))
     if len(values) < e.replications:
         return Verdict(expected, f"{len(values)} replications flown", False, e.because, e.metric)
-    mean, off = limit(values, e.confidence)
-    low = e.at_least is not None and mean - off < e.at_least - e.tolerance
-    high = e.at_most is not None and mean + off > e.at_most + e.tolerance
-    got = f"{mean:.6g} ± {off:.2g} over {len(values)}"
+    found = mean_interval(values, possible(e.metric), 2 * e.confidence - 1)
+    low = e.at_least is not None and found.low < e.at_least - e.tolerance
+    high = e.at_most is not None and found.high > e.at_most + e.tolerance
+    got = f"{found.mean:.6g} [{found.low:.6g}, {found.high:.6g}] over {len(values)}"
     if not low and not high:
         return Verdict(expected, got, True, e.because, e.metric)
     worst = values.index(min(values) if low else max(values))
     got = f"{got}, {values[worst]:.6g} in replication {worst}"
     return Verdict(expected, got, False, e.because, e.metric, replication=worst)
-
-
-def limit(values: Sequence[float], confidence: float) -> tuple[float, float]:
-    """The mean of n ≥ 2 values, and how far its one-sided confidence limit is from it: t(n − 1) s / √n."""
-    from scipy.special import stdtrit
-
-    n, mean = len(values), math.fsum(values) / len(values)
-    s = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1))
-    return mean, float(stdtrit(n - 1, confidence)) * s / math.sqrt(n)
 
 
 def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:

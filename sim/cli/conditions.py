@@ -144,13 +144,13 @@ def learn(
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)
         table.add_row(arm.text, f"{sum(lesson.ap[k] for lesson in lessons) / len(lessons):.3f}", f"{wins}")
     out.print(table)
-    table = Table("over the first arm, AP points", *(f"budget {b:g}" for b in BUDGETS))
+    table = Table("over the first arm, AP points, 95 %", *(f"budget {b:g}" for b in BUDGETS))
     for k, arm in enumerate(ARMS[1:], start=1):
         found = gains(lessons, k)
         for phase in ("search", "track"):
             cells = (found.get((phase, b)) for b in BUDGETS)
             table.add_row(
-                f"{arm.text}: {phase}", *("–" if c is None else f"{100 * c[0]:+.1f} ± {100 * c[1]:.1f}" for c in cells)
+                f"{arm.text}: {phase}", *("–" if c is None else points((c.mean, c.low, c.high), "+.1f") for c in cells)
             )
     out.print(table)
     enough = ", ".join(f"{name} {budget:.3f}" for name, budget in thresholds(lessons).items())

@@ -1,5 +1,7 @@
 """The fields of `outcome.json` and their meanings; `outcome.md` is made from them.
 
+A number is an amount, 0 or more, unless its range stands after its meaning.
+
 A test holds `sortie.sim.results.outcome.outcome` to these types, field by field; `check_number` holds the names of metrics to them.
 """
 
@@ -12,6 +14,7 @@ from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hin
 from sortie.fleet.energy.battery import CAUSES, RECORDED
 from sortie.fleet.messages.auth import DropReason
 from sortie.radio.transmission import Status
+from sortie.scenarios.intervals import AMOUNT, ANY, SHARE, Range
 from sortie.scenarios.reading.nodes import nearest
 
 
@@ -22,10 +25,12 @@ class Percentiles(TypedDict):
 
 class Accuracy(TypedDict):
     full_scene: Annotated[
-        float | None, "AP@0.5 over all cars within range, rotated BEV IoU, pooled over egos and scored fusions."
+        float | None, "AP@0.5 over all cars within range, rotated BEV IoU, pooled over egos and scored fusions.", SHARE
     ]
     mission: Annotated[
-        float | None, "The same of detections and cars whose centres lie in the mission disc, while there is one."
+        float | None,
+        "The same of detections and cars whose centres lie in the mission disc, while there is one.",
+        SHARE,
     ]
 
 
@@ -48,15 +53,18 @@ class Ap50(Accuracy):
 
 
 class MissionOutcome(TypedDict):
-    flown_share: Annotated[float, "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air."]
+    flown_share: Annotated[float, "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air.", SHARE]
     region_observed_share: Annotated[
         float | None,
         "Share of the mission region's area in view, 0 … 1, averaged over the time in which there is a region. A place is "
         "in view where it lies in the picture of one of the five cameras of a drone, on flat ground without houses and "
         "trees, and in the square of the drone's feature map. The drone flies, and its duty cycle is above 0.",
+        SHARE,
     ]
     target_in_view_share: Annotated[
-        float | None, "Share of the time of phase `track`, 0 … 1, in which the target's place is in view, as above."
+        float | None,
+        "Share of the time of phase `track`, 0 … 1, in which the target's place is in view, as above.",
+        SHARE,
     ]
     target_longest_out_of_view_s: Annotated[
         float | None, "Longest unbroken time of phase `track` in which no drone has the target in view, s."
@@ -65,6 +73,7 @@ class MissionOutcome(TypedDict):
         float | None,
         "Share of the time of phase `track`, 0 … 1, in which a box of at least one drone overlaps the target with an "
         "IoU of at least 0.5. Each scored instant stands for the time until the next one.",
+        SHARE,
     ]
     target_longest_undetected_s: Annotated[
         float | None, "Longest unbroken time of phase `track` in which no drone's boxes hold the target, s."
@@ -86,9 +95,9 @@ class Bytes(TypedDict):
 
 
 class Drone(TypedDict):
-    soc: Annotated[float, "State of charge, 0 … 1."]
+    soc: Annotated[float, "State of charge, 0 … 1.", SHARE]
     voltage_v: Annotated[float, "At the pack's terminals."]
-    airborne: Annotated[bool, "Whether it still flew."]
+    airborne: Annotated[bool, "Whether it still flew.", SHARE]
     energy_j: Annotated[float, "Spent to the very end, all causes."]
 
 
@@ -119,7 +128,7 @@ class PhaseOutcome(TypedDict):
     ap50: Annotated[Accuracy, "Accuracy within it."]
     data_rate_mbps: Annotated[float, "Payload bytes captured in it, as Mb/s."]
     feature_payload_bytes: Annotated[float | None, "Median size of a feature payload."]
-    deadline_miss_rate: Annotated[float | None, "As for the whole sortie."]
+    deadline_miss_rate: Annotated[float | None, "As for the whole sortie.", SHARE]
 
 
 class Event(TypedDict):
@@ -154,18 +163,19 @@ class Outcome(TypedDict):
         MissionOutcome, "The mission of the whole fleet; null where there is no region, no target or no detector."
     ]
     bytes: Annotated[Bytes, "What was sent."]
-    context_share: Annotated[float | None, "Context bytes over all bytes."]
+    context_share: Annotated[float | None, "Context bytes over all bytes.", SHARE]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
     deadline_miss_rate: Annotated[
         float | None,
         "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known.",
+        SHARE,
     ]
     payload_fates: Annotated[dict[str, int], "Counts by status and reason."]
-    medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy."]
+    medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy.", SHARE]
     age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
     data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
     descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
-    battery: Annotated[dict[str, float], "State of charge as the last frame begins, by drone."]
+    battery: Annotated[dict[str, float], "State of charge as the last frame begins, by drone.", SHARE]
     drones: Annotated[dict[str, Drone], "Each as the last frame begins."]
     energy_j: Annotated[dict[str, float], "By cause, and `total`; hover outweighs the radio about a hundredfold."]
     policies: Annotated[Policies, "Who decided, and how often it was put right."]
@@ -241,6 +251,27 @@ def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
         kind = below
     if what := _no_number(kind):
         raise ValueError(f"{name}: is {what}, a metric must be a number")
+
+
+def possible(name: str) -> Range:
+    """The values that a metric can have, by its dotted name; any value where the reference does not have it.
+
+    Example:
+        >>> possible("drones.2.soc"), possible("bytes.data_sent")
+        (Range(low=0.0, high=1.0), Range(low=0.0, high=inf))
+    """
+    kind: Any = Outcome
+    within = AMOUNT
+    for part in name.split("."):
+        fields = get_type_hints(kind, include_extras=True) if is_typeddict(kind) else {}
+        if part in fields:
+            kind, _, *ranges = get_args(fields[part])
+            within = ranges[0] if ranges else AMOUNT
+        elif get_origin(kind) in (dict, list):
+            kind = get_args(kind)[-1]
+        else:
+            return ANY
+    return within
 
 
 def _below(kind: Any, part: str, keys: Collection[str] | None) -> Any:

@@ -66,7 +66,7 @@ def page() -> str:
 def fields(section: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
     """Path, value and meaning of every field of a typed dictionary, those inside it after it."""
     for name, hint in get_type_hints(section, include_extras=True).items():
-        kind, meaning = get_args(hint)
+        kind, meaning, *_ = get_args(hint)
         inner, mark = _inner(kind)
         yield f"{path}{name}", _value(kind), meaning
         if inner is not None:

@@ -178,7 +178,6 @@ def pair_up(
     mission: bool,
     begin_s: float = 0.0,
     leaving_out: Collection[int] = (),
-    whole_sorties: bool = False,
 ) -> tuple[list[Matched], list[Matched], list[int]]:
     """Fusions that two arms of sorties both scored, side by side, and what the bootstrap may not part.
 
@@ -186,7 +185,6 @@ def pair_up(
         a, b: records in pairs.
         mission, begin_s: as for `matched`.
         leaving_out: drones that are not counted.
-        whole_sorties: those of one sortie stand or fall together; else those of one instant.
     """
     first: list[Matched] = []
     second: list[Matched] = []
@@ -198,5 +196,5 @@ def pair_up(
             if (t_s, drone) in theirs and drone not in leaving_out:
                 first.append(ours[t_s, drone])
                 second.append(theirs[t_s, drone])
-                groups.append(k if whole_sorties else instants.setdefault((k, t_s), len(instants)))
+                groups.append(instants.setdefault((k, t_s), len(instants)))
     return first, second, groups

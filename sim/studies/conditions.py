@@ -10,6 +10,7 @@ import numpy as np
 from sortie.perception.detectors import make_detector
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.registry import POLICIES, resolve, within_budget
+from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
@@ -20,7 +21,6 @@ from sortie.sim.results.outcome import matched, outcome
 FIXED = ("all-4", "best-2", "worst-2", "random-2", "fixed-compression", "silence")
 """Policies that do the same whatever the condition; the best of them, and the best of them in each condition, are the
 paper's two yardsticks."""
-DRAWS = 4000
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Summary:
     policy: str
     ap: float
     gain: tuple[float, float, float]
-    """Mean AP over that of the best fixed policy, with its 95 % interval: conditions resampled in pairs; NaN for a single one."""
+    """Mean AP over that of the best fixed policy, with its paired 95 % interval over conditions; NaN for a single one."""
     of_oracle: float | None
     """Mean AP relative to the best fixed policy of each condition; None where those have an AP of zero."""
     data_bytes: float
@@ -133,11 +133,11 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
     rows = []
     for p in policies:
         mine = [at[p, c] for c in conditions]
-        low, high = paired_interval(ap[p] - ap[best])
+        gain = mean_interval(ap[p] - ap[best], SHARE.of_differences())
         mean = float(ap[p].mean())
         rows.append(
             Summary(
-                p, mean, (mean - float(ap[best].mean()), low, high), mean / oracle if oracle else None,
+                p, mean, (gain.mean, gain.low, gain.high), mean / oracle if oracle else None,
                 float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
                 float(np.mean([c.miss_rate for c in mine])),
             )
@@ -157,18 +157,6 @@ def _best_fixed(ap: Mapping[str, float]) -> str:
 def _fixed(policies: Sequence[str]) -> list[str]:
     """Those that do the same whatever the condition; the first of all where none does."""
     return [p for p in policies if p in FIXED] or list(policies[:1])
-
-
-def paired_interval(differences: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean difference over conditions [n]; NaN of a single one, which has none."""
-    if len(differences) < 2:
-        return float("nan"), float("nan")
-    from scipy import stats  # half a second to import, and only here
-
-    low, high = stats.bootstrap(
-        (differences,), np.mean, n_resamples=DRAWS, method="percentile", rng=np.random.default_rng(seed)
-    ).confidence_interval
-    return float(low), float(high)
 
 
 def all_policies() -> list[str]:

@@ -15,12 +15,13 @@ import numpy as np
 from sortie.perception.detectors import Constructor, Detector
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.intervals import SHARE, Range, mean_interval
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import both_matched
-from sortie.sim.studies.conditions import paired_interval, scenario_of
+from sortie.sim.studies.conditions import scenario_of
 
 POLICIES = ("silence", "all-4", "boxes")
 TOWNS_APART = 1000
@@ -141,8 +142,8 @@ def _surrogate(calibration: Path | None) -> Constructor:
 
 @dataclass(frozen=True, slots=True)
 class ConditionMean:
-    """The mean over conditions of a policy's AP, or of what it gains over another's, by both; with 95 % intervals, conditions
-    resampled in pairs, of the torch detector's and of the difference; NaN for a single one."""
+    """The mean over conditions of a policy's AP, or of what it gains over another's, by both; with 95 % intervals over
+    conditions of the torch detector's and of the difference; NaN for a single one."""
 
     what: str
     region: str
@@ -158,21 +159,22 @@ def means(levels: Sequence[ConditionAp]) -> Iterator[ConditionMean]:
         ap = {p: {v.condition: v for v in levels if (v.policy, v.region) == (p, region)} for p in policies}
         for p in policies:
             if ap[p]:
-                yield _mean(p, region, _table(ap[p].values()))
+                yield _mean(p, region, _table(ap[p].values()), SHARE)
         for k, p in enumerate(policies):
             for earlier in policies[:k]:
                 # drones that look from elsewhere may find none to look for
                 both = [c for c in ap[p] if c in ap[earlier]]
                 if both:
                     its, theirs = (_table([ap[name][c] for c in both]) for name in (p, earlier))
-                    yield _mean(f"{p} − {earlier}", region, its - theirs)
+                    yield _mean(f"{p} − {earlier}", region, its - theirs, SHARE.of_differences())
 
 
 def _table(levels: Iterable[ConditionAp]) -> np.ndarray:
     return np.array([(v.torch, v.surrogate) for v in levels])
 
 
-def _mean(what: str, region: str, both: np.ndarray) -> ConditionMean:
-    error = both[:, 1] - both[:, 0]
-    torch, off = ((float(v.mean()), *paired_interval(v)) for v in (both[:, 0], error))
-    return ConditionMean(what, region, torch, float(both[:, 1].mean()), off)
+def _mean(what: str, region: str, both: np.ndarray, within: Range) -> ConditionMean:
+    torch = mean_interval(both[:, 0], within)
+    off = mean_interval(both[:, 1] - both[:, 0], within.of_differences())
+    surrogate = float(both[:, 1].mean())
+    return ConditionMean(what, region, (torch.mean, torch.low, torch.high), surrogate, (off.mean, off.low, off.high))

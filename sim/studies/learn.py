@@ -21,6 +21,7 @@ from sortie.perception.detectors import make_detector
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.catalogue.adaptive import ARMS, features, spend
 from sortie.policies.contract import Directive, FleetView
+from sortie.scenarios.intervals import SHARE, Estimate, mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
@@ -136,9 +137,9 @@ def fit(lessons: list[Lesson]) -> dict[str, list[list[float]] | list[float]]:
     return {"mean": mean.tolist(), "scale": scale.tolist(), "weights": weights.tolist()}
 
 
-def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[float, float, int]]:
-    """AP of an arm over the first by phase and budget: mean, its standard error, and how many conditions."""
-    gains: dict[tuple[str, float], tuple[float, float, int]] = {}
+def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], Estimate]:
+    """AP of an arm over the first by phase and budget: the mean over conditions with its 95 % interval."""
+    gains: dict[tuple[str, float], Estimate] = {}
     for phase in ("search", "track"):
         for budget in BUDGETS:
             gained = np.array(
@@ -149,7 +150,7 @@ def gains(lessons: list[Lesson], arm: int) -> dict[tuple[str, float], tuple[floa
                 ]
             )
             if len(gained):
-                gains[phase, budget] = float(gained.mean()), float(gained.std() / np.sqrt(len(gained))), len(gained)
+                gains[phase, budget] = mean_interval(gained, SHARE.of_differences())
     return gains
 
 

@@ -18,13 +18,14 @@ from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.evaluate import Settings, match_all
 from sortie.perception.geometry import FULL
 from sortie.perception.metrics.ap import Matched, average_precision, match, suppress
-from sortie.perception.metrics.bootstrap import rank, resamples
+from sortie.perception.metrics.bootstrap import rank
 from sortie.perception.metrics.overlap import corners, iou_pairs
 from sortie.perception.network.fusion.base import takes_part
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.network.warp import warp
 from sortie.perception.types import Boxes
+from sortie.scenarios.intervals import resamples
 
 EGOS = [e for e in range(5) for p in range(5) if p != e]
 PEERS = [p for e in range(5) for p in range(5) if p != e]

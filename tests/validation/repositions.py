@@ -14,8 +14,10 @@ import numpy as np
 from stored import Column, Table, points
 
 from sortie.fleet.coverage import footprint_radius_m
-from sortie.perception.metrics.bootstrap import Difference, compare
+from sortie.perception.metrics.ap import average_precision
+from sortie.perception.metrics.bootstrap import Difference
 from sortie.policies.registry import resolve, within_budget
+from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.choreography import EVENT
@@ -23,7 +25,6 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.studies.compare import pair_up
-from sortie.sim.studies.conditions import paired_interval
 
 SCENARIO, BUDGET, RADIUS_M = "track_target", 0.1, 32.0
 STAYS, MOVES = "all-4", "vantage"
@@ -47,7 +48,7 @@ class RepositionRow:
 
     mission: str
     mission_ap: Difference
-    """AP@0.5 in the mission disc; sorties resampled in pairs."""
+    """AP@0.5 in the mission disc; the interval is over sorties."""
     full_ap: Difference
     covered: tuple[float, float]
     """Mean share of the mission disc within some drone's footprint, a and b."""
@@ -146,13 +147,15 @@ def _moves(record: SortieRecord) -> int:
 
 def _gain(arms: np.ndarray) -> Interval:
     """Mean of b less a over [2, sorties], with its 95 % interval."""
-    gain = arms[1] - arms[0]
-    return (float(gain.mean()), *paired_interval(gain))
+    gain = mean_interval(arms[1] - arms[0])
+    return gain.mean, gain.low, gain.high
 
 
 def _difference(a: Sequence[SortieRecord], b: Sequence[SortieRecord], *, mission: bool) -> Difference:
-    """AP while tracking; whole sorties are resampled."""
-    return compare(*pair_up(a, b, mission=mission, begin_s=TRACKING_FROM_S, whole_sorties=True))
+    """AP while tracking: means over sorties of each sortie's own AP and difference."""
+    pairs = [pair_up([one], [other], mission=mission, begin_s=TRACKING_FROM_S) for one, other in zip(a, b, strict=True)]
+    arms = np.array([[average_precision(pair[arm]) for pair in pairs] for arm in (0, 1)])
+    return Difference(*np.nanmean(arms, axis=1).tolist(), *_gain(arms))
 
 
 def table(rows: Sequence[RepositionRow], about: str = "") -> Table:

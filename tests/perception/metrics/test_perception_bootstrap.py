@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.perception.metrics.ap import Matched, average_precision
-from sortie.perception.metrics.bootstrap import benjamini_hochberg, compare, interval, p_value, rank, resamples
+from sortie.perception.metrics.bootstrap import compare, rank
+from sortie.scenarios.intervals import benjamini_hochberg, p_value, percentile_interval, resamples
 
 
 def units(seed: int, count: int, quality: float = 0.7, found: int = 40, per_score: int = 1000) -> list[Matched]:
@@ -115,9 +116,9 @@ def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
     for seed in range(200):
         sample = experiment(seed, 40)
         weights = resamples(40, 200, seed)
-        low, high = interval(rank(sample, np.repeat(np.arange(40), 5), bins=60).ap(weights))
+        low, high = percentile_interval(rank(sample, np.repeat(np.arange(40), 5), bins=60).ap(weights))
         by_frame += low <= real <= high
-        low, high = interval(rank(sample, bins=60).ap(resamples(200, 200, seed)))
+        low, high = percentile_interval(rank(sample, bins=60).ap(resamples(200, 200, seed)))
         by_ego += low <= real <= high
     assert 0.87 <= by_frame / 200 <= 0.99
     assert by_ego < by_frame - 15, "egos of one frame are not independent, and taking them for it is overconfident"

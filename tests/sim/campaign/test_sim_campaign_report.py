@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import stats
 
+from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
@@ -21,7 +20,6 @@ from sortie.sim.campaign.figures import on_front
 from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, sign, winner_metrics
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
-from sortie.sim.campaign.statistics import RunningMean, estimate, paired, t_interval
 from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
@@ -31,34 +29,6 @@ TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 4
 )
 
 ONE_METRIC = TWO.replace("[bytes.data_sent, energy_j.total]", "[bytes.data_sent]")
-
-
-@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40))
-def test_running_means_are_numpys(values: list[float]) -> None:
-    mean = RunningMean()
-    for v in values:
-        mean.add(v)
-    assert mean.mean == pytest.approx(np.mean(values), abs=1e-9)
-    assert mean.variance == pytest.approx(np.var(values, ddof=1), rel=1e-6, abs=1e-6)
-
-
-def test_intervals_are_students() -> None:
-    values = np.random.default_rng(0).normal(5, 2, 23)
-    low, high = stats.t.interval(0.95, 22, values.mean(), stats.sem(values))
-    found = estimate(values)
-    assert (found.low, found.high) == pytest.approx((low, high))
-    assert math.isinf(t_interval(RunningMean()))
-    assert estimate([math.nan, 3.0]).count == 1
-
-
-def test_pairing_saves_what_the_common_part_was() -> None:
-    """With a = c + x, b = c + y the difference has Var x + Var y, unpaired Var x + Var y + 2 Var c: here 1 + 2·25/2 = 26."""
-    rng = np.random.default_rng(1)
-    c, x, y = rng.normal(0, 5, 20_000), rng.normal(0, 1, 20_000), rng.normal(1, 1, 20_000)
-    found = paired(c + x, c + y)
-    assert found.saved == pytest.approx(26, rel=0.05)
-    assert found.difference.low < 1 < found.difference.high
-    assert found.difference.half_width == pytest.approx(1.96 * math.sqrt(2 / 20_000), rel=0.05)
 
 
 def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
@@ -185,6 +155,28 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     with pytest.raises(RunError, match=r"--run 48: .* has runs 0 … 47"):
         find_row(folder, 48)
     assert pq.read_table(folder / "runs").num_rows == 48
+
+
+def test_rates_stay_within_their_range_and_bytes_above_zero(tmp_path: Path) -> None:
+    """Student's interval of the bare mean is [0.85, 1.06] for these misses, and begins below zero for these bytes."""
+    from sortie.sim.campaign.figures import whiskers
+    from sortie.sim.campaign.report import _lines
+
+    rates, sent = iter([0.8, 1.0, 1.0, 1.0, 0.95, 0.98] * 2), iter([0.0] * 10 + [6e6, 3e6])
+    metrics = "metrics: [deadline_miss_rate, bytes.data_sent]"
+    text = TWO.replace("metrics: [bytes.data_sent, energy_j.total]", metrics)
+    rows = rows_of(tmp_path, text, lambda fields, p: next(rates), "deadline_miss_rate")
+    table = rows.table.append_column("bytes.data_sent", pa.array([next(sent) for _ in range(12)]))
+    rows = CampaignRows(rows.plan, table, rows.unit, rows.policy)
+    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    first = told.partition("Differences from")[0]
+    for metric, highest in (("deadline_miss_rate", 1.0), ("bytes.data_sent", math.inf)):
+        (line,) = (line for line in first.splitlines() if line.startswith(f"| {metric} |"))
+        bounds = re.findall(r"\[([-\d.e]+)(?: [kMG])?, ([-\d.e]+)", line)
+        assert len(bounds) == 2
+        assert all(0 < float(low) < float(high) <= highest for low, high in bounds)
+    e = mean_interval([0.8, 1.0, 1.0], SHARE)
+    assert whiskers([e])[:, 0].tolist() == [e.mean - e.low, e.high - e.mean]
 
 
 def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from scipy import stats
 from sim_examples import BASE, example
 from typer.testing import CliRunner
 
+from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.checking import check_scenario
 from sortie.sim.check.discovery import is_scenario
-from sortie.sim.check.expectations import check, limit
+from sortie.sim.check.expectations import check
 from sortie.sim.check.golden import differences, golden_path, write_golden
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
@@ -35,17 +36,20 @@ expect:
 
 def test_the_limit_is_students() -> None:
     values = np.random.default_rng(1).normal(3, 2, 12)
-    mean, off = limit(values.tolist(), 0.95)
     low = stats.ttest_1samp(values, 0, alternative="greater").confidence_interval(0.95).low
-    assert mean == pytest.approx(values.mean())
-    assert mean - off == pytest.approx(low)
+    record = run_sortie(example("duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]"))
+    for bound, holds in ((low - 1e-6, True), (low + 1e-6, False)):
+        expect = f"expect=[{{metric: m, at_least: {bound}, replications: 12, confidence: 0.95}}]"
+        (verdict,) = check(example(expect), record, {}, [{"m": v} for v in values.tolist()])
+        assert verdict.holds is holds
+        assert verdict.got.startswith(f"{values.mean():.6g} [{low:.6g}, ")
 
 
 @pytest.mark.slow
 def test_a_mean_at_its_bound_is_called_shown_as_seldom_as_asked() -> None:
     """With a true mean of 0 the expectation `≥ 0 with 90 %` is wrongly called held in 10 % of cases, within 3 σ."""
     rng, cases = np.random.default_rng(2), 4000
-    held = sum(m - off >= 0 for m, off in (limit(rng.normal(0, 1, 8).tolist(), 0.9) for _ in range(cases)))
+    held = sum(mean_interval(rng.normal(0, 1, 8), level=0.8).low >= 0 for _ in range(cases))
     assert abs(held / cases - 0.1) < 3 * math.sqrt(0.09 / cases)
 
 
@@ -118,7 +122,7 @@ def test_replications_are_flown_once_each(tmp_path: Path) -> None:
     (verdict,) = check_scenario(str(path)).verdicts
     each = [outcome(run_sortie(load(path), replication=r))["energy_j"]["total"] for r in (0, 1)]
     assert each[0] != each[1]
-    assert verdict.got.startswith(f"{sum(each) / 2:.6g} ± ")
+    assert verdict.got.startswith(f"{sum(each) / 2:.6g} [")
 
 
 def test_a_failure_over_replications_shows_the_worst_of_them(tmp_path: Path) -> None:

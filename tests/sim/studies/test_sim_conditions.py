@@ -24,7 +24,7 @@ from sortie.sim.cli import conditions as commands
 from sortie.sim.cli.app import main
 from sortie.sim.folders import RunError
 from sortie.sim.studies import learn
-from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, paired_interval, scenario_of, summarise
+from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, scenario_of, summarise
 from sortie.sim.studies.in_flight import torch_answers
 from sortie.sim.studies.learn import Lesson, draw_condition, fit, save
 
@@ -136,13 +136,6 @@ def test_conditions_without_a_detector_are_refused_before_anything_flies(tmp_pat
         RunError, match=r"condition poor: perception\.detector is none, conditions are compared by accuracy"
     ):
         fly_all(conditions, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
-
-
-def test_the_interval_of_a_known_mean() -> None:
-    differences = np.array([-1.0, 1.0] * 50)
-    low, high = paired_interval(differences)
-    assert low == pytest.approx(-0.196, abs=0.03), "1.96 standard errors of a tenth"
-    assert high == pytest.approx(0.196, abs=0.03)
 
 
 def test_compare_prints_every_policy_over_the_conditions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -284,8 +277,11 @@ def test_gains_by_phase_and_budget_by_hand() -> None:
     ]  # fmt: skip
     found = learn.gains(lessons, 2)
     assert found.keys() == {("search", 0.01), ("track", 0.2)}
-    assert found["search", 0.01] == (pytest.approx(0.02), pytest.approx(0.01 / 2**0.5), 2)
-    assert found["track", 0.2] == (pytest.approx(-0.1), 0.0, 1)
+    two, one = found["search", 0.01], found["track", 0.2]
+    assert (two.mean, two.count) == (pytest.approx(0.02), 2)
+    assert two.half_width == pytest.approx(12.706 * 0.01, rel=0.01), "Student's, with one degree of freedom"
+    assert (one.mean, one.count) == (pytest.approx(-0.1), 1)
+    assert np.isnan(one.half_width)
 
 
 def test_boxes_are_worth_it_up_to_where_their_gain_falls_through_zero() -> None:
