@@ -148,7 +148,7 @@ def test_the_command_line_prints_the_summaries_of_the_api(tmp_path: Path, monkey
     assert made == ["run", "comparison", "picture at 1"]
 
 
-@pytest.mark.parametrize("name", ["fly_and_look", "write_and_verify_a_policy"])
+@pytest.mark.parametrize("name", ["fly_and_look", "write_and_verify_a_policy", "campaign_over_link_and_battery"])
 def test_a_notebook_flies_by_the_public_interface(name: str) -> None:
     text = (ROOT / "notebooks" / f"{name}.ipynb").read_text()
     assert "sortie.sim" not in text
@@ -208,6 +208,7 @@ def test_a_comparison_has_a_row_a_sortie_and_says_what_its_intervals_cover() -> 
     ]
     (gain,) = three.gains
     assert (gain.policy, gain.metric, gain.over, gain.count) == ("quiet", "ap50.full_scene", "sorties", 3)
+    assert [s.record is not None for s in three.sorties] == [True, True, False, False, False, False]
     assert "means of 3 sorties, seeds 0 to 2, each with a town and random draws of its own" in _line(three)
 
 
