@@ -10,9 +10,9 @@ from age import Chain, mean_age_s, mean_peak_age_s, share_older
 from hypothesis import given
 from hypothesis import strategies as st
 from radio_flights import Hover, trace
-from scipy import stats
 
 from sortie.radio.settings import AirSettings, BurstSettings
+from sortie.scenarios.intervals import mean_interval
 
 PERIOD_S = 0.1
 
@@ -79,8 +79,8 @@ def mean_age(rows: np.ndarray) -> tuple[float, float, float]:
 
 def within(values: list[float], expected: float) -> bool:
     """Whether what is expected lies in the 99.9 % interval of the mean of independent values."""
-    low, high = stats.t.interval(0.999, len(values) - 1, np.mean(values), stats.sem(values))
-    return bool(low <= expected <= high)
+    found = mean_interval(values, level=0.999)
+    return found.low <= expected <= found.high
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.4])
