@@ -62,7 +62,7 @@ def test_equal_values_are_their_own_interval_and_impossible_ones_are_refused() -
     ids=["differences", "rates", "rates near both ends", "bytes"],
 )
 def test_eight_units_cover_as_promised(draw: object, within: Range, true: float) -> None:
-    """93 to 98 %; a percentile bootstrap of eight covers about 90 %."""
+    """93 to 98 %, within which Student's interval of eight stays for these; a percentile bootstrap covers about 90 %."""
     rng = np.random.default_rng(0)
     found = [mean_interval(draw(rng), within) for _ in range(4000)]  # type: ignore[operator]
     assert 0.93 < np.mean([e.low <= true <= e.high for e in found]) < 0.98
