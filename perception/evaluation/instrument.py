@@ -71,7 +71,9 @@ class CarNetView:
     """
 
     def __init__(self, net: CarNet, features: torch.Tensor, est: torch.Tensor) -> None:
-        self._net, self._features, self._est = net, features, est
+        self._net, self._est = net, est
+        self.features = features
+        """[d, 80, 64, 64]: every drone's, on its own grid."""
         self._table = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
         self._under: dict[int, Support] = {}
         self._silent: dict[tuple[int, tuple[int, ...]], torch.Tensor] = {}
@@ -80,9 +82,9 @@ class CarNetView:
     def rank(self, by: CellsBy) -> NDArray[np.floating]:
         """Confidence: the highest score of the cell's head pixels, each drone alone; norm: of its feature vector."""
         if by == "norm":
-            plane = self._features.norm(dim=1)
+            plane = self.features.norm(dim=1)
         else:
-            plane = F.max_pool2d(self._net.head(self._features)[:, :1], 2)[:, 0]
+            plane = F.max_pool2d(self._net.head(self.features)[:, :1], 2)[:, 0]
         out: NDArray[np.floating] = plane.cpu().numpy()
         return out
 
@@ -107,15 +109,16 @@ class CarNetView:
         under = self._support(e.ego, e.peers)
         weights, arrived = arriving(under, sent)
         inside, arrived = under.inside.flatten(1), arrived.flatten(1)
+        trust = self._trust(e)
         if not isinstance(self._net.fusion, PerCell):
-            return self._dense(e, own, under, weights, arrived if e.unsent == "masked" else inside)
+            return self._dense(e, own, under, weights, arrived if e.unsent == "masked" else inside, trust)
         at = arrived.any(dim=0).nonzero().squeeze(1)
-        base = own if e.unsent == "masked" else self._zeros(e, own, inside, len(at))
+        base = own if e.unsent == "masked" else self._zeros(e, own, inside, len(at), trust)
         if not len(at):
             return base
         said = torch.cat([own[at][None], self._gather(e, under, weights, at)])
         part = (arrived if e.unsent == "masked" else inside)[:, at]
-        return base.index_copy(0, at, self._mix(said, part))
+        return base.index_copy(0, at, self._mix(said, part, trust))
 
     def _support(self, ego: int, peers: tuple[int, ...]) -> Support:
         """Of these peers under the ego; all of a view's are worked out once."""
@@ -123,6 +126,12 @@ class CarNetView:
             self._under[ego] = support(self._est[ego], self._est, self._net.config.geometry.cell_m)
         every = self._under[ego]
         return Support(*(part[list(peers)] for part in every))
+
+    def _trust(self, e: Exchange) -> torch.Tensor:
+        """[1 + peers]: the links' weights, 1 but for what the method's handshake makes of them."""
+        own, peers = self.features[e.ego], self.features[list(e.peers)]
+        weight = self._net.fusion.weigh(own[None], peers[None], own.new_ones(1, len(e.peers)))[0]
+        return F.pad(weight, (1, 0), value=1.0)
 
     def _gather(self, e: Exchange, under: Support, weights: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
         """[peers, p, 80]: what arrived at these cells of the ego's grid."""
@@ -132,31 +141,39 @@ class CarNetView:
         moved = rows(self._table, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
         return moved.view(k, len(at), -1)
 
-    def _mix(self, said: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
-        """Fuse [1 + k, p, 80] cell by cell; the ego takes part everywhere, every link has weight 1."""
+    def _mix(self, said: torch.Tensor, part: torch.Tensor, trust: torch.Tensor) -> torch.Tensor:
+        """Fuse [1 + k, p, 80] cell by cell by the links' weights [1 + k]; the ego takes part everywhere."""
         fusion = self._net.fusion
         assert isinstance(fusion, PerCell)  # noqa: S101 (tells the type checker)
         part = torch.cat([torch.ones_like(part[:1]), part])
-        mixed: torch.Tensor = fusion.mix(said, part, torch.ones_like(part, dtype=said.dtype))
+        mixed: torch.Tensor = fusion.mix(said, part, trust[:, None].expand(part.shape))
         return torch.where(part[1:].any(dim=0)[:, None], mixed, said[0])
 
-    def _zeros(self, e: Exchange, own: torch.Tensor, inside: torch.Tensor, arrived: int) -> torch.Tensor:
+    def _zeros(
+        self, e: Exchange, own: torch.Tensor, inside: torch.Tensor, arrived: int, trust: torch.Tensor
+    ) -> torch.Tensor:
         """The ego beside silent peers that count as zeros."""
         if arrived == len(own):
             return own  # every cell is about to be replaced
         key = (e.ego, e.peers)
         if key not in self._silent:
             said = torch.cat([own[None], own.new_zeros(len(e.peers), *own.shape)])
-            self._silent[key] = self._mix(said, inside)
+            self._silent[key] = self._mix(said, inside, trust)
         return self._silent[key]
 
     def _dense(
-        self, e: Exchange, own: torch.Tensor, under: Support, weights: torch.Tensor, part: torch.Tensor
+        self,
+        e: Exchange,
+        own: torch.Tensor,
+        under: Support,
+        weights: torch.Tensor,
+        part: torch.Tensor,
+        trust: torch.Tensor,
     ) -> torch.Tensor:
         """The whole map, for a fusion that looks beyond its cell."""
         every = torch.arange(len(own), device=own.device)
         said = torch.cat([own[None], self._gather(e, under, weights, every)])
         part = torch.cat([torch.ones_like(part[:1]), part]).view(1, -1, CELLS, CELLS)
         agents = said.view(1, -1, CELLS, CELLS, own.shape[1]).permute(0, 1, 4, 2, 3)
-        fused: torch.Tensor = self._net.fusion(agents, part, torch.ones(1, len(said), device=own.device))
+        fused: torch.Tensor = self._net.fusion(agents, part, trust[None])
         return fused[0].permute(1, 2, 0).reshape(own.shape)

@@ -282,7 +282,9 @@ class TorchDetector:
         def said(at: Tensor) -> Tensor:
             return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
 
-        fused = self._net.fusion.fuse(known[ego].features.result(), said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+        own, theirs = known[ego].features.result(), [known[s.capture].features.result() for s in maps]
+        weight = self._net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
+        fused = self._net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         return self._head(fused)
 
     def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:

@@ -187,6 +187,7 @@ def step_loss(
     weight = torch.ones(b * EGOS, k - 1, device=device)
     shape = (b * EGOS, k - 1, CELLS, CELLS)
     part = takes_part(sent.view(shape), inside.view(shape), weight, "masked" if thinning is None else thinning.unsent)
+    weight = net.fusion.weigh(agents[:, 0], features[agent].unflatten(0, (b * EGOS, k - 1)), weight)
     fused = net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0))
     alone = np.arange(b) * k + rng.integers(k, size=b)
     out = net.head(torch.cat([fused, features[alone]]))

@@ -33,7 +33,7 @@ class Perception(Section):
         "torch",
         description="The detector: the network, its fast surrogate, a recording of another model, or none: the traffic alone.",
     )
-    fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "where2comm"] = Field(
+    fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "when2com", "where2comm"] = Field(
         "disconet",
         description="How what peers sent is fused; weights belong to a fusion, none and late take any; the surrogate takes its calibration's, or none.",
     )

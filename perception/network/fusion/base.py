@@ -21,7 +21,7 @@ class Fusion(nn.Module):
 
     - agents [n, 1 + k, c, h, w]: maps on the ego's grid, the ego's own first, zero where nothing was sent;
     - takes_part [n, 1 + k, h, w] bool: which agent counts in which cell, the ego in all of them;
-    - weight [n, 1 + k]: each link's fusion weight from its directive, 0 … 1, the ego's 1;
+    - weight [n, 1 + k]: each link's fusion weight from its directive, 0 … 1, after `weigh`; the ego's 1;
 
     and returns [n, c, h, w]. Where no peer takes part the ego's features come back as they are; a peer of weight 0
     takes no part (`takes_part`); peers have no order. k may be 0.
@@ -49,6 +49,15 @@ class Fusion(nn.Module):
         peers = features(torch.arange(height * width)).view(-1, height, width, channels).permute(0, 3, 1, 2)
         out: Tensor = self(torch.cat([own[None], peers])[None], takes_part[None], weight[None])
         return out
+
+    def weigh(self, own: Tensor, peers: Tensor, weight: Tensor) -> Tensor:
+        """The links' weights after the method's handshake; unchanged where it has none.
+
+        Args:
+            own: [n, c, h, w] and peers: [n, k, c, h, w], whole maps, each on its own grid.
+            weight: [n, k], from the directives.
+        """
+        return weight
 
     def fold(self) -> None:
         """Fold batch norms into the layers before them, for inference; what has none does nothing."""

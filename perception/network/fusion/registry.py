@@ -8,7 +8,8 @@ from sortie.perception.network.fusion.fcooper import FCooper
 from sortie.perception.network.fusion.late import Late
 from sortie.perception.network.fusion.none import Alone
 from sortie.perception.network.fusion.v2vnet import V2VNet
+from sortie.perception.network.fusion.when2com import When2com
 from sortie.perception.network.fusion.where2comm import Where2comm
 
-FUSIONS: dict[str, type[Fusion]] = {f.name: f for f in (Alone, Late, FCooper, V2VNet, DiscoNet, Where2comm)}
+FUSIONS: dict[str, type[Fusion]] = {f.name: f for f in (Alone, Late, FCooper, V2VNet, DiscoNet, When2com, Where2comm)}
 DEFAULT = DiscoNet.name

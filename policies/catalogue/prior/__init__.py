@@ -48,7 +48,9 @@ class Method:
         return self.title.lower().replace(" ", "-") + (STAND_IN if self.missing else "")
 
 
-_MATCHING = "learned keys and queries; coverage grids are matched instead"
+_MATCHING = (
+    "learned keys and queries where drones choose; coverage grids are matched instead (fusion when2com has them)"
+)
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -59,8 +61,8 @@ METHODS: dict[str, Method] = {
             "where2comm",
             request_bytes,
         ),
-        Method("When2com", _MATCHING, when2com, None, lambda _: MATCH_BYTES),
-        Method("Who2com", _MATCHING, who2com, None, lambda _: MATCH_BYTES),
+        Method("When2com", _MATCHING, when2com, "when2com", lambda _: MATCH_BYTES),
+        Method("Who2com", _MATCHING, who2com, "when2com", lambda _: MATCH_BYTES),
         Method(
             "V2VNet",
             "the learned compression of features and the network that compensates their delay",

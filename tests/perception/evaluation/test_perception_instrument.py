@@ -59,7 +59,8 @@ def everywhere(net: CarNet, features: torch.Tensor, frames: Seen, f: int, e: Exc
     ones = torch.ones(1, k)
     part = takes_part(arrived[None, :, 0], inside[None, :, 0], ones, e.unsent)
     agents = torch.cat([features[e.ego : e.ego + 1], moved])[None]
-    out: torch.Tensor = net.head(net.fusion(agents, part, F.pad(ones, (1, 0), value=1.0)))[0]
+    weight = net.fusion.weigh(features[[e.ego]], features[peers][None], ones)
+    out: torch.Tensor = net.head(net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0)))[0]
     return out
 
 

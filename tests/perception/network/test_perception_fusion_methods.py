@@ -14,10 +14,11 @@ from sortie.perception.network.fusion.base import Fusion, takes_part
 from sortie.perception.network.fusion.registry import DEFAULT, FUSIONS
 from sortie.perception.network.fusion.traffic import LinkBytes
 from sortie.perception.network.fusion.v2vnet import V2VNet
+from sortie.perception.network.fusion.when2com import When2com, asked
 from sortie.perception.network.fusion.where2comm import HEADS, Where2comm, confidence_map, requested_rank
 
 SIDE = 12
-LEARNED = ("disconet", "v2vnet", "where2comm")
+LEARNED = ("disconet", "v2vnet", "when2com", "where2comm")
 FUSING = ("fcooper", *LEARNED)
 draws = settings(max_examples=5, deadline=None, derandomize=True)
 
@@ -136,7 +137,8 @@ def test_folding_changes_nothing_and_every_parameter_learns(name: str) -> None:
     fusion = FUSIONS[name]().train()
     parameters = list(fusion.parameters())
     if parameters:
-        grads = torch.autograd.grad(fusion(agents, part, torch.ones(1, 3)).square().sum(), parameters)
+        weight = F.pad(fusion.weigh(agents[:, 0], agents[:, 1:], torch.ones(1, 2)), (1, 0), value=1.0)
+        grads = torch.autograd.grad(fusion(agents, part, weight).square().sum(), parameters)
         assert all(torch.isfinite(g).all() for g in grads)
 
 
@@ -196,6 +198,50 @@ def test_where2comm_is_attention_with_confidence_as_prior() -> None:
         assert torch.allclose(fused[0, :, row, column], plain, atol=1e-4)
 
 
+def test_when2com_is_the_mean_by_attention_of_keys_and_queries() -> None:
+    agents, sent = maps(10, 4, 0.7)
+    net = METHODS["when2com"]
+    assert isinstance(net, When2com)
+    with torch.inference_mode():
+        seen = [net.handshake.look(agents[:, i])[0] for i in range(4)]
+        query = net.handshake.query(seen[0])
+        scores = torch.stack([net.handshake.key(s) @ net.handshake.match.weight @ query for s in seen]) / 16
+        attention = net.attention(agents[:, 0], agents[:, 1:])[0]
+        assert torch.allclose(attention, scores.softmax(dim=0), atol=1e-5)
+        directive = torch.tensor([[1.0, 0.5, 1.0]])
+        weight = F.pad(net.weigh(agents[:, 0], agents[:, 1:], directive), (1, 0), value=1.0)
+        fused = net(agents, takes_part(sent, torch.ones_like(sent), directive, "masked"), weight)
+    for row, column in ((0, 0), (3, 11), (8, 7)):
+        share = attention * torch.tensor([1.0, 1.0, 0.5, 1.0])
+        share[1:] *= sent[0, :, row, column]
+        plain = (share / share.sum()) @ agents[0, :, :, row, column]
+        assert torch.allclose(fused[0, :, row, column], plain, atol=1e-4)
+
+
+def test_a_handshake_is_of_whole_maps_and_of_nobody_elses() -> None:
+    """A peer's odds hang on its own map and the ego's alone, whatever cells of it are sent."""
+    agents, _ = maps(11, 4)
+    net = METHODS["when2com"]
+    with torch.inference_mode():
+        three = net.weigh(agents[:, 0], agents[:, 1:], torch.ones(1, 3))
+        one = net.weigh(agents[:, 0], agents[:, 2:3], torch.ones(1, 1))
+    assert torch.allclose(three[:, 1:2], one, atol=1e-6)
+    assert len(set(three[0].tolist())) == 3
+
+
+def test_who2com_asks_one_and_when2com_whoever_has_attention() -> None:
+    attention = torch.tensor([[0.9, 0.04, 0.06], [0.2, 0.5, 0.3]])
+    assert asked(attention).tolist() == [[False, True], [True, False]]
+    assert asked(attention, 0.2).tolist() == [[False, False], [True, True]]
+
+
+@pytest.mark.parametrize("name", [n for n in FUSIONS if n != "when2com"])
+def test_without_a_handshake_weights_are_the_directives(name: str) -> None:
+    agents, _ = maps(12, 3)
+    weight = torch.tensor([[0.3, 1.0]])
+    assert METHODS[name].weigh(agents[:, 0], agents[:, 1:], weight) is weight
+
+
 def test_confidence_is_smoothed_and_requests_ask_for_what_is_unknown() -> None:
     heat = torch.full((1, 128, 128), -math.inf)
     heat[0, 40, 60] = 0.0
@@ -212,10 +258,11 @@ def test_confidence_is_smoothed_and_requests_ask_for_what_is_unknown() -> None:
 @pytest.mark.parametrize("name", FUSING)
 def test_bytes_of_features(name: str) -> None:
     method = FUSIONS[name]
-    assert method.link_bytes(cells=4096) == LinkBytes(655_360, 0, 0)
-    assert method.link_bytes(cells=1024) == LinkBytes(163_840, 512, 0)
-    assert method.link_bytes(cells=82).total == 82 * 160 + 123
-    assert method.link_bytes(cells=0).total == 0
+    first = 132 if name == "when2com" else 0  # a query of 32 floats and a score
+    assert method.link_bytes(cells=4096) == LinkBytes(655_360, 0, first)
+    assert method.link_bytes(cells=1024) == LinkBytes(163_840, 512, first)
+    assert method.link_bytes(cells=82).total == 82 * 160 + 123 + first
+    assert method.link_bytes(cells=0).total == first
 
 
 def test_bytes_of_what_is_not_features() -> None:

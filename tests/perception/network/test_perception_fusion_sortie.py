@@ -9,6 +9,8 @@ from perception_examples import capture, cross
 
 from sortie.perception.joining import LATE_MIN_SCORE, sendable
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
+from sortie.perception.network.fusion.base import Fusion
+from sortie.perception.network.fusion.when2com import When2com
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
@@ -51,6 +53,15 @@ def test_none_is_a_drone_alone_and_late_joins_the_same_boxes_from_maps_as_from_b
     assert len(whole) > len(single)
     assert not same(starved, whole)
     assert same(mute, single)
+
+
+def test_a_handshake_weighs_what_arrives(
+    scene: SceneModel, fleet: list[Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detector, job = TorchDetector(scene, Perception(fusion="when2com"), seed=1), (fleet[0], shares(fleet[1:]))
+    weighed = detector.detect([job])[0]
+    monkeypatch.setattr(When2com, "weigh", Fusion.weigh)
+    assert not same(detector.detect([job])[0], weighed)
 
 
 def test_late_fusion_sends_what_is_sure() -> None:

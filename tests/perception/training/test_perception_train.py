@@ -14,7 +14,7 @@ from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, 
 from sortie.perception.network.checkpoint import load_weights, read_facts, save_weights
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.training import train as training
-from sortie.perception.training.learn import Thinning, draw_batch, local_cars
+from sortie.perception.training.learn import Thinning, draw_batch, gradients, local_cars
 from sortie.perception.training.recipe import Recipe, command
 from sortie.perception.training.train import learning_rate, train
 from sortie.perception.training.validation import card
@@ -65,6 +65,23 @@ def test_batches_follow_from_seed_step_and_shard(frames: Frames) -> None:
     assert np.array_equal(a.est, b.est)
     others = [draw_batch(frames, 1, 4, 1), draw_batch(frames, 0, 5, 1), draw_batch(frames, 0, 4, 0)]
     assert not any(a.images.shape == o.images.shape and np.array_equal(a.images, o.images) for o in others)
+
+
+def test_keys_and_queries_learn_from_the_detection_loss(frames: Frames) -> None:
+    """Every part of the handshake has a gradient, the same for the same seed."""
+
+    def grads() -> dict[str, torch.Tensor]:
+        torch.manual_seed(3)
+        net = CarNet(ModelConfig(fusion="when2com")).train()
+        _, found = gradients(net, draw_batch(frames, 0, 1, 0), np.random.default_rng(1), torch.device("cpu"))
+        named = zip(net.named_parameters(), found, strict=True)
+        return {name: grad for (name, _), grad in named if name.startswith("fusion.handshake.")}
+
+    one, two = grads(), grads()
+    assert {name.split(".")[2] for name in one} == {"look", "query", "key", "match"}
+    # a key's bias moves all scores of a row alike, so it does not matter
+    assert all(bool(g.abs().max() > 0) for name, g in one.items() if name != "fusion.handshake.key.bias")
+    assert all(torch.equal(one[name], two[name]) for name in one)
 
 
 def test_the_rate_rises_and_falls() -> None:

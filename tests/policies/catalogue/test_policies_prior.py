@@ -237,7 +237,9 @@ def test_handshakes_are_those_of_the_methods() -> None:
 
 def test_own_fusions() -> None:
     own = {name: own_fusion(name) for name in POLICIES if own_fusion(name)}
-    assert own == {f"{fusion}-style": fusion for fusion in ("where2comm", "v2vnet", "disconet")}
+    assert own == {f"{fusion}-style": fusion for fusion in ("where2comm", "when2com", "v2vnet", "disconet")} | {
+        "who2com-style": "when2com"
+    }
 
 
 # --- the policy that reads and decides all -------------------------------------------------------
