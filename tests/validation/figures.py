@@ -103,6 +103,19 @@ def _fusion_methods() -> Tables:
     return {"fusion_methods": fusion_comparison.table(rows, "30 frames of the test split; intervals over scenes.")}
 
 
+def _handshakes() -> Tables:
+    import handshakes
+
+    from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.detector import shipped
+
+    split = make_split(Benchmark(), "test", ROOT / "runs/bench", scenes=60)
+    rows = handshakes.measure(load_weights(shipped("when2com")), load_frames(split), workers=2)
+    about = "60 frames of the test split, five egos each; intervals over scenes, differences in points of AP."
+    return {"handshakes": handshakes.table(rows, about)}
+
+
 def _link() -> Tables:
     import link
 
@@ -489,6 +502,7 @@ FIGURES: dict[str, Figure] = {
     "difficulty": Figure(12, _difficulty),
     "surrogate_in_flight": Figure(18, _surrogate_in_flight),
     "arms": Figure(20, _arms),
+    "handshakes": Figure(5, _handshakes),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out),

@@ -1,4 +1,4 @@
-"""Whom to ask for a map: learned handshakes against rules by geometry, on the same frames: `python tests/validation/handshakes.py`.
+"""Whom to ask for a map: learned handshakes against rules by geometry, on the same frames.
 
 Every way asks its peers for whole maps, which are fused by the same network (`perception.fusion: when2com`). Positions are the
 estimated ones.
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stored import Column, Table, points
 
 from sortie.perception.budget import payload_bytes
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy
@@ -79,8 +81,10 @@ class Chosen:
         if not isinstance(net.fusion, When2com):
             raise ValueError(f"weights are made for fusion {net.config.fusion!r}, must be 'when2com'")
         self._instrument, self._net, self._choice = CarNetInstrument(net), net, CHOICES[name]
+        self.start_worker = self._instrument.start_worker
         self.fingerprint = f"{name}:{self._instrument.fingerprint}"
         self.geometry = self._instrument.geometry
+        self._counting = Lock()
         self.links = 0
         """Maps that went over the air in all frames."""
 
@@ -91,7 +95,8 @@ class Chosen:
         overlap = footprint_overlap(xy_m, np.full(len(xy_m), FOOTPRINT_M))
         rng = stream(0, 0, (int(frames.scene[frame]), frame), "handshakes.random")
         asks = self._choice(attention_of(self._net, view), overlap, rng)
-        self.links += int(asks.sum())
+        with self._counting:
+            self.links += int(asks.sum())
         return ChosenView(view, asks)
 
 
@@ -139,7 +144,7 @@ class HandshakeRow:
     bytes_per_frame: float
 
 
-def measure(net: CarNet, frames: FleetFrames) -> list[HandshakeRow]:
+def measure(net: CarNet, frames: FleetFrames, workers: int = 1) -> list[HandshakeRow]:
     """Every choice against a drone alone and against the learned one of as many peers; scenes are the bootstrap's units.
 
     Raises:
@@ -148,12 +153,12 @@ def measure(net: CarNet, frames: FleetFrames) -> list[HandshakeRow]:
     drones = frames.est_pose.shape[1]
     scene = np.repeat(np.asarray(frames.scene), drones)
     count = len(frames.scene)
-    plain = evaluate(CarNetInstrument(net), frames, (SINGLE, FULL_SHARING), regions=("full",)).at(TAU)
+    plain = evaluate(CarNetInstrument(net), frames, (SINGLE, FULL_SHARING), regions=("full",), workers=workers).at(TAU)
     alone = plain.matched(SINGLE)
     found: dict[str, tuple[Sequence[Matched], int]] = {}
     for name in CHOICES:
         instrument = Chosen(net, name)
-        seen = evaluate(instrument, frames, (FULL_SHARING,), regions=("full",)).at(TAU)
+        seen = evaluate(instrument, frames, (FULL_SHARING,), regions=("full",), workers=workers).at(TAU)
         found[name] = seen.matched(FULL_SHARING), instrument.links
     found["everyone"] = plain.matched(FULL_SHARING), count * drones * (drones - 1)
     rows = []
@@ -174,38 +179,24 @@ def measure(net: CarNet, frames: FleetFrames) -> list[HandshakeRow]:
     return rows
 
 
-def table(rows: Sequence[HandshakeRow]) -> str:
-    """Markdown; differences in AP points with 95 % intervals."""
-
-    def points(d: Difference) -> str:
-        return f"{100 * d.delta:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]"
-
-    lines = [
-        "| asks for the maps of | maps an ego | MB a fleet-frame | AP@0.5 | over alone | over the learned choice above |",
-        "|---|---|---|---|---|---|",
+def table(rows: Sequence[HandshakeRow], about: str = "") -> Table:
+    """A row a way to choose."""
+    columns = [
+        Column("asks for the maps of"),
+        Column("maps an ego", ".2f"),
+        Column("a fleet-frame", ".2f", " MB", 1e-6),
+        Column("AP@0.5", ".3f"),
+        Column("over a drone alone", "+.1f", factor=100),
+        Column("over the learned choice above", "+.1f", factor=100),
     ]
-    for r in rows:
-        own = "–" if r.name.endswith("learned") else points(r.against_first)
-        lines.append(
-            f"| {r.name} | {r.links_per_ego:.2f} | {r.bytes_per_frame / 1e6:.2f} | {r.against_alone.ap_b:.3f} "
-            f"| {points(r.against_alone)} | {own} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    import argparse
-    import sys
-    from pathlib import Path
-
-    from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
-    from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.detector import WEIGHTS
-
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--weights", type=Path, default=WEIGHTS / "when2com.safetensors")
-    parser.add_argument("--scenes", type=int, default=60, help="scenes of the test split, one frame each")
-    parser.add_argument("--bench", type=Path, default=Path("runs/bench"))
-    args = parser.parse_args()
-    split = make_split(Benchmark(), "test", args.bench, scenes=args.scenes)
-    sys.stdout.write(table(measure(load_weights(args.weights), load_frames(split))))
+    return Table(
+        columns,
+        [
+            [
+                r.name, r.links_per_ego, r.bytes_per_frame, r.against_alone.ap_b, points(r.against_alone),
+                None if r.name.endswith("learned") else points(r.against_first),
+            ]
+            for r in rows
+        ],
+        about,
+    )  # fmt: skip

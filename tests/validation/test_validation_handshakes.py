@@ -67,6 +67,6 @@ def test_only_those_who_were_asked_are_heard_and_paid_for(frames: Seen, monkeypa
     assert [r.links_per_ego for r in rows.values()] == [1.0, 1.0, 4.0]
     one = 5 * 655_360
     assert [r.bytes_per_frame for r in rows.values()] == [one + 20 * 132, one, 4 * one]
-    assert "| everyone | 4.00 | 13.11 |" in handshakes.table(list(rows.values()))
+    assert "| everyone | 4.00 | 13.11 MB |" in handshakes.table(list(rows.values())).markdown()
     with pytest.raises(ValueError, match="weights are made for fusion 'disconet', must be 'when2com'"):
         handshakes.Chosen(network("disconet"), "most overlap")
