@@ -120,9 +120,9 @@ def test_an_effect_stands_when_all_that_states_it_stands(table: list[ClaimRow]) 
     found = rows.effects(first)
     assert len(found) == 17
     assert not {"bytes.full", "matched", "starved", "peers.all", "flip.0.25"} & set(found)
-    assert found["two or four at ρ = 0.25"] == "reproduced"
+    assert found["two or four at a budget of 0.25"] == "reproduced"
     worse = [replace(r, verdict="opposite") if r.id == "flip.0.25" else r for r in first]
-    assert rows.effects(worse)["two or four at ρ = 0.25"] == "opposite"
+    assert rows.effects(worse)["two or four at a budget of 0.25"] == "opposite"
     assert len(rows.effects(worse)) == 17
     stand = sum(v == "reproduced" for v in found.values())
     assert report.tally(first).startswith(f"{stand} of 17 independent effects stand (")
