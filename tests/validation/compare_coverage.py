@@ -1,7 +1,7 @@
 """How often the 95 % interval of `sortie compare --seeds 8` covers the difference that it estimates.
 
-    python tests/validation/compare_coverage.py fly      # about an hour on one core, goes on where it stopped
-    python tests/validation/compare_coverage.py report   # writes docs/results/coverage.md from the stored table
+    python tests/validation/compare_coverage.py [WORKERS]    # flies what compare_coverage.csv lacks
+    make figures FIGURE=coverage                             # counts, for docs/results/coverage.md
 
 The plan, written before anything was flown:
 
@@ -29,21 +29,18 @@ import csv
 import math
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from stored import Cell, Column, Table
 
 import sortie
-from sortie.scenarios.report_text import table
-from sortie.sim.folders import put_between
 from sortie.sim.studies.compare import AREAS, SEEDS, over_sorties
 
 TABLE = Path(__file__).parent / "compare_coverage.csv"
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "coverage.md"
-BEGIN, END = "<!-- coverage:begin -->", "<!-- coverage:end -->"
 SHORT = {"duration_s": 10, "mission.phases.1.at_s": 3, "perception.detector": "surrogate"}
 POLICIES = ("worked", "all-4", "silence")
 CONTRASTS = tuple(f"{policy} {area}" for policy in POLICIES[1:] for area in AREAS)
@@ -155,42 +152,23 @@ def promised() -> float:
     return float(2 * stats.t.cdf(stats.t.ppf(0.975, SEEDS - 1) / math.sqrt(2), SEEDS - 1) - 1)
 
 
-def section() -> str:
-    """What stands between the page's markers."""
-    truth, _ = gains()
-    hits, following = covered(printed), next_within(printed)
-    others = {"percentile bootstrap": "percentile", "BCa bootstrap": "BCa"}
-    error = 100 * hits.mean(axis=1).std(ddof=1) / math.sqrt(len(hits))
-    rows = [_row("Student's, printed", hits), *(_row(name, covered(resampled(m))) for name, m in others.items())]
-    head = ("interval", *(" in the ".join(TOLD[part] for part in c.split()) for c in CONTRASTS), "all four")
-    true = (f"{100 * mean:+.2f}" for mean in np.nanmean(truth, axis=0))
-    return "\n".join(
-        [
-            BEGIN, "",
-            f"Coverage of the true difference over {REPETITIONS} repetitions of {SEEDS} sorties, in per cent.",
-            "", *table(head, [*rows, ("true difference, AP points", *true, "")]), "",
-            f"The standard error of the first row's last figure is {error:.1f} points.",
-            "",
-            f"Added after the sorties were flown: of 20,000 random eights of the {FLOWN.stop - FLOWN.start} sorties, the printed "
-            f"interval holds the mean of all of them in {_spelt(eights())} of draws, by contrast.",
-            "",
-            f"The next repetition's point estimate lies within the printed interval in {100 * following.mean():.1f} % of "
-            f"{following.size} pairs; {100 * promised():.1f} % is what the interval promises.",
-            "", END,
-        ]
-    )  # fmt: skip
-
-
-def _spelt(hits: Floats) -> str:
-    return ", ".join(f"{100 * share:.1f} %" for share in hits.mean(axis=0))
-
-
-def _row(name: str, hits: Floats) -> Iterator[str]:
-    return iter((name, *(f"{100 * share:.1f}" for share in hits.mean(axis=0)), f"{100 * hits.mean():.1f}"))
+def table() -> Table:
+    """A row a way to make the interval, a column a contrast; shares in per cent."""
+    rows: list[list[Cell]] = []
+    ways = {"Student's, as printed": printed, "percentile bootstrap": resampled("percentile"), "BCa": resampled("BCa")}
+    for name, interval in ways.items():
+        hits = covered(interval)
+        error = float(hits.mean(axis=1).std(ddof=1) / math.sqrt(len(hits)))
+        rows.append([f"{name}: holds the true difference", *hits.mean(axis=0).tolist(), float(hits.mean()), error])
+    following = next_within(printed)
+    rows.append(["Student's: holds the next estimate", *following.mean(axis=0).tolist(), float(following.mean()), None])
+    rows.append(["the same, by Student's distribution", *[promised()] * (len(CONTRASTS) + 1), None])
+    at_random = eights()
+    rows.append(["Student's: random eights", *at_random.mean(axis=0).tolist(), float(at_random.mean()), None])
+    names = (" in the ".join(TOLD[part] for part in contrast.split()) for contrast in CONTRASTS)
+    shares = [Column(name, ".1f", factor=100) for name in (*names, "all four", "standard error")]
+    return Table([Column("in per cent"), *shares], rows)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["fly"]:
-        fly(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
-    else:
-        put_between(PAGE, section(), BEGIN, END)
+    fly(int(sys.argv[1]) if len(sys.argv) > 1 else 1)

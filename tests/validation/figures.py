@@ -236,11 +236,11 @@ def _arms() -> Tables:
                 [
                     arm.text,
                     phase,
-                    *(m and (m[0] if m[2] < 2 else (m[0], m[0] - 1.96 * m[1], m[0] + 1.96 * m[1])) for m in means),
+                    *(m and (m.mean if m.count < 2 else (m.mean, m.low, m.high)) for m in means),
                 ]
             )
     budgets = [Column(f"budget {budget:g}", "+.1f", factor=100) for budget in BUDGETS]
-    about = f"{len(lessons)} training conditions; AP points over maps to all, ± 1.96 standard errors."
+    about = f"{len(lessons)} training conditions; AP points over maps to all, with 95 % intervals over conditions."
     return {"arms": Table([Column("arm"), Column("phase"), *budgets], rows, about)}
 
 
@@ -364,12 +364,19 @@ def seeds_table(tables: Mapping[str, Sequence[Any]]) -> Table:
 
 
 def _compare() -> Tables:
-    command = ("compare", "track_target", "--policies", "worked,all-4,silence")
+    command = ("compare", "track_target", "--policies", "worked,all-4,silence", "--seeds", "8")
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "page.md"
         page.write_text("<!-- compare:begin --><!-- compare:end -->", "utf-8")
         _sortie(*command, "--readme", page)
         return {"compare": _between(page.read_text("utf-8"), "compare")}
+
+
+def _coverage() -> Tables:
+    """From the stored sorties; `python tests/validation/compare_coverage.py` flies those that are missing."""
+    import compare_coverage
+
+    return {"coverage": compare_coverage.table()}
 
 
 def _hysteresis() -> Tables:
@@ -486,6 +493,7 @@ FIGURES: dict[str, Figure] = {
     "flight": Figure(0.5, _flight),
     "survey": Figure(1, _survey),
     "compare": Figure(2, _compare),
+    "coverage": Figure(0.5, _coverage),
     "viewpoints": Figure(2, _viewpoints),
     "where_boxes_average": Figure(3, _where_boxes_average),
     "live": Figure(3.5, _live, timed=True),

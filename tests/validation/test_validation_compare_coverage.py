@@ -1,9 +1,8 @@
-"""The interval of `sortie compare` covers what it promises, counted anew from the stored sorties; the page says the same."""
+"""The interval of `sortie compare` covers what it promises, counted anew from the stored sorties."""
 
 from __future__ import annotations
 
 import compare_coverage
-import pytest
 
 
 def test_the_printed_interval_covers_the_true_difference() -> None:
@@ -11,8 +10,3 @@ def test_the_printed_interval_covers_the_true_difference() -> None:
     assert abs(compare_coverage.covered(compare_coverage.printed).mean() - 0.95) < 3 * 0.011
     shares = compare_coverage.eights(2000).mean(axis=0)
     assert 0.93 < shares.min() <= shares.max() < 0.97
-
-
-@pytest.mark.slow
-def test_the_page_holds_what_the_stored_sorties_give() -> None:
-    assert compare_coverage.section() in compare_coverage.PAGE.read_text()
