@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from stored import FOLDER, MARKED, ROOT, Column, Table, rendered, save, sections
 
+from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.sim.folders import write_text
 
@@ -155,7 +156,7 @@ def _flight() -> Tables:
 def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: bool = False) -> Table:
     """As `sortie compare NAME --policies …`: every policy's AP, and its gain over the best fixed one, by phase and budget."""
     from sortie.perception.detectors import make_detector
-    from sortie.sim.studies.conditions import best_fixed, fly_all, paired_interval, summarise
+    from sortie.sim.studies.conditions import best_fixed, fly_all, summarise
     from sortie.sim.studies.in_flight import torch_answers
 
     conditions = load_conditions(name)
@@ -173,8 +174,8 @@ def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: b
 
     def gain(policy: str, part: Sequence[Any]) -> tuple[float, float, float] | None:
         over = np.array([ap[policy, c.name] - ap[first, c.name] for c in part])
-        over = over[np.isfinite(over)]
-        return (float(over.mean()), *paired_interval(over)) if len(over) else None
+        found = mean_interval(over, SHARE.of_differences())
+        return (found.mean, found.low, found.high) if found.count else None
 
     gains = ["searching", "tracking", *(f"budget {budget:g}" for budget in budgets)]
     return Table(
