@@ -19,8 +19,13 @@ The plan, written before anything was flown:
 
 Two other ways to make an interval are reported for comparison: the percentile and the BCa bootstrap (`scipy.stats.bootstrap`).
 
-Added after the sorties were flown, since 200 repetitions leave an error of a point and more: `eights` draws eight of the 1,600
-sorties at random, 20,000 times, and counts how often the interval holds the mean of all 1,600.
+Added after the first run's sorties were flown, since 200 repetitions leave an error of a point and more: `eights` draws eight
+of a run's 1,600 sorties at random, 20,000 times, and counts how often the interval holds the mean of all 1,600.
+
+The first run held the true difference in 92.9 % of the pairs, with a standard error of 1.1: hypothesis 1 was missed. A second
+run was planned then, before any of it was flown: the same plan and hypotheses, seeds 4,010,001 to 4,012,000, and the policies
+as they are after the first run (best peers by the receiver's footprint, links with a state, damping to the least). Both runs
+are reported, whatever the second one gives. The first run's sorties cannot be flown again by this version.
 """
 
 from __future__ import annotations
@@ -44,9 +49,11 @@ TABLE = Path(__file__).parent / "compare_coverage.csv"
 SHORT = {"duration_s": 10, "mission.phases.1.at_s": 3, "perception.detector": "surrogate"}
 POLICIES = ("worked", "all-4", "silence")
 CONTRASTS = tuple(f"{policy} {area}" for policy in POLICIES[1:] for area in AREAS)
-TRUTH = range(4_000_001, 4_000_401)
 REPETITIONS = 200
-FLOWN = range(TRUTH.stop, TRUTH.stop + SEEDS * REPETITIONS)
+FIRST_SEED = {"first run": 4_000_001, "second run": 4_010_001}
+"""By run. The first 400 sorties of a run give the true difference, the others its repetitions."""
+TRUTHS = 400
+PER_RUN = TRUTHS + SEEDS * REPETITIONS
 TOLD = {"all-4": "full sharing", "silence": "silence", "full_scene": "full scene", "mission": "mission disc"}
 
 Floats = NDArray[np.float64]
@@ -61,9 +68,10 @@ def fly_some(seeds: Sequence[int]) -> list[list[str]]:
 
 
 def fly(workers: int) -> None:
-    """Fly what the table lacks."""
+    """Fly what the table lacks of the second run."""
     done = set() if not TABLE.exists() else {int(row["seed"]) for row in _rows()}
-    missing = [seed for seed in (*TRUTH, *FLOWN) if seed not in done]
+    begin = FIRST_SEED["second run"]
+    missing = [seed for seed in range(begin, begin + PER_RUN) if seed not in done]
     if not TABLE.exists():
         TABLE.write_text(",".join(["seed", *CONTRASTS]) + "\n")
     with ProcessPoolExecutor(workers) as pool, TABLE.open("a", newline="") as file:
@@ -84,11 +92,11 @@ def _rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def gains() -> tuple[Floats, Floats]:
-    """The stored gains: [400, contrasts] for the truth, [repetitions, 8, contrasts]; NaN where there was nothing to find."""
+def gains(run: str) -> tuple[Floats, Floats]:
+    """A run's gains: [400, contrasts] for the truth, [repetitions, 8, contrasts]; NaN where there was nothing to find."""
     of = {int(row["seed"]): [float(row[c] or "nan") for c in CONTRASTS] for row in _rows()}
-    flown = np.array([of[seed] for seed in FLOWN])
-    return np.array([of[seed] for seed in TRUTH]), flown.reshape(REPETITIONS, SEEDS, len(CONTRASTS))
+    flown = np.array([of[seed] for seed in range(FIRST_SEED[run], FIRST_SEED[run] + PER_RUN)])
+    return flown[:TRUTHS], flown[TRUTHS:].reshape(REPETITIONS, SEEDS, len(CONTRASTS))
 
 
 def printed(values: Floats) -> tuple[float, float]:
@@ -110,16 +118,16 @@ def resampled(method: str) -> Interval:
     return interval
 
 
-def covered(interval: Interval) -> Floats:
+def covered(run: str, interval: Interval) -> Floats:
     """[repetitions, contrasts]: 1 where a repetition's interval holds the true difference."""
-    truth, flown = gains()
+    truth, flown = gains(run)
     true = np.nanmean(truth, axis=0)
     return np.array([[_holds(interval(v), t) for v, t in zip(rep.T, true, strict=True)] for rep in flown])
 
 
-def eights(draws: int = 20_000) -> Floats:
+def eights(run: str, draws: int = 20_000) -> Floats:
     """[draws, contrasts]: 1 where the printed interval of eight random sorties holds the mean of all of them."""
-    sorties = gains()[1].reshape(-1, len(CONTRASTS))
+    sorties = gains(run)[1].reshape(-1, len(CONTRASTS))
     rng = np.random.default_rng(0)
     return np.array(
         [
@@ -129,9 +137,9 @@ def eights(draws: int = 20_000) -> Floats:
     )
 
 
-def next_within(interval: Interval) -> Floats:
+def next_within(run: str, interval: Interval) -> Floats:
     """[repetitions - 1, contrasts]: 1 where a repetition's interval holds the next one's point estimate."""
-    _, flown = gains()
+    _, flown = gains(run)
     means = np.nanmean(flown, axis=1)
     return np.array(
         [
@@ -153,21 +161,25 @@ def promised() -> float:
 
 
 def table() -> Table:
-    """A row a way to make the interval, a column a contrast; shares in per cent."""
+    """A row a run and a way to make the interval, a column a contrast; shares in per cent."""
     rows: list[list[Cell]] = []
     ways = {"Student's, as printed": printed, "percentile bootstrap": resampled("percentile"), "BCa": resampled("BCa")}
-    for name, interval in ways.items():
-        hits = covered(interval)
-        error = float(hits.mean(axis=1).std(ddof=1) / math.sqrt(len(hits)))
-        rows.append([f"{name}: holds the true difference", *hits.mean(axis=0).tolist(), float(hits.mean()), error])
-    following = next_within(printed)
-    rows.append(["Student's: holds the next estimate", *following.mean(axis=0).tolist(), float(following.mean()), None])
-    rows.append(["the same, by Student's distribution", *[promised()] * (len(CONTRASTS) + 1), None])
-    at_random = eights()
-    rows.append(["Student's: random eights", *at_random.mean(axis=0).tolist(), float(at_random.mean()), None])
+    for run in FIRST_SEED:
+        for name, interval in ways.items():
+            hits = covered(run, interval)
+            error = float(hits.mean(axis=1).std(ddof=1) / math.sqrt(len(hits)))
+            rows.append([f"{run}. {name}: holds the true difference", *_means(hits), error])
+        rows.append([f"{run}. Student's: holds the next estimate", *_means(next_within(run, printed)), None])
+        rows.append([f"{run}. Student's: random eights", *_means(eights(run)), None])
+    rows.append(["Student's distribution: the next estimate", *[promised()] * (len(CONTRASTS) + 1), None])
     names = (" in the ".join(TOLD[part] for part in contrast.split()) for contrast in CONTRASTS)
     shares = [Column(name, ".1f", factor=100) for name in (*names, "all four", "standard error")]
     return Table([Column("in per cent"), *shares], rows)
+
+
+def _means(hits: Floats) -> list[float]:
+    """Of each contrast, and of all."""
+    return [*hits.mean(axis=0).tolist(), float(hits.mean())]
 
 
 if __name__ == "__main__":

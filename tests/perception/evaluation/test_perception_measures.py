@@ -62,7 +62,7 @@ def test_the_widest_of_several() -> None:
     against = tuple(Contrast((all_4(rho),), (FULL_SHARING,), "mission") for rho in (0.05, 0.1))
     got = Widest(against).measure(scores)
     assert got.value == pytest.approx(-4.0)
-    assert got.note == "at ρ = 0.05"
+    assert got.note == "at a budget of 0.05"
 
 
 def test_the_part_of_the_gain_that_is_kept() -> None:

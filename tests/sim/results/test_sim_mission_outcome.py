@@ -23,7 +23,6 @@ from sortie.perception.scene.render import AXES
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView
-from sortie.sim.cli.tables import comparison_table, outcome_table
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.mission_outcome import sees_ground
@@ -32,7 +31,9 @@ from sortie.sim.results.outcome_fields import check_number, open_keys
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report import page
 from sortie.sim.results.sightings import sightings
+from sortie.sim.results.summary import outcome_table
 from sortie.sim.studies.compare import Contender, compare
+from sortie.sim.studies.comparison_text import comparison_table
 
 STILL = (
     "fleet.route.waypoints_m=[[0, 0]]",
@@ -305,13 +306,13 @@ def test_the_share_flown_is_the_first_line_where_it_is_below_one(whole: SortieRe
 
 
 def test_a_comparison_shows_it_first(thinned: SortieRecord) -> None:
-    rows, _ = compare([Contender("worked", example(*SEEING, LOSS)), Contender("silence", example(*SEEING))], [1])
-    table = comparison_table(rows)
+    flown = compare([Contender("worked", example(*SEEING, LOSS)), Contender("silence", example(*SEEING))], [1])
+    table = comparison_table(flown)
     names = list(table.columns[0].cells)
     assert names[:3] == ["flown", "AP@0.5 full scene", "  grounded drones blind"]
     assert [next(iter(column.cells)) for column in table.columns[1:]] == ["90.0 %", "100.0 %"]
-    (alone,), _ = compare([Contender("worked", example("duration_s=1", "mission.phases=[{}]"))], [1])
-    assert "flown" not in list(comparison_table([alone]).columns[0].cells)
+    alone = compare([Contender("worked", example("duration_s=1", "mission.phases=[{}]"))], [1])
+    assert "flown" not in list(comparison_table(alone).columns[0].cells)
 
 
 def test_expectations_and_campaigns_name_them(tmp_path: Path) -> None:
