@@ -1,15 +1,15 @@
-"""The study's report, written by rule from its rows: Markdown, and the README's sentences. Pure text."""
+"""The study's report, written by rule from its rows: Markdown, and the section of the page on the flip. Pure text."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sortie.perception.benchmark.dataset import SIZES
 from sortie.perception.evaluation.results import TAU
 from sortie.perception.study.measure import StudyRow
-from sortie.perception.study.plan import StudyPlan
+from sortie.perception.study.plan import StudyPlan, Variant
 from sortie.scenarios.report_text import NONE, interval, listed, picture, signed, table
 
 BEGIN, END = "<!-- study:begin -->", "<!-- study:end -->"
@@ -114,10 +114,19 @@ def thresholds(plan: StudyPlan, found: StudyRows) -> str:
 
 
 def short(plan: StudyPlan, rows: Sequence[StudyRow], link: str) -> str:
-    """The README's section between its markers: three sentences."""
-    sentences = answers(plan, StudyRows(rows))[:3]
+    """The page's section between its markers: the findings, and a table of the networks that they compare."""
+    found = StudyRows(rows)
+    compared = [plan.variants[0], *_dropped(plan)]
+    views = {v.job(s): FixedSettings(v.name, s) for v in compared for s in v.seeds}
     whole = f"{on_frames(rows)} The whole study: [{link}]({link})."
-    return "\n".join([BEGIN, "", *(s.removeprefix("- ") for s in sentences), whole, "", END])
+    zero = _table(plan, found, "network, zero fill", views)
+    masked = _table(plan, found, "network, masked", {n: replace(view, unsent="masked") for n, view in views.items()})
+    return "\n".join([BEGIN, "", *answers(plan, found)[:-1], "", *zero, "", *masked, "", _LEGEND, "", whole, "", END])
+
+
+def _dropped(plan: StudyPlan) -> list[Variant]:
+    """The variants that were trained with cells dropped at random."""
+    return [v for v in plan.variants if v.recipe.get("cell_dropout")]
 
 
 def on_frames(rows: Sequence[StudyRow]) -> str:
@@ -131,60 +140,35 @@ def on_frames(rows: Sequence[StudyRow]) -> str:
 def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
     """What the rows show about the paper's observation and about each part of the hypothesis."""
     m, networks = plan.measured, found.networks()
-    first = plan.variants[0].name
-    seeds = [s for v, s in networks if v == first]
-    flipped = [f"{v}-{s}" for v, s in networks for u in m.unsent if flips(found, FixedSettings(v, s, u), m.budgets)]
-    fallen = [
-        f"{v}-{s}"
-        for v, s in networks
-        for u in m.unsent
-        if sign(found.get(FixedSettings(v, s, u), "starved", m.starved)) < 0
-    ]
-    little = min(m.budgets)
-    contrast = [found.get(FixedSettings(first, s), "contrast", little) for s in seeds]
-    starved = [found.get(FixedSettings(first, s), "starved", m.starved) for s in seeds]
-    fill = [found.get(FixedSettings(first, s), "fill", m.starved) for s in seeds]
-    masked = [found.get(FixedSettings(first, s, "masked"), "contrast", little) for s in seeds]
+    views = {(f"{v}-{s}", u): FixedSettings(v, s, u) for v, s in networks for u in m.unsent}
+    flipped = [name for (name, _), view in views.items() if flips(found, view, m.budgets)]
+    fallen = [name for (name, _), view in views.items() if sign(found.get(view, "starved", m.starved)) < 0]
     swept = [
-        name
-        for v, s in networks for u in m.unsent for t in m.taus for c in m.cells_by for d in m.densities
-        for name in [f"{v}-{s}, {u}, cells by {c}, τ {t}, {d}"]
-        if flips(found, FixedSettings(v, s, u, c, str(t), d), m.budgets)
+        f"{name}, {u}, cells by {c}, τ {t}, {d}"
+        for (name, u), view in views.items() for t in m.taus for c in m.cells_by for d in m.densities
+        if flips(found, replace(view, cells_by=c, tau_name=str(t), density=d), m.budgets)
     ]  # fmt: skip
-    flip = "No network shows the flip" if not flipped else f"The flip shows in {', '.join(dict.fromkeys(flipped))}"
-    fall = "none falls" if not fallen else f"{', '.join(dict.fromkeys(fallen))} fall"
-    dropped = [v for v in plan.variants if v.recipe.get("cell_dropout")]
     lines = [
-        f"- {flip} at the model's own threshold among {len(networks)} networks under {listed(m.unsent)} filling, and {fall} "
-        f"below a single drone at a budget of {m.starved:g}: with {first} (seeds {listed(seeds)}) two peers minus four at a budget of {little:g} "
-        f"is {_several(contrast)} under zero fill and the starved fleet minus a single drone {_several(starved)}.",
-        f"- Zero fill costs {_several(fill)} against masked fusion at a budget of {m.starved:g}, significantly in "
-        + " and ".join(
-            f"{sum(sign(found.get(FixedSettings(v.name, s), 'fill', m.starved)) < 0 for s in its)} of {len(its)} networks of `{v.name}`"
-            for v in (plan.variants[0], *dropped)
-            if (its := [s for s in v.seeds if (v.name, s) in networks])
-        )
-        + f": masking moves the contrast at a budget of {little:g} to {_several(masked)}"
-        + "".join(
-            f", {v.name} training to {_several([found.get(FixedSettings(v.name, s), 'contrast', little) for s in seeds])}"
-            for v in dropped
-            if any((v.name, s) in networks for s in seeds)
-        )
-        + ".",
-        "- Over every threshold, ranking, filling, density and network measured the flip appears "
-        + (
-            f"in {len(swept)} of the cases: {'; '.join(swept[:6])}{' …' if len(swept) > 6 else ''}."
-            if swept
-            else "nowhere."
-        )
-        + " "
-        + (
-            "The hypothesis names what the flip would be removed by; where there is none to remove, its cause is not shown by this benchmark."
-            if not flipped
-            else "Where it appears, the tables below say what removes it."
-        ),
+        f"- **The flip appears in {_of(flipped, networks)}**, at the model's own threshold, under {listed(m.unsent)} filling.",
+        f"- At a budget of {m.starved:g}, {_of(fallen, networks)} have a lower AP than a drone alone.",
     ]
-    oracles = [found.get(FixedSettings(v, s, u), "oracle") for v, s in networks for u in m.unsent]
+    for v in (plan.variants[0], *_dropped(plan)):
+        if its := [f"{v.name}-{s}" for s in v.seeds if (v.name, s) in networks]:
+            costs = [n for n in its if sign(found.get(views[n, m.unsent[0]], "fill", m.starved)) < 0]
+            lines.append(
+                f"- Zero fill has a significantly lower AP than masked fusion, at that budget, in {len(costs)} of the "
+                f"{len(its)} networks `{v.name}`."
+            )
+    lines.append(
+        "- Over all thresholds, rankings, fillings, densities and networks, the flip appears "
+        + (f"in {len(swept)} cases: {'; '.join(swept[:6])}{' …' if len(swept) > 6 else ''}." if swept else "nowhere.")
+    )
+    lines.append(
+        "- The tables say what removes the flip where it appears."
+        if flipped
+        else "- The effect did not appear, so this experiment cannot say what causes it."
+    )
+    oracles = [found.get(view, "oracle") for view in views.values()]
     gains = [r for r in oracles if r is not None]
     if gains:
         top = max(gains, key=lambda r: r.value)
@@ -193,6 +177,13 @@ def answers(plan: StudyPlan, found: StudyRows) -> list[str]:
             f"the best single one ({top.variant}-{top.seed}, {top.unsent})."
         )
     return lines
+
+
+def _of(names: Sequence[str], networks: Sequence[object]) -> str:
+    """Which of the networks."""
+    return (
+        f"none of the {len(networks)} networks" if not names else f"the networks {listed(list(dict.fromkeys(names)))}"
+    )
 
 
 _LEGEND = (
@@ -252,11 +243,6 @@ def _plain(row: StudyRow | None) -> str:
 
 def _difference(row: StudyRow | None) -> str:
     return NONE if row is None else interval(row.value, row.low, row.high, signed)
-
-
-def _several(rows: Sequence[StudyRow | None]) -> str:
-    there = [r for r in rows if r is not None]
-    return listed([_difference(r) for r in there]) if there else "not measured"
 
 
 def _quoted(text: str) -> list[str]:

@@ -78,14 +78,14 @@ def test_the_report_tells_of_a_flip_where_there_is_one_and_names_what_is_missing
     plan = read_plan()
     rows = rows_with((7.7, 1.4, -4.0, -4.8)) + rows_with((-2, -2, -2, -2), unsent="masked")
     text = report(plan, rows)
-    assert "The flip shows in full-0" in text
-    assert "full-0 fall below a single drone" in text
+    assert "The flip appears in the networks full-0" in text
+    assert "the networks full-0 have a lower AP than a drone alone" in text
     assert "▲ +7.7 [+6.7, +8.7]" in text
     assert "▼ −4.8 [−5.8, −3.8]" in text
     assert "Not trained yet" in text
     assert "deep-0" in text.partition("Not trained yet")[2]
     quiet = "\n".join(answers(plan, StudyRows(rows_with((-2, -2, -2, -2)))))
-    assert "No network shows the flip" in quiet
+    assert "The flip appears in none of the 1 networks" in quiet
     assert "appears nowhere" in quiet
 
 
