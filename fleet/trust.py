@@ -144,7 +144,7 @@ def judge(
             others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
             doubt = (
                 (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
-                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps / 2)
+                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
                     standing.least_soc,
@@ -206,18 +206,19 @@ def coverage_doubt(d: Descriptor, seen_per_metre: float, blur_m: float = 0.0) ->
     return f"coverage: {missing} cells unseen that it must see" if missing >= FALSE_CELLS else ""
 
 
-def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival], rounded_mbps: float = 0.0) -> str:
+def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival], step_mbps: float = 0.0) -> str:
     """What a goodput claim says against the payloads that came over the link; empty where it may be so.
 
-    Args: `rounded_mbps` is how far the claim may be off by the descriptor's form.
+    Args: `step_mbps` is the step in which the descriptor's form writes goodputs. Rounding adds or takes half of it, and a weak
+    link that would round to nothing reads a whole step.
     """
     if not arrivals:
         return ""
     fastest_mbps = max(a.phy_mbps for a in arrivals)
-    if claimed_mbps - rounded_mbps > OVERSTATED * fastest_mbps:
+    if claimed_mbps - step_mbps > OVERSTATED * fastest_mbps:
         return f"goodput: {claimed_mbps:.0f} Mb/s claimed, frames came at {fastest_mbps:.0f}"
     rates = [a.mbps for a in arrivals if a.size_bytes >= LARGE_BYTES]
-    if rates and claimed_mbps + rounded_mbps < UNDERSTATED * median(rates):
+    if rates and claimed_mbps + step_mbps / 2 < UNDERSTATED * median(rates):
         return f"goodput: {claimed_mbps:.1f} Mb/s claimed, {median(rates):.0f} arrived"
     return ""
 

@@ -73,7 +73,7 @@ class Descriptor(NamedTuple):
     footprint_radius_m: float
     battery_soc: float
     cpu_headroom: float
-    """Share of the companion computer's processor that was left over the last frame, 0 … 1."""
+    """Share of the companion computer's processor that was left over in the last second, 0 … 1."""
     gpu_headroom: float
     """The same of its accelerator."""
     peer_goodput_mbps: tuple[float, ...]
@@ -125,6 +125,15 @@ class FleetView(NamedTuple):
         """Ids of the other drones heard, ascending."""
         ego = self.ego
         return tuple([i for i in sorted(self.descriptors) if i != ego])
+
+    @property
+    def full_sharing_maps(self) -> int:
+        """The maps that a drone sends, and receives, under full sharing: N − 1 in a fleet of N, heard or not.
+
+        N counts the ego's roster, and drones that were heard beyond it.
+        """
+        me = self.me
+        return max(len(self.peers), 0 if me is None else len(me.peer_goodput_mbps))
 
 
 class Directive(NamedTuple):

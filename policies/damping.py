@@ -149,8 +149,11 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
             return current
         rest = proposed if proposed.representation == _NONE else current
         return rest if duty == rest.duty_percent else rest._replace(duty_percent=duty, reason=proposed.reason)
+    # The share of cells of another rung does not bound this one's.
     if proposed.representation < current.representation:
-        rho, roi = proposed.rho, proposed.roi  # the budget of another rung does not bound this one
+        rho, roi = proposed.rho, proposed.roi
+    elif proposed.representation > current.representation:
+        rho, roi = current.rho, _lower_roi(current.roi, proposed.roi)
     else:
         rho, roi = min(current.rho, proposed.rho), _lower_roi(current.roi, proposed.roi)
     reduced = proposed._replace(

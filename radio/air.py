@@ -34,7 +34,7 @@ from sortie.radio.relay import Routes
 from sortie.radio.sample import IntArray, Sample, Service
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
 from sortie.scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
@@ -405,7 +405,8 @@ class Air:
                 else:
                     since, bits = s.t_queued_s, drained - s.drained_bits
                 if now - since >= _WINDOW_S:
-                    known[s.receiver] = min(known[s.receiver], max(bits / (now - since) * 1e-6, SILENT_MBPS))
+                    least_mbps = SILENT_MBPS if s is head else WAITING_MBPS
+                    known[s.receiver] = min(known[s.receiver], max(bits / (now - since) * 1e-6, least_mbps))
         return known
 
     def _book(self, s: Sample) -> None:

@@ -19,7 +19,7 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
 
 RISE = 0.3
 
@@ -37,9 +37,9 @@ class Goodput:
         row[receiver] = before + RISE * (mbps - before) if 0.0 < before < mbps else max(mbps, SILENT_MBPS)
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
-        """A link cannot be said to be better than this now; an unmeasured link stays unmeasured."""
+        """A link cannot be said to be better than this now; its state stays, since nothing was tried over it."""
         row = self._mbps[sender]
-        row[receiver] = min(row[receiver], max(mbps, SILENT_MBPS))
+        row[receiver] = min(row[receiver], max(mbps, WAITING_MBPS))
 
     def read(self, sender: int) -> list[float]:
         """The estimates to all drones (0 where unmeasured, and to itself)."""

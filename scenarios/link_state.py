@@ -18,6 +18,10 @@ SILENT_MBPS = 2.0**-10
 """What a measured link reads at least: about 1 kb/s, exact as a 32-bit float."""
 
 
+WAITING_MBPS = 2 * SILENT_MBPS
+"""What a link reads at least if its payloads only waited behind others: nothing was tried, so it is not silent."""
+
+
 class LinkState(IntEnum):
     """What is known of an outgoing link."""
 

@@ -166,6 +166,8 @@ def _to_int(value: float, bounds: tuple[float, float], bits: int) -> int:
     if bounds is _GOODPUT and value <= 0.0:
         return 0
     steps = round((min(max(value, low), high) - low) / _step(bounds, bits)) + (bounds is _GOODPUT)
+    if bounds is _GOODPUT and value > SILENT_MBPS:
+        steps = max(steps, 2)  # measured, however weak: not silent
     # a radius of a region is above 0, however coarse
     return max(steps, 1) if bounds is _REGION[2] else steps
 

@@ -238,21 +238,21 @@ FLIP = (
     Claim(
         "flip.crossover", "budget, 7", "The lead changes between 5 and 10 % of the bytes, at", "%",
         Paper(low=5.0, high=10.0, digits=0), Crossover(_CONCENTRATING), verdict.same_place, headline=True,
-        effect="choosing by budget",
+        defined=True,  # follows from the four contrasts above
     ),
     Claim(
         "wrong.starved", "budget, 9", "The winner at a budget of 0.25, used at 0.02, loses", POINTS,
         Paper(-7.7), WrongChoice(POLICIES, chosen_at=3, judged_at=0), headline=True,
-        effect="choosing by budget",
+        effect="two or four at a budget of 0.02",
     ),
     Claim(
         "wrong.plentiful", "budget, 9", "The winner at a budget of 0.02, used at 0.25, loses", POINTS,
         Paper(-4.8), WrongChoice(POLICIES, chosen_at=0, judged_at=3), headline=True,
-        effect="choosing by budget",
+        effect="two or four at a budget of 0.25",
     ),
     Claim("oracle.level", "budget, 11", "Mean AP of the oracle", AP, Paper(0.320, digits=3), MeanLevel(POLICIES, fixed=False), verdict.level),
     Claim("fixed.level", "budget, 11", "Mean AP of the best fixed policy", AP, Paper(0.299, digits=3), MeanLevel(POLICIES, fixed=True), verdict.level),
-    Claim("oracle", "budget, 11", "The oracle over the best fixed policy", POINTS, Paper(2.1), Oracle(POLICIES), headline=True, effect="choosing by budget"),
+    Claim("oracle", "budget, 11", "The oracle over the best fixed policy", POINTS, Paper(2.1), Oracle(POLICIES), headline=True, defined=True),  # the difference of the two levels above
     Claim(
         "oracle.held-out", "budget, 13", "The same, chosen on half of the frames, judged on the rest", POINTS,
         Paper(2.0), Oracle(POLICIES, held_out=True), headline=True, effect="choosing by budget",

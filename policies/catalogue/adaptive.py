@@ -97,7 +97,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
 
     Samples beyond that would wait for one another and miss their deadlines.
     """
-    measured = [me.goodput_to(peer) for peer in peers if me.link_state(peer) == LinkState.MEASURED]
+    measured = [me.goodput_to(peer) for peer in peers if me.link_state(peer) != LinkState.NEVER_MEASURED]
     if not measured:
         return 1.0
     share = CARRIED * fsum(measured) / len(measured) / (len(peers) * FEATURE_MAP_MEGABITS * RATE_HZ)

@@ -38,26 +38,25 @@ def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive
     """
     if view.me is None:
         return []
-    peers, ids = view.peers, sorted(view.descriptors)
     # the cells left over go to the lowest ids, which costs no ranking of every receiver's senders
-    place = ids.index(view.ego)
+    place, maps = sorted(view.descriptors).index(view.ego), view.full_sharing_maps
     return [
-        full_sharing(
-            view.ego, p, _rho(received_budget, len(peers), place - (p < view.ego), len(peers)), "fixed: every peer"
-        )
-        for p in peers
+        full_sharing(view.ego, p, _rho(received_budget, maps, place - (p < view.ego), maps), "fixed: every peer")
+        for p in view.peers
     ]
 
 
 def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover most of its footprint; the budget is as for `everyone`."""
-    return _serve(view, received_budget, f"the {k} that cover most of the receiver's footprint", lambda _, by: by[:k])
+    return _serve(
+        view, k, received_budget, f"the {k} that cover most of the receiver's footprint", lambda _, by: by[:k]
+    )
 
 
 def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover least of its footprint; the budget is as for `everyone`."""
     what = f"the {k} that cover least of the receiver's footprint"
-    return _serve(view, received_budget, what, lambda _, by: by[max(0, len(by) - k) :])
+    return _serve(view, k, received_budget, what, lambda _, by: by[max(0, len(by) - k) :])
 
 
 def random_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0, salt: int = 0) -> list[Directive]:
@@ -70,33 +69,37 @@ def random_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0, salt:
         drawn = _draw(view, salt, receiver, by_overlap, k)
         return [i for i in by_overlap if i in drawn]
 
-    return _serve(view, received_budget, f"{k} drawn at random", draw)
+    return _serve(view, k, received_budget, f"{k} drawn at random", draw)
 
 
 def _serve(
-    view: FleetView, received_budget: float, what: str, choose: Callable[[int, list[int]], Sequence[int]]
+    view: FleetView, k: int, received_budget: float, what: str, choose: Callable[[int, list[int]], Sequence[int]]
 ) -> list[Directive]:
     """The ego's part in serving every receiver.
 
     Args:
+        k: how many senders serve a receiver in a fleet that hears everybody.
         received_budget: cells that each ego receives, as a share of full sharing.
         what: which senders serve, as text for the reason.
         choose: from a receiver and all its possible senders, those that cover most first, to those that serve it.
     """
-    directives = []
+    directives, maps = [], view.full_sharing_maps
     for peer in view.peers:
         senders = choose(peer, peers_by_overlap(view, peer))
         if view.ego in senders:
-            rho = _rho(received_budget, len(view.peers), senders.index(view.ego), len(senders))
+            rho = _rho(received_budget, maps, senders.index(view.ego), min(k, maps))
             directives.append(full_sharing(view.ego, peer, rho, f"fixed: {what}"))
         else:
             directives.append(nothing(view.ego, peer, f"fixed: not among {what}"))
     return directives
 
 
-def _rho(received_budget: float, peers: int, place: int, k: int) -> float:
-    """The share of its map that one of k senders sends: whole cells, those left over one each to the first senders."""
-    each, spare = divmod(floor(received_budget * peers * FEATURE_CELLS + 1e-9), k)
+def _rho(received_budget: float, maps: int, place: int, k: int) -> float:
+    """The share of its map that one of k senders sends: whole cells, those left over one each to the first senders.
+
+    It depends on the roster alone, so that senders who hear different drones send the same share.
+    """
+    each, spare = divmod(floor(received_budget * maps * FEATURE_CELLS + 1e-9), k)
     return min(1.0, (each + (place < spare)) / FEATURE_CELLS)
 
 
@@ -127,7 +130,7 @@ def random_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0,
 
 
 def _send_to(view: FleetView, chosen: Collection[int], sent_budget: float, what: str) -> list[Directive]:
-    rho = min(1.0, sent_budget * len(view.peers) / len(chosen)) if chosen else 0.0
+    rho = min(1.0, sent_budget * view.full_sharing_maps / len(chosen)) if chosen else 0.0
     return [
         full_sharing(view.ego, p, rho, f"fixed: {what}")
         if p in chosen

@@ -263,7 +263,7 @@ def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str 
 
 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
-    """The fleet, each drone deciding on this view, keeps every budget that the policy takes (`_SPENT`)."""
+    """The fleet keeps every budget that the policy takes (`_SPENT`), if each drone decides on this one view."""
     takes: Callable[..., Any] = policy
     for name in parameters(policy).keys() & _SPENT.keys():
         whose, full_maps = _SPENT[name]
@@ -273,7 +273,7 @@ def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
             for ego in view.descriptors:
                 for d in _decide(bound, view._replace(ego=ego)):
                     maps[whose(d)] += d.rho  # type: ignore[assignment]  # a counter of maps, not whole ones
-            allowed = budget * (len(view.peers) if full_maps else 1)
+            allowed = budget * (view.full_sharing_maps if full_maps else 1)
             for who, spent in maps.items():
                 if not spent <= allowed * (1 + _ROUNDING):
                     return f"{name}={budget:g}: {who} {spent:g} maps, at most {allowed:g} is allowed"

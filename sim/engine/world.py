@@ -6,6 +6,7 @@ Scenario events act on the physics here: extra loss, jammers, battery faults, lo
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -94,7 +95,7 @@ class World:
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
         self._frame = 0
-        self._work = [Work()] * n
+        self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
         self._headrooms = [(1.0, 1.0)] * n
         self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
         self.now = plan.at(0.0)
@@ -130,11 +131,13 @@ class World:
                 on_second(env.now)
 
     def _measure_headrooms(self) -> None:
-        scenario, before = self._scenario, self._work
-        self._work = [replace(status.work) for status in self.drones]
+        """Over the last second, so that a duty cycle does not show as a computer that is idle and busy in turn."""
+        scenario = self._scenario
+        self._work.append([replace(status.work) for status in self.drones])
+        lasts_s = (len(self._work) - 1) * scenario.frame_s
         self._headrooms = [
-            headrooms(scenario.fleet.computer, scenario.perception.compute_delay_s, a, b, scenario.frame_s)
-            for a, b in zip(before, self._work, strict=True)
+            headrooms(scenario.fleet.computer, scenario.perception.compute_delay_s, a, b, lasts_s)
+            for a, b in zip(self._work[0], self._work[-1], strict=True)
         ]
 
     def reroute(self, motion: Trajectories) -> None:

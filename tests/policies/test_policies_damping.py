@@ -135,7 +135,7 @@ def test_a_part_that_flickers_does_not_hold_up_a_steady_one() -> None:
 
 
 def least(asked: list[Directive]) -> Directive:
-    """The least of several directives in turn, in every part; a lower representation comes with its own ρ and disc."""
+    """The least of several directives in turn, in every part; a representation comes with its own ρ, and a lower one with its own disc."""
     rung = min(d.representation for d in asked)
     if rung == Representation.NONE:
         return NOTHING._replace(duty_percent=min(d.duty_percent for d in asked))
@@ -143,7 +143,7 @@ def least(asked: list[Directive]) -> Directive:
     radii_m = [d.roi.radius_m for d in asked[own:] if d.roi is not None]
     return FULL._replace(
         representation=rung,
-        rho=min(d.rho for d in asked[own:]),
+        rho=min(d.rho for d in asked if d.representation == rung),
         roi=Disc(0.0, 0.0, min(radii_m)) if radii_m else None,
         rate_hz=min(d.rate_hz for d in asked),
         fusion_weight=min(d.fusion_weight for d in asked),
@@ -321,3 +321,13 @@ def test_an_answer_is_kept_for_who_asks_the_same_alone() -> None:
     assert read == pytest.approx([24 / 1.25, 20.0, 24 / 1.1, 24 / 1.1, 24 / 1.25])
     assert apply_hysteresis(poor, rich, BAND) is apply_hysteresis(poor, rich, BAND)
     assert apply_hysteresis(poor, other, BAND).agent_id == 2
+
+
+def test_the_cells_of_another_representation_bound_nothing() -> None:
+    """Raw images have no ρ: a policy that alternates them with features keeps its features meanwhile."""
+    features = FULL._replace(representation=Representation.FEATURES, rho=0.5)
+    raw = features._replace(representation=Representation.RAW, rho=0.0)
+    link = DampedLink(features)
+    for tick in range(100):
+        link = damp(link, (raw, features)[tick % 2], tick * 0.1, 1.0)
+        assert (link.enforced.representation, link.enforced.rho) == (Representation.FEATURES, 0.5)

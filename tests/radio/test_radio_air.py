@@ -15,10 +15,11 @@ from radio_examples import CROSS_M, still
 from scipy import stats
 
 from sortie.radio import Air, Status, Transmission
+from sortie.radio.goodput import Goodput
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import losses
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
 
 DEFAULT = AirSettings()
 STILL = AirSettings(shadowing_sigma_db=0.0)
@@ -433,3 +434,15 @@ def test_arguments_out_of_bounds_are_refused() -> None:
         f.air.broadcast(0, 3000, print)
     with pytest.raises(ValueError, match=r"publish_spread is 2, must be in \[0, 1\]"):
         Flight(STILL, 2, spread=2)
+
+
+def test_a_link_whose_payloads_only_waited_is_not_silent() -> None:
+    """Silent means that something was tried and nothing got through; a queue behind another link says less."""
+    links = Goodput(3)
+    links.measured(0, 1, 50.0)
+    links.bounded(0, 1, 0.0)
+    links.bounded(0, 2, 0.0)
+    assert [state_of(mbps) for mbps in links.read(0)[1:]] == [LinkState.MEASURED, LinkState.NEVER_MEASURED]
+    links.measured(0, 1, 0.0)
+    links.bounded(0, 1, 3.0)
+    assert state_of(links.read(0)[1]) == LinkState.SILENT

@@ -61,7 +61,7 @@ class When2com(PerCell):
 
     def weigh(self, own: Tensor, peers: Tensor, weight: Tensor) -> Tensor:
         scores: Tensor = self.handshake(own, peers)
-        return weight * (scores[:, 1:] - scores[:, :1]).exp()
+        return weight * (scores[:, 1:] - scores[:, :1]).clamp(-60, 60).exp()  # beyond, a float overflows
 
     def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         share = weight * part

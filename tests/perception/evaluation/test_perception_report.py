@@ -225,3 +225,12 @@ def test_halves_share_no_frame_and_leave_none_out() -> None:
     assert not (rb * a).any()
     assert (ra != a).any()
     assert math.isclose(a.mean(), 5 / 11)
+
+
+def test_no_two_effects_are_one_another_or_anothers_mirror(table: list[ClaimRow]) -> None:
+    """In a world made of the paper's own levels: equal values and intervals, or mirrored ones, are of one effect."""
+    seen: dict[tuple[float, ...], str] = {}
+    for row in table:
+        if row.instrument == "zero" and row.kind == Kind.EFFECT and row.value and row.low is not None:
+            ends = tuple(sorted(round(abs(v or 0.0), 9) for v in (row.value, row.low, row.high)))
+            assert seen.setdefault(ends, row.effect) == row.effect, row.id

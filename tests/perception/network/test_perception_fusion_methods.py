@@ -218,6 +218,14 @@ def test_when2com_is_the_mean_by_attention_of_keys_and_queries() -> None:
         assert torch.allclose(fused[0, :, row, column], plain, atol=1e-4)
 
 
+def test_a_score_far_from_the_drones_own_stays_finite() -> None:
+    agents, _ = maps(11, 4)
+    net = METHODS["when2com"]
+    with torch.inference_mode():
+        weight = net.weigh(1e5 * agents[:, 0], 1e5 * agents[:, 1:], torch.ones(1, 3))
+    assert torch.isfinite(weight).all()
+
+
 def test_a_handshake_is_of_whole_maps_and_of_nobody_elses() -> None:
     """A peer's odds hang on its own map and the ego's alone, whatever cells of it are sent."""
     agents, _ = maps(11, 4)

@@ -45,7 +45,10 @@ def test_no_more_is_sent_than_the_air_carries() -> None:
     assert a.carried(fleet_of(5, goodput=52.0).descriptors[0], (1, 2, 3, 4)) == pytest.approx(0.125 / 2**0.5)
     assert a.carried(fleet_of(5, goodput=1e6).descriptors[0], (1, 2, 3, 4)) == 1.0
     assert a.carried(fleet_of(5, goodput=0.0).descriptors[0], (1, 2, 3, 4)) == 1.0, "unmeasured is not weak"
-    assert a.carried(fleet_of(5, goodput=SILENT_MBPS).descriptors[0], (1, 2, 3, 4)) == 1.0, "silent links carry no map"
+    silent = fleet_of(5, goodput=SILENT_MBPS).descriptors[0]
+    assert a.carried(silent, (1, 2, 3, 4)) < a.FEW, "silent links carry no map"
+    one = silent._replace(peer_goodput_mbps=(SILENT_MBPS, SILENT_MBPS, SILENT_MBPS, 100.0))
+    assert a.carried(one, (1, 2, 3, 4)) < a.carried(fleet_of(5).descriptors[0], (1, 2, 3, 4)), "nor raise what is sent"
     some = me._replace(peer_goodput_mbps=(0.0, 104.8576, 0.0, 0.0))
     assert a.carried(some, (1, 2, 3, 4)) == pytest.approx(0.25), "by the links that were measured"
     tight = a.spend(fleet_of(5, goodput=5.0), a.MAPS, 0.4, "")

@@ -130,3 +130,14 @@ def test_the_sender_chooses_its_receivers() -> None:
     assert {tuple(receivers("random-2-receivers", salt=s)) for s in range(40)} == {
         (a, b) for a in range(1, 5) for b in range(a + 1, 5)
     }
+
+
+def test_a_link_carries_the_same_share_however_many_drones_were_heard() -> None:
+    """Senders who hear different drones would otherwise divide the same budget by different fleets."""
+    whole = fleet_of(5)._replace(ego=1)
+    few = whole._replace(descriptors={i: whole.descriptors[i] for i in (0, 1)}, age_s={0: 0.1, 1: 0.1})
+    for name in ("all-4", "best-2"):
+        rho = [
+            next(d.rho for d in POLICIES[name](v, received_budget=0.125) if d.destination == 0) for v in (whole, few)
+        ]
+        assert rho == [0.125 * 4 / (4 if name == "all-4" else 2)] * 2

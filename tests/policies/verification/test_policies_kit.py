@@ -59,7 +59,7 @@ def oversends(view: FleetView, *, sent_budget: float = 1.0) -> list[Directive]:
 def all_to_the_first(view: FleetView, *, received_budget: float = 1.0) -> list[Directive]:
     """Keeps each sender's total, but one receiver gets it all."""
     first = min(view.peers, default=None)
-    total = received_budget * len(view.peers)
+    total = received_budget * view.full_sharing_maps
     return [d._replace(rho=min(1.0, total) if d.destination == first else 0.0) for d in share(view)]
 
 
@@ -143,8 +143,8 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (rises_with_age, "age-monotone", "rate_hz rises"),
     (rises_for_another, "age-monotone", "representation rises from 2 to 3"),
     (overspends, "budget kept", "rho=0.02: link 1→2 carries 0.03 maps, at most 0.02 is allowed"),
-    (oversends, "budget kept", "sent_budget=0.02: drone 1 sends 0.03 maps, at most 0.02 is allowed"),
-    (all_to_the_first, "budget kept", "received_budget=0.02: drone 0 receives 0.08 maps, at most 0.04 is allowed"),
+    (oversends, "budget kept", "sent_budget=0.02: drone 0 sends 0.03 maps, at most 0.02 is allowed"),
+    (all_to_the_first, "budget kept", "maps, at most 0.1 is allowed"),
     (remembers, "deterministic", "two calls with the same view differ"),
     (lottery, "deterministic", "two calls with the same view differ"),
     (too_fast, "bounds kept", "rate_hz is 31.0, must be in [0, 30]"),
