@@ -174,7 +174,7 @@ MISSION = (
     Claim("mission.0.05", "mission, 2", "Mission AP at a budget of 0.05", AP, Paper(0.773, digits=3), ApOf(all_4(0.05), "mission"), verdict.level),
     Claim("mission.0.1", "mission, 2", "Mission AP at a budget of 0.1", AP, Paper(0.784, digits=3), ApOf(all_4(0.1), "mission"), verdict.level),
     Claim(
-        "mission.widest", "mission, 3", "Mission AP at budgets 0.05–0.1, widest from full sharing", POINTS,
+        "mission.widest", "mission, 3", "Mission AP against full sharing, at the budget of 0.05 or 0.1 with the larger difference", POINTS,
         Paper(2.2, -0.5, 5.1, MARGIN["mission"]),
         Widest((_against_full(0.05, "mission"), _against_full(0.1, "mission"))), verdict.no_difference, headline=True,
         effect="mission under a budget",
@@ -241,12 +241,12 @@ FLIP = (
         defined=True,  # follows from the four contrasts above
     ),
     Claim(
-        "wrong.starved", "budget, 9", "The winner at a budget of 0.25, used at 0.02, loses", POINTS,
+        "wrong.starved", "budget, 9", "The winner at a budget of 0.25, used at 0.02: change of AP", POINTS,
         Paper(-7.7), WrongChoice(POLICIES, chosen_at=3, judged_at=0), headline=True,
         effect="two or four at a budget of 0.02",
     ),
     Claim(
-        "wrong.plentiful", "budget, 9", "The winner at a budget of 0.02, used at 0.25, loses", POINTS,
+        "wrong.plentiful", "budget, 9", "The winner at a budget of 0.02, used at 0.25: change of AP", POINTS,
         Paper(-4.8), WrongChoice(POLICIES, chosen_at=0, judged_at=3), headline=True,
         effect="two or four at a budget of 0.25",
     ),
@@ -301,7 +301,7 @@ OVERHEAD = (
     Claim("plane.x86.median", "overhead, 9", "A policy decision on x86, median", "ms", Paper(0.03, digits=2), Elsewhere("x86_policy_ms_p50"), verdict.at_most),
     Claim("plane.roi", "overhead, 11", "A phase change shrinks feature payloads", "×", Paper(10.0, digits=0), Elsewhere("roi_shrinks"), verdict.same_order, headline=True),
     Claim("plane.battery", "overhead, 12", "Battery decay moves agent 1 down the rate ladder, rungs met", "of 3", Paper(3.0, digits=0), Elsewhere("battery_rungs"), verdict.exact),
-    Claim("plane.link", "overhead, 12", "A link drop at 60 s leaves agent 2 with detections, after", "s", Paper(0.1), Elsewhere("link_drop_s"), verdict.at_most, headline=True),
+    Claim("plane.link", "overhead, 12", "A link drop at 60 s leaves drone 2 with detections, after", "s", Paper(0.1), Elsewhere("link_drop_s"), verdict.at_most, headline=True),
 )  # fmt: skip
 
 SECTIONS: dict[str, tuple[Claim, ...]] = {

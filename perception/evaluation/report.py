@@ -128,7 +128,7 @@ def short(rows: Sequence[ClaimRow], facts: Mapping[str, Any], link: str) -> str:
         lines.append((first.says, papers(first), ours(first), verdict(first), masked))
     tail = [
         "",
-        "AP differences in points with 95 % intervals; *ours* is the paper's instrument (cells that were not sent count "
+        "AP differences in points with 95 % intervals over frames; *ours* is the paper's instrument (cells that were not sent count "
         "as zeros), *masked* leaves them out of the fusion, as sorties do. In brackets: arithmetic on the paper's figures. "
         "±: the margin of an equivalence test. An effect stands when every claim that states it is reproduced.",
         f"All claims, figures, and how each verdict is reached: [{link}]({link}).",

@@ -58,14 +58,14 @@ def explanations(flown: Flown) -> Iterator[str]:
         for s in sorties:
             for fate, n in s.outcome["payload_fates"].items():
                 fates[fate] = fates.get(fate, 0) + n
-        total = sum(fates.values())
+        total, in_all = sum(fates.values()), " in all sorties" * (len(sorties) > 1)
         if not total:
             yield f"[bold]{policy}[/bold]: sent nothing; every drone saw with its own eyes only"
             continue
         parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
         age = _mean(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
-        yield f"[bold]{policy}[/bold]: {total} payloads, {parts}; {fused}"
+        yield f"[bold]{policy}[/bold]: {total} payloads{in_all}, {parts}; {fused}"
 
 
 def _by_policy(flown: Flown) -> dict[str, list[Compared]]:
