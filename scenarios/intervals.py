@@ -25,6 +25,7 @@ from sortie.scenarios.streams import stream
 Floats = NDArray[np.float64]
 LEVEL = 0.95
 DRAWS = 1000
+ROUNDING = 1e-12
 
 
 class Range(NamedTuple):
@@ -82,10 +83,10 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
         >>> round(mean_interval(rates).high, 3), round(mean_interval(rates, SHARE).high, 3)
         (1.039, 0.995)
     """
-    kept = [v for v in np.asarray(values, float).ravel().tolist() if not math.isnan(v)]
+    kept = [_to_end(v, within) for v in np.asarray(values, float).ravel().tolist() if not math.isnan(v)]
     for value in kept:
         if not within.low <= value <= within.high:
-            raise ValueError(f"{value:g}, must be {within.low:g} to {within.high:g}")
+            raise ValueError(f"{value!r}, must be {within.low:g} to {within.high:g}")
     if not kept:
         return Estimate(math.nan, math.nan, math.nan, 0)
     n, mean = len(kept), math.fsum(kept) / len(kept)
@@ -109,6 +110,11 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
     off /= width * part * (1 - part)
     low, high = (within.low + width * float(expit(logit(part) + sign * off)) for sign in (-1, 1))
     return Estimate(mean, low, high, n)
+
+
+def _to_end(value: float, within: Range) -> float:
+    """The end of the range that rounding has left a value just beside."""
+    return next((end for end in within if abs(value - end) < ROUNDING), value)
 
 
 @dataclass(frozen=True, slots=True)

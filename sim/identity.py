@@ -55,6 +55,12 @@ def release_of(code: str) -> str:
     return code.partition("+")[0]
 
 
+def _argument(value: object) -> str:
+    """An argument as text that is the same in every process: the repr of most objects holds an address."""
+    plain = value is None or isinstance(value, str | int | float)
+    return repr(value) if plain else name_of(value)
+
+
 def name_of(thing: object) -> str:
     """The name under which a record keeps a policy or a detector that was passed as a Python object.
 
@@ -66,7 +72,7 @@ def name_of(thing: object) -> str:
         "sortie.sim.identity.release_of(code='0.1.0+0')"
     """
     if isinstance(thing, functools.partial):
-        bound = [*map(repr, thing.args), *(f"{key}={value!r}" for key, value in thing.keywords.items())]
+        bound = [*map(_argument, thing.args), *(f"{key}={_argument(value)}" for key, value in thing.keywords.items())]
         return f"{name_of(thing.func)}({', '.join(bound)})"
     own = {*vars(type(thing)), *getattr(thing, "__dict__", ())}
     if "name" in own and isinstance(name := getattr(thing, "name", None), str):

@@ -76,7 +76,7 @@ def compare(
         )  # fmt: skip
     out.print(compared.summary())
     if out_file is not None:
-        write_text(out_file, json.dumps(_plain(compared), indent=2) + "\n")
+        write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
     if readme is not None:
         command = compare_command(scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion)
@@ -94,7 +94,8 @@ def _plain(compared: sortie.Comparison) -> dict[str, Any]:
         {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, "gain_over_first": s.gain, "outcome": s.outcome}
         for s in compared.sorties
     ]
-    return {"gains": [asdict(gain) for gain in compared.gains], "sorties": sorties}
+    gains = [{k: None if v != v else v for k, v in asdict(gain).items()} for gain in compared.gains]  # NaN: no interval
+    return {"gains": gains, "sorties": sorties}
 
 
 def _split_policies(text: str) -> list[str]:

@@ -133,7 +133,7 @@ class PhaseOutcome(TypedDict):
 
 class Event(TypedDict):
     t_s: Annotated[float, "When."]
-    drone: Annotated[int, "Whose; −1 is the fleet's."]
+    drone: Annotated[int, "Whose; −1 is the fleet's.", ANY]
     kind: Annotated[str, "What kind."]
     text: Annotated[str, "In words."]
 

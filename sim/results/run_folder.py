@@ -40,10 +40,15 @@ def default_path(scenario: Scenario, seed: int, replication: int, own: Scenario 
     """
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
     parts = [scenario.name, f"s{seed}", policy, *([f"r{replication}"] if replication else [])]
-    flown, filed = (None if s is None else s.model_dump_json(exclude={"seed"}) for s in (scenario, own))
-    if flown != filed:
+    flown, filed = (None if s is None else _sorted_json(s) for s in (scenario, own))
+    if flown != filed or policy != scenario.policy.name:  # p/a.py and p_a.py read alike here
         parts.append(hashlib.sha256(str(flown).encode()).hexdigest()[:6])
     return Path("runs") / "-".join(parts)
+
+
+def _sorted_json(scenario: Scenario) -> str:
+    """A scenario without its seed, the same text in whatever order parameters were given."""
+    return json.dumps(scenario.model_dump(mode="json", exclude={"seed"}), sort_keys=True)
 
 
 def ensure_writable(path: Path) -> None:

@@ -90,7 +90,7 @@ def _what_gains_are(flown: Flown) -> str:
     if not flown.gains:
         return ""
     covers = {
-        "sorties": "the mean over sorties of each sortie's difference in AP, with Student's 95 % interval over sorties",
+        "sorties": "the mean over sorties of each sortie's difference in AP, over the fusions that both policies made, with Student's 95 % interval over sorties",
         "instants of one sortie": "with a 95 % interval over the instants of this one flight, which says nothing of others",
     }[flown.gains[0].over]
     return f"Gains are in AP points over {flown.sorties[0].policy}, paired: {covers}."

@@ -90,3 +90,12 @@ def test_pairing_saves_what_the_common_part_was() -> None:
 )  # fmt: skip
 def test_every_metric_has_its_range(metric: str, within: Range) -> None:
     assert possible(metric) == within
+
+
+def test_a_share_that_rounding_left_beside_its_end_is_at_the_end() -> None:
+    for beside in (1 - 1e-16, 1 + 2e-16):
+        assert mean_interval([beside, 1.0, 1.0], SHARE).high == 1.0
+
+
+def test_an_events_drone_may_be_the_fleets() -> None:
+    assert possible("events.0.drone") == ANY

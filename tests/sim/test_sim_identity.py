@@ -217,3 +217,22 @@ def test_a_policy_passed_as_a_callable_is_named_by_its_module(policy: Any, name:
     record = run_sortie(example("duration_s=1"), policy)
     assert outcome(record)["policy"] == name
     assert list(outcome(record)["policies"]["decisions"]) == [name]
+
+
+class _Odds:
+    """An argument whose repr holds its address."""
+
+
+def test_a_bound_object_is_named_by_its_class_and_not_by_its_address() -> None:
+    one, other = (identity.name_of(functools.partial(resolve, _Odds())) for _ in range(2))
+    assert one == other
+    assert "0x" not in one
+
+
+def test_a_folder_tells_policies_apart_and_not_the_order_of_their_parameters() -> None:
+    def folder(name: str, params: str) -> str:
+        flown = example(f"policy.name={name}", f"policy.params={params}")
+        return run_folder.default_path(flown, 1, 0, own=flown if params == "{}" else example()).name
+
+    assert folder("best-2", "{k: 2, received_budget: 0.2}") == folder("best-2", "{received_budget: 0.2, k: 2}")
+    assert folder("p1/a.py:f", "{}") != folder("p1_a.py:f", "{}")
