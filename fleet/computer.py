@@ -1,11 +1,11 @@
 """How much of its companion computer a drone has left: the headrooms that its descriptor publishes.
 
-Per frame, with the times of `fleet.computer` in the scenario and `perception.compute_delay_s` for a look:
+Over some time, with the times of `fleet.computer` in the scenario and `perception.compute_delay_s` for a look:
 
     accelerator_s = looks × compute delay + feature maps received × fusion
     cpu_s         = driving cores × accelerator_s + decisions × decision + megabits sent and received / payload rate
-    gpu headroom  = 1 − accelerator_s / frame
-    cpu headroom  = 1 − cpu_s / (cores × frame)
+    gpu headroom  = 1 − accelerator_s / time
+    cpu headroom  = 1 − cpu_s / (cores × time)
 
 Both are at least 0. What the radio's own processor does is left out.
 """

@@ -21,7 +21,7 @@ import numpy as np
 from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
 
 MAGIC = 0xC0
 MARK = bytes([MAGIC])
@@ -70,6 +70,7 @@ FULL = Form()
 
 
 def _step(bounds: tuple[float, float], bits: int) -> float:
+    """What one more of a number means; a goodput has a number less, which says that it was never measured."""
     return (bounds[1] - bounds[0]) / ((1 << bits) - 1 - (bounds is _GOODPUT))
 
 
@@ -163,11 +164,11 @@ def _to_int(value: float, bounds: tuple[float, float], bits: int) -> int:
         (as_int,) = struct.unpack("<I", struct.pack("<f", value))
         return int(as_int)
     low, high = bounds
-    if bounds is _GOODPUT and value <= 0.0:
-        return 0
-    steps = round((min(max(value, low), high) - low) / _step(bounds, bits)) + (bounds is _GOODPUT)
-    if bounds is _GOODPUT and value > SILENT_MBPS:
-        steps = max(steps, 2)  # measured, however weak: not silent
+    steps = round((min(max(value, low), high) - low) / _step(bounds, bits))
+    if bounds is _GOODPUT:
+        state = state_of(value)
+        # 0 is never measured, 1 silent; a measured link reads at least a step, however weak it is
+        return 1 + max(steps, 1) if state == LinkState.MEASURED else int(state)
     # a radius of a region is above 0, however coarse
     return max(steps, 1) if bounds is _REGION[2] else steps
 

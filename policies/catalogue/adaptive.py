@@ -78,7 +78,7 @@ def spend(view: FleetView, arm: Arm, sent_budget: float, why: str) -> list[Direc
         return []
     ego, peers = view.ego, view.peers
     chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
-    per_link = min(1.0, sent_budget * len(peers) / len(chosen), carried(me, chosen)) if chosen else 0.0
+    per_link = min(1.0, sent_budget * view.full_sharing_maps / len(chosen), carried(me, chosen)) if chosen else 0.0
     roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
     reason = f"{why}: {arm.text}"
     directives = []

@@ -265,9 +265,9 @@ def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
     """The fleet keeps every budget that the policy takes (`_SPENT`), if each drone decides on this one view."""
     takes: Callable[..., Any] = policy
-    for name in parameters(policy).keys() & _SPENT.keys():
-        whose, full_maps = _SPENT[name]
-        for budget in BUDGETS:
+    known = parameters(policy)
+    for name, (whose, full_maps) in _SPENT.items():
+        for budget in BUDGETS if name in known else ():
             bound = partial(takes, **{name: budget})
             maps: Counter[str] = Counter()
             for ego in view.descriptors:

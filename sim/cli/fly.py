@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 import sortie
-from sortie.scenarios.reading.load import ScenarioError, load
+from sortie.scenarios.reading.load import ScenarioError, library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
@@ -115,7 +115,11 @@ def _named(scenario: str | None) -> str:
 
 
 def _as_filed(scenario: str, policy: str) -> Scenario | None:
-    """The scenario without `--set`, under a policy; None where the file is a scenario only with `--set`."""
+    """A scenario of the library without `--set`, under a policy. None for a file of the user's, which may change, or
+    share its name with another one."""
+    given, shipped = Path(scenario), library().get(Path(scenario).stem)
+    if shipped is None or (given.exists() and not given.samefile(shipped)):
+        return None
     try:
         own = load(scenario)
         return own if policy == own.policy.name else load(scenario, policy_overrides(policy, own.policy.name))

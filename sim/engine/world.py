@@ -223,6 +223,7 @@ class World:
                 batteries.voltage_v.copy(),
                 batteries.current_a.copy(),
                 batteries.spent_j,
+                [status.work.looks for status in self.drones],
                 airborne,
             )
         )
@@ -254,7 +255,7 @@ class World:
         return self._flight.at(frame)[drone]
 
     def platform(self, drone: int) -> Platform:
-        """Charge, and headrooms over the frame that ended."""
+        """Charge, and headrooms over the second that ended."""
         return Platform(self.batteries.soc[drone], *self._headrooms[drone])
 
 

@@ -21,7 +21,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LOOK_S = 1.0
-"""The region is looked at this often: a drone at 5 m/s has moved by a tenth of its nadir picture."""
+"""The region is sampled this often, and a drone's look counts for so long: at 5 m/s it has moved by a tenth of its nadir
+picture."""
 PLACES = 400
 """Places in the region, spread evenly; each stands for a 400th of its area."""
 FOUND_IOU = 0.5
@@ -34,7 +35,8 @@ def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     t_s = mission["t_s"].to_numpy()
     width_s = np.diff(t_s, append=record.scenario.duration_s)
     flying = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
-    looking = flying & (_duty_percent(record, len(t_s)) > 0)
+    looks = np.reshape(states["looks"].to_numpy(), (-1, n))
+    looking = flying & _looked_lately(looks, max(1, round(LOOK_S / record.scenario.frame_s)))
     pose = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=-1)
     pose = pose.reshape(-1, n, 7)
     target = np.stack([mission[c].to_numpy() for c in ("target_x_m", "target_y_m")], axis=-1)
@@ -145,21 +147,15 @@ def _share_and_gap(seen: Bools, counted: Bools, width_s: Floats) -> tuple[float 
     return 1.0 - float(width_s[missed].sum() / width_s[counted].sum()), longest_s
 
 
-def _duty_percent(record: SortieRecord, frames: int) -> NDArray[np.int64]:
-    """Each drone's duty cycle in each frame [T, N], the highest over its links.
+def _looked_lately(looks: NDArray[np.int64], frames: int) -> Bools:
+    """Whether a drone's perception ran in a frame, or in one of the `frames` - 1 frames before it: [T, N].
 
-    A link asks for 100 until its first directive is in force. The record has no link that never changes; such a link
-    does not count.
+    Args:
+        looks: [T, N] frames before this one in which it ran. What it did in the last frame is not in it: the one before
+            stands for it.
+        frames: how many a look is good for.
     """
-    duty = np.full((frames, record.scenario.fleet.drones), 100)
-    table = record.tables["directives"]
-    columns = [table[c].to_pylist() for c in ("t_s", "drone", "peer", "duty_percent")]
-    if set(columns[-1]) <= {100}:
-        return duty
-    links: dict[int, dict[int, int]] = {}
-    for drone, peer in zip(columns[1], columns[2], strict=True):
-        links.setdefault(drone, {})[peer] = 100
-    for t_s, drone, peer, percent in zip(*columns, strict=True):
-        links[drone][peer] = percent
-        duty[int(t_s / record.scenario.frame_s + _INSTANT_S) :, drone] = max(links[drone].values())
-    return duty
+    ran = np.diff(looks, axis=0, append=2 * looks[-1:] - looks[-2:-1] if len(looks) > 1 else looks[-1:] + 1)
+    total = np.cumsum(np.concatenate([np.zeros_like(ran[:1]), ran]), axis=0)
+    since = np.maximum(np.arange(1, len(ran) + 1) - frames, 0)
+    return np.asarray(total[1:] > total[since])

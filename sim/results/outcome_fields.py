@@ -58,7 +58,7 @@ class MissionOutcome(TypedDict):
         float | None,
         "Share of the mission region's area in view, 0 … 1, averaged over the time in which there is a region. A place is "
         "in view where it lies in the picture of one of the five cameras of a drone, on flat ground without houses and "
-        "trees, and in the square of the drone's feature map. The drone flies, and its duty cycle is above 0.",
+        "trees, and in the square of the drone's feature map. The drone flies, and its perception ran within the last second.",
         SHARE,
     ]
     target_in_view_share: Annotated[

@@ -40,7 +40,7 @@ pa.array(())  # pyarrow looks for pandas at its first array; at import, that is 
 TABLES: dict[str, dict[str, pa.DataType]] = {
     "states": dict(
         t_s=F, drone=I, x_m=F, y_m=F, z_m=F, qx=F, qy=F, qz=F, qw=F, vx_mps=F, vy_mps=F, vz_mps=F,
-        p_radps=F, q_radps=F, r_radps=F, soc=F, voltage_v=F, current_a=F, spent_j=F, airborne=B,
+        p_radps=F, q_radps=F, r_radps=F, soc=F, voltage_v=F, current_a=F, spent_j=F, looks=I, airborne=B,
     ),
     "descriptors": dict(
         t_s=F, drone=I, stamp_ns=pa.int64(), wire_bytes=I, soc=F, cpu_headroom=F, gpu_headroom=F,
@@ -77,7 +77,8 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
 }  # fmt: skip
 ABOUT = {
     "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU. "
-    "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`.",
+    "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`; "
+    "`looks` counts the frames before this one in which perception ran.",
     "descriptors": "A descriptor published. Goodput to each other drone by ascending id, Mb/s; 0 is never measured, at most 2⁻¹⁰ is silent: nothing got through.",
     "drops": "A descriptor refused at a receiver, with the reason.",
     "directives": "A change of what a gate enforces, with the reason that decided it.",

@@ -29,14 +29,14 @@ WRITTEN = frozenset(
 def default_path(scenario: Scenario, seed: int, replication: int, own: Scenario | None) -> Path:
     """The run's folder, named after what flies: `runs/SCENARIO-sSEED-POLICY`, then `-rN` for a replication.
 
-    Six hex digits follow where the scenario is not as its file has it. They are a digest of all that flies but the
-    seed, so that other settings, and other parameters of the policy, have folders of their own. The same sortie flown
-    again has the same folder.
+    Six hex digits follow where the scenario is not one of the library as it is shipped. They are a digest of all that
+    flies but the seed, so that other settings, other parameters of the policy, and other files with the same `name`
+    have folders of their own. The same sortie flown again has the same folder.
 
     Args:
         scenario: what flies.
         seed, replication: of the random draws.
-        own: the scenario as its file has it, under the same policy; None where there is no such file.
+        own: the library's scenario as it is shipped, under the same policy; None for a file of the user's.
     """
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
     parts = [scenario.name, f"s{seed}", policy, *([f"r{replication}"] if replication else [])]

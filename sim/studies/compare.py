@@ -68,7 +68,8 @@ class Gain:
 
     policy: str
     metric: str
-    """`ap50.full_scene` or `ap50.mission`."""
+    """`ap50.full_scene` or `ap50.mission`: over the fusions that both policies made. Where drones left the air and several
+    seeds were flown, also `ap50.grounded_blind.full_scene` and `.mission`: over all drones."""
     gain: float
     low: float
     high: float
@@ -151,12 +152,23 @@ def compare(
 
 
 def _over_sorties(flown: Sequence[Compared]) -> Iterator[Gain]:
-    for label in dict.fromkeys(f.policy for f in flown[1:] if f.policy != flown[0].policy):
-        for name in AREAS:
-            gains = [gain for f in flown if f.policy == label and (gain := f.gain[name]) is not None]
-            if gains:
-                e = over_sorties(gains)
-                yield Gain(label, f"ap50.{name}", e.mean, e.low, e.high, "sorties", e.count)
+    first = {f.seed: f for f in flown if f.policy == flown[0].policy}
+    for label in dict.fromkeys(f.policy for f in flown if f.policy != flown[0].policy):
+        its = [f for f in flown if f.policy == label]
+        gains = {f"ap50.{name}": [f.gain[name] for f in its] for name in AREAS}
+        if any(f.outcome["mission"]["flown_share"] < 1.0 for f in flown):
+            gains |= {f"ap50.grounded_blind.{name}": [_blind(f, first[f.seed], name) for f in its] for name in AREAS}
+        for metric, of_sorties in gains.items():
+            kept = [gain for gain in of_sorties if gain is not None]
+            if kept:
+                e = over_sorties(kept)
+                yield Gain(label, metric, e.mean, e.low, e.high, "sorties", e.count)
+
+
+def _blind(its: Compared, first: Compared, area: str) -> float | None:
+    """AP minus the first policy's, with drones that left the air counted as blind under both."""
+    ap, before = (f.outcome["ap50"]["grounded_blind"][area] for f in (its, first))
+    return None if ap is None or before is None else ap - before
 
 
 def over_sorties(gains: Sequence[float]) -> Estimate:

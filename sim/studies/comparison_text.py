@@ -102,7 +102,8 @@ def _side_by_side(flown: Flown) -> dict[str, list[str]]:
     sorties = {s.seed for s in flown.sorties}
 
     def mean(*path: str, text: Callable[[Any], str]) -> list[str]:
-        return [text(_mean(_at(s.outcome, path) for s in of)) for of in _by_policy(flown).values()]
+        values = [[_at(s.outcome, path) for s in of] for of in _by_policy(flown).values()]
+        return [text(_mean(of)) + _some(sum(v is not None for v in of), len(sorties)) for of in values]
 
     def gain(metric: str) -> list[str]:
         return [_gain(gains.get((policy, metric)), len(sorties)) for policy in _by_policy(flown)]
@@ -115,11 +116,13 @@ def _side_by_side(flown: Flown) -> dict[str, list[str]]:
     rows = {
         "flown": mean("mission", "flown_share", text=percent) if grounded else [],
         "AP@0.5 full scene": mean("ap50", "full_scene", text=number),
-        "  grounded drones blind": blind["full_scene"],
         "  gain": gain("ap50.full_scene"),
+        "  grounded drones blind": blind["full_scene"],
+        "    gain": gain("ap50.grounded_blind.full_scene") if grounded else [],
         "AP@0.5 mission": mean("ap50", "mission", text=number),
-        "  grounded drones blind ": blind["mission"],
         "  gain ": gain("ap50.mission"),
+        "  grounded drones blind ": blind["mission"],
+        "    gain ": gain("ap50.grounded_blind.mission") if grounded else [],
         "data sent": mean("bytes", "data_sent", text=size),
         "data delivered": mean("bytes", "data_delivered", text=size),
         "  handshakes": mean("bytes", "handshakes_sent", text=size),
@@ -154,5 +157,10 @@ def _kilojoules(value: float) -> str:
 def _gain(gain: Gain | None, sorties: int) -> str:
     if gain is None:
         return ""
-    some = f" ({gain.count} of {sorties})" if gain.over == "sorties" and gain.count < sorties else ""
+    some = _some(gain.count, sorties) if gain.over == "sorties" else ""
     return points((gain.gain, gain.low, gain.high), "+.1f") + some
+
+
+def _some(count: int, sorties: int) -> str:
+    """How many of the sorties a mean is over, where it is not over all of them."""
+    return f" ({count} of {sorties})" if 0 < count < sorties else ""

@@ -25,6 +25,18 @@ class MadeFrames:
     scene: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class SeenFrames(MadeFrames):
+    """With what four cameras of each drone saw."""
+
+    images: NDArray[np.uint8]
+
+
+def with_images(made: MadeFrames, images: NDArray[np.uint8]) -> SeenFrames:
+    """Made frames and their images [n, d, cameras, height, width]."""
+    return SeenFrames(made.true_pose, made.est_pose, made.cars, made.scene, images)
+
+
 def made_frames(scenes: Sequence[int], seed: int = 0, cars: int = 40) -> MadeFrames:
     """A cross of five over cars that stand apart, headings and pose errors drawn; the last car of each frame is missing."""
     n = len(scenes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
 from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
+from sortie.scenarios.reading.load import load
 from sortie.sim import identity
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results import run_folder
@@ -236,3 +238,11 @@ def test_a_folder_tells_policies_apart_and_not_the_order_of_their_parameters() -
 
     assert folder("best-2", "{k: 2, received_budget: 0.2}") == folder("best-2", "{received_budget: 0.2, k: 2}")
     assert folder("p1/a.py:f", "{}") != folder("p1_a.py:f", "{}")
+
+
+def test_what_flies_as_the_library_ships_it_has_a_folder_without_a_digest() -> None:
+    shipped = load("track_target")
+    assert run_folder.default_path(shipped, 1, 0, own=shipped).name == "track_target-s1-worked"
+    assert run_folder.default_path(shipped, 4, 2, own=shipped).name == "track_target-s4-worked-r2"
+    other = load("track_target", ["policy.params={rho: 0.5}"])
+    assert re.fullmatch(r"track_target-s1-worked-[0-9a-f]{6}", run_folder.default_path(other, 1, 0, own=shipped).name)

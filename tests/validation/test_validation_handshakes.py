@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import handshakes
 import numpy as np
 import pytest
 import torch
-from harness_examples import MadeFrames, made_frames
-from numpy.typing import NDArray
+from harness_examples import SeenFrames, made_frames, with_images
 
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.network.model import CarNet, ModelConfig
 
 
-@dataclass(frozen=True)
-class Seen(MadeFrames):
-    images: NDArray[np.uint8]
-
-
 @pytest.fixture(scope="module")
-def frames() -> Seen:
-    made = made_frames([1, 2])
+def frames() -> SeenFrames:
     images = np.random.default_rng(5).integers(0, 255, (2, 5, 4, 256, 256), dtype=np.uint8)
-    return Seen(made.true_pose, made.est_pose, made.cars, made.scene, images)
+    return with_images(made_frames([1, 2]), images)
 
 
 def network(fusion: str = "when2com") -> CarNet:
@@ -36,7 +27,7 @@ def network(fusion: str = "when2com") -> CarNet:
     return net
 
 
-def test_every_choice_asks_others_and_as_many_as_its_name_says(frames: Seen) -> None:
+def test_every_choice_asks_others_and_as_many_as_its_name_says(frames: SeenFrames) -> None:
     net = network()
     attention = handshakes.attention_of(net, CarNetInstrument(net).look(frames, 0))
     assert attention.sum(axis=1) == pytest.approx(np.ones(5), abs=1e-5)
@@ -61,7 +52,7 @@ def test_every_choice_asks_others_and_as_many_as_its_name_says(frames: Seen) -> 
     ]
 
 
-def test_only_those_who_were_asked_are_heard_and_paid_for(frames: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_those_who_were_asked_are_heard_and_paid_for(frames: SeenFrames, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(handshakes, "CHOICES", {k: handshakes.CHOICES[k] for k in ("Who2com, learned", "most overlap")})
     rows = {r.name: r for r in handshakes.measure(network(), frames)}
     assert [r.links_per_ego for r in rows.values()] == [1.0, 1.0, 4.0]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from harness_examples import MadeFrames, made_frames
-from numpy.typing import NDArray
+from harness_examples import SeenFrames, made_frames, with_images
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
@@ -25,17 +23,11 @@ from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.network.warp import warp
 
 
-@dataclass(frozen=True)
-class Seen(MadeFrames):
-    images: NDArray[np.uint8]
-
-
 @pytest.fixture(scope="module")
-def frames() -> Seen:
-    made = made_frames([1, 2])
+def frames() -> SeenFrames:
     rng = np.random.Generator(np.random.PCG64(5))
     coarse = rng.integers(0, 255, (2, 5, 4, 32, 32), dtype=np.uint8).repeat(8, axis=3).repeat(8, axis=4)
-    return Seen(made.true_pose, made.est_pose, made.cars, made.scene, coarse)
+    return with_images(made_frames([1, 2]), coarse)
 
 
 def network(fusion: str, seed: int = 0) -> CarNet:
@@ -50,7 +42,7 @@ def network(fusion: str, seed: int = 0) -> CarNet:
 
 
 @torch.inference_mode()
-def everywhere(net: CarNet, features: torch.Tensor, frames: Seen, f: int, e: Exchange) -> torch.Tensor:
+def everywhere(net: CarNet, features: torch.Tensor, frames: SeenFrames, f: int, e: Exchange) -> torch.Tensor:
     """The head's output by whole maps, `warp` and `takes_part`, one ego at a time."""
     est = torch.from_numpy(frames.est_pose[f] - frames.est_pose[f].mean(axis=0) * (1, 1, 0)).float()
     peers, k = list(e.peers), len(e.peers)
@@ -66,7 +58,7 @@ def everywhere(net: CarNet, features: torch.Tensor, frames: Seen, f: int, e: Exc
 
 @pytest.mark.parametrize("unsent", ["zero", "masked"])
 @pytest.mark.parametrize("fusion", [name for name, f in FUSIONS.items() if f.shares == "features"])
-def test_fusing_where_something_arrived_is_fusing_everywhere(frames: Seen, fusion: str, unsent: str) -> None:
+def test_fusing_where_something_arrived_is_fusing_everywhere(frames: SeenFrames, fusion: str, unsent: str) -> None:
     net = network(fusion)
     view = CarNetInstrument(net).look(frames, 0)
     net = folded(net)
@@ -88,7 +80,7 @@ def test_fusing_where_something_arrived_is_fusing_everywhere(frames: Seen, fusio
     assert apart == 3, "what was sent matters"
 
 
-def test_a_drone_alone_and_silent_peers(frames: Seen) -> None:
+def test_a_drone_alone_and_silent_peers(frames: SeenFrames) -> None:
     net = network("disconet")
     view = CarNetInstrument(net).look(frames, 1)
     nothing = np.zeros((4, 64, 64), bool)
@@ -107,7 +99,7 @@ def test_a_drone_alone_and_silent_peers(frames: Seen) -> None:
     assert not np.array_equal(alone[:, 5], silent[:, 5]), "zeros dilute"
 
 
-def test_ranks(frames: Seen) -> None:
+def test_ranks(frames: SeenFrames) -> None:
     net = network("disconet")
     view = CarNetInstrument(net).look(frames, 0)
     with torch.inference_mode():
@@ -130,7 +122,7 @@ def test_a_fingerprint_is_of_weights_and_configuration(tmp_path: Path) -> None:
         CarNetInstrument.load(tmp_path / "none.safetensors")
 
 
-def test_from_images_to_ap(frames: Seen) -> None:
+def test_from_images_to_ap(frames: SeenFrames) -> None:
     """The whole way, with threads and without."""
     instrument = CarNetInstrument(network("disconet"))
     conditions = (SINGLE, Sharing(0.02, "best-2", roi=True), FULL_SHARING)

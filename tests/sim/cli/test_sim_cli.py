@@ -213,29 +213,33 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     assert (kept["policy"], kept["seed"]) == ("best-2", 7)
 
 
+SECOND = ("--set", "duration_s=1", "--set", "perception.detector=none", "--set", "mission.phases=[{}]")
+
+
 @pytest.mark.parametrize(
     ("arguments", "folder"),
     [
-        ((), "example-s1-worked"),
-        (("--seed", "4"), "example-s4-worked"),
-        (("--set", "seed=4"), "example-s4-worked"),
-        (("--replication", "2"), "example-s1-worked-r2"),
-        (("--policy", "silence"), "example-s1-silence"),
-        (("--policy", "worked(rho=0.25)"), "example-s1-worked"),
-        (("--policy", "worked(rho=0.5)"), "example-s1-worked-[0-9a-f]{6}"),
-        (("--set", "fleet.drones=3", "--seed", "4"), "example-s4-worked-[0-9a-f]{6}"),
-        (("--set", "policy.name=silence", "--set", "policy.params={}"), "example-s1-silence"),
+        ((), "track_target-s1-worked-[0-9a-f]{6}"),  # shorter than the library's
+        (("--seed", "4"), "track_target-s4-worked-[0-9a-f]{6}"),
+        (("--replication", "2"), "track_target-s1-worked-r2-[0-9a-f]{6}"),
+        (("--policy", "silence"), "track_target-s1-silence-[0-9a-f]{6}"),
     ],
 )
 def test_a_runs_folder_is_named_after_what_flew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], folder: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = BASE.replace("duration_s: 6", "duration_s: 0.5").replace("at_s: 3, phase: track", "at_s: 0.3, phase: track")
-    (tmp_path / "example.yaml").write_text(text)
-    assert command("fly", "example.yaml", "--no-recording", *arguments) == 0
+    assert command("fly", "track_target", "--no-recording", *SECOND, *arguments) == 0
     (made,) = (tmp_path / "runs").iterdir()
     assert re.fullmatch(folder, made.name)
+
+
+def test_two_files_of_one_name_have_two_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file, seconds in (("a", 0.5), ("b", 0.6), ("a", 0.5)):
+        (tmp_path / f"{file}.yaml").write_text(f"name: one\nduration_s: {seconds}\nperception: {{detector: none}}\n")
+        assert command("fly", f"{file}.yaml", "--no-recording") == 0
+    assert len(list((tmp_path / "runs").iterdir())) == 2
 
 
 def test_other_settings_have_a_folder_of_their_own_and_the_same_ones_do_not(

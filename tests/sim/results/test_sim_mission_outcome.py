@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +160,20 @@ def test_one_link_that_asks_for_perception_keeps_the_camera_on() -> None:
     assert mission(*STILL[:2], region(0, 0, 20), policy=partly)["region_observed_share"] == 1.0
 
 
+def test_it_is_the_looks_that_count_and_not_what_a_link_asks_for() -> None:
+    """A link that stays at 100 % leaves no row in `directives`, and one frame in a hundred is hardly a look."""
+
+    def duty(*percents: int) -> Callable[[FleetView], list[Directive]]:
+        return lambda view: [
+            Directive(view.ego, p, duty_percent=percents[k % len(percents)], reason="duty")
+            for k, p in enumerate(sorted(view.peers))
+        ]
+
+    seen = [mission(*STILL[:2], region(0, 0, 20), policy=duty(*d))["region_observed_share"] for d in ((0, 100), (1,))]
+    assert seen[0] == 1.0
+    assert (seen[1] or 0.0) < 0.5
+
+
 # --- the target ----------------------------------------------------------------------------------
 
 TRACK = "mission.phases=[{at_s: 0, phase: track}]"
@@ -309,7 +323,7 @@ def test_a_comparison_shows_it_first(thinned: SortieRecord) -> None:
     flown = compare([Contender("worked", example(*SEEING, LOSS)), Contender("silence", example(*SEEING))], [1])
     table = comparison_table(flown)
     names = list(table.columns[0].cells)
-    assert names[:3] == ["flown", "AP@0.5 full scene", "  grounded drones blind"]
+    assert names[:4] == ["flown", "AP@0.5 full scene", "  gain", "  grounded drones blind"]
     assert [next(iter(column.cells)) for column in table.columns[1:]] == ["90.0 %", "100.0 %"]
     alone = compare([Contender("worked", example("duration_s=1", "mission.phases=[{}]"))], [1])
     assert "flown" not in list(comparison_table(alone).columns[0].cells)
@@ -326,3 +340,14 @@ def test_a_failed_expectation_says_who_left_the_air(thinned: SortieRecord) -> No
     assert explain_metric("mission.flown_share", thinned, outcome(thinned)).startswith(
         "left the air: drone 3 at 3 s (fell silent)"
     )
+
+
+def test_a_fleet_that_lost_drones_has_a_gain_over_all_drones_too() -> None:
+    """Over the fusions that both made, the survivors flatter; counted as blind, the lost drones cost what they cost."""
+    lost = "events=[{kind: drone_lost, drone: 0, at_s: 1}, {kind: drone_lost, drone: 1, at_s: 1}]"
+    thin = example(*SEEING, lost)
+    flown = compare([Contender("stays", example(*SEEING)), Contender("loses", thin)], [1, 2])
+    gains = {g.metric: g.gain for g in flown.gains}
+    stays, loses = ([s.outcome["ap50"]["grounded_blind"]["full_scene"] for s in flown.sorties[k::2]] for k in (0, 1))
+    assert gains["ap50.grounded_blind.full_scene"] == pytest.approx(np.mean(np.subtract(loses, stays)))
+    assert gains["ap50.grounded_blind.full_scene"] < gains["ap50.full_scene"] - 0.02
