@@ -5,7 +5,7 @@ An interval covers what was drawn independently, its units: sorties, draws of a 
 - **The mean of independent units** (`mean_interval`): Student's interval. Sortie's samples are small, eight sorties for
   one, where a percentile bootstrap covers well below 95 % (`docs/results/coverage.md`). A metric with a smallest or
   largest possible value gets Student's interval on a scale without ends, so that no rate leaves 0 … 1 and no number of
-  bytes is negative.
+  bytes is negative. A yes or no has the exact binomial interval.
 - **A figure that pools its units**, such as an average precision over many frames, is no mean. Its units are resampled
   (`resamples`), and `percentile_interval` and `p_value` read the draws.
 """
@@ -33,6 +33,8 @@ class Range(NamedTuple):
 
     low: float = -math.inf
     high: float = math.inf
+    yes_or_no: bool = False
+    """Whether there are no values between the two."""
 
     def of_differences(self) -> Range:
         """The range of one value minus another."""
@@ -44,6 +46,8 @@ AMOUNT = Range(0.0)
 """Bytes, joules, seconds, counts."""
 SHARE = Range(0.0, 1.0)
 """Rates, fractions, average precision."""
+FLAG = Range(0.0, 1.0, yes_or_no=True)
+"""Whether something holds: 0 or 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +73,14 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
         values: any shape, a value a unit; NaN are left out.
         within: what values are possible. The interval is Student's for the logit of the mean between two ends, for its
             logarithm above one end, and for the mean itself where there is none; the standard error is carried over by
-            the delta method (Oehlert, *A Note on the Delta Method*, 1992). Far from an end, the three agree.
+            the delta method (Oehlert, *A Note on the Delta Method*, 1992). Far from an end, the three agree. Of a yes or
+            no it is the binomial's exact one (Clopper and Pearson, 1934).
         level: of the two-sided interval.
 
     Returns:
-        The estimate. Below two values it has no interval. Where all values are equal the interval is that value.
+        The estimate. Below two values it has no interval. Measured values that are all equal show no spread, from which
+        an interval could follow: it is that value alone, and reports write "all equal" in its place. A yes or no that is
+        always the same has an interval like any other.
 
     Raises:
         ValueError: a value that is not possible.
@@ -82,6 +89,8 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
         >>> rates = [0.9, 0.95, 1.0, 1.0]
         >>> round(mean_interval(rates).high, 3), round(mean_interval(rates, SHARE).high, 3)
         (1.039, 0.995)
+        >>> round(mean_interval([0] * 8, FLAG).high, 3)  # no drone lost in eight sorties: up to 37 % may be
+        0.369
     """
     kept = [_to_end(v, within) for v in np.asarray(values, float).ravel().tolist() if not math.isnan(v)]
     for value in kept:
@@ -92,6 +101,8 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
     n, mean = len(kept), math.fsum(kept) / len(kept)
     if n == 1:
         return Estimate(mean, math.nan, math.nan, 1)
+    if within.yes_or_no:
+        return _binomial(round(math.fsum(kept)), n, level)
     error = math.sqrt(math.fsum((v - mean) ** 2 for v in kept) / (n - 1) / n)
     if min(kept) == max(kept):
         return Estimate(kept[0], kept[0], kept[0], n)
@@ -110,6 +121,16 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
     off /= width * part * (1 - part)
     low, high = (within.low + width * float(expit(logit(part) + sign * off)) for sign in (-1, 1))
     return Estimate(mean, low, high, n)
+
+
+def _binomial(k: int, n: int, level: float) -> Estimate:
+    """The exact interval of a probability, `k` of `n` times."""
+    from scipy.special import betaincinv
+
+    tail = 0.5 - level / 2
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
+    return Estimate(k / n, low, high, n)
 
 
 def _to_end(value: float, within: Range) -> float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-MINUS, NONE = "−", "–"
+MINUS, NONE, ALL_EQUAL = "−", "–", "(all equal)"
 
 
 def number(value: Any, form: str = ".3f", unit: str = "") -> str:
@@ -31,14 +31,16 @@ def signed(value: float, decimals: int = 1) -> str:
 
 
 def interval(value: float, low: float | None, high: float | None, text: Callable[[float], str], unit: str = "") -> str:
-    """A value with its interval, or alone where the interval is missing or NaN.
+    """A value with its interval, or alone where the interval is missing or NaN; "all equal" where nothing spreads.
 
     Example:
-        >>> interval(2.0, 1.5, 2.5, signed)
-        '+2.0 [+1.5, +2.5]'
+        >>> interval(2.0, 1.5, 2.5, signed), interval(0.0, 0.0, 0.0, signed)
+        ('+2.0 [+1.5, +2.5]', '0.0 (all equal)')
     """
     if low is None or high is None or math.isnan(low):
         return text(value) + unit
+    if low == high:
+        return f"{text(value)}{unit} {ALL_EQUAL}"
     return f"{text(value)}{unit} [{text(low)}, {text(high)}]"
 
 

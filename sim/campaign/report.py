@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow.compute as pc
 
 from sortie.scenarios.intervals import Estimate, Floats, Paired, mean_interval, paired
-from sortie.scenarios.report_text import NONE, number, prefixed, table
+from sortie.scenarios.report_text import ALL_EQUAL, NONE, number, prefixed, table
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
 from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
@@ -273,6 +273,7 @@ def _interval(e: Estimate, *, signed: bool = False) -> str:
         return NONE
     plus = "+" if signed and e.mean >= 0 else ""
     if math.isnan(e.low) or e.low == e.high:
-        return f"{plus}{prefixed(e.mean)[0]}"
+        equal = "" if math.isnan(e.low) else f" {ALL_EQUAL}"
+        return f"{plus}{prefixed(e.mean)[0]}{equal}"
     mean, low, high = prefixed(e.mean, e.low, e.high)
     return f"{plus}{mean} [{low}, {high}]"

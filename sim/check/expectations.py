@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
 from sortie.sim.results.outcome import describe
 from sortie.sim.results.outcome_fields import possible
@@ -133,7 +134,7 @@ def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
     found = mean_interval(values, possible(e.metric), 2 * e.confidence - 1)
     low = e.at_least is not None and found.low < e.at_least - e.tolerance
     high = e.at_most is not None and found.high > e.at_most + e.tolerance
-    got = f"{found.mean:.6g} [{found.low:.6g}, {found.high:.6g}] over {len(values)}"
+    got = f"{interval(found.mean, found.low, found.high, '{:.6g}'.format)} over {len(values)}"
     if not low and not high:
         return Verdict(expected, got, True, e.because, e.metric)
     worst = values.index(min(values) if low else max(values))

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hin
 from sortie.fleet.energy.battery import CAUSES, RECORDED
 from sortie.fleet.messages.auth import DropReason
 from sortie.radio.transmission import Status
-from sortie.scenarios.intervals import AMOUNT, ANY, SHARE, Range
+from sortie.scenarios.intervals import AMOUNT, ANY, FLAG, SHARE, Range
 from sortie.scenarios.reading.nodes import nearest
 
 
@@ -97,7 +97,7 @@ class Bytes(TypedDict):
 class Drone(TypedDict):
     soc: Annotated[float, "State of charge, 0 … 1.", SHARE]
     voltage_v: Annotated[float, "At the pack's terminals."]
-    airborne: Annotated[bool, "Whether it still flew.", SHARE]
+    airborne: Annotated[bool, "Whether it still flew.", FLAG]
     energy_j: Annotated[float, "Spent to the very end, all causes."]
 
 
@@ -258,7 +258,7 @@ def possible(name: str) -> Range:
 
     Example:
         >>> possible("drones.2.soc"), possible("bytes.data_sent")
-        (Range(low=0.0, high=1.0), Range(low=0.0, high=inf))
+        (Range(low=0.0, high=1.0, yes_or_no=False), Range(low=0.0, high=inf, yes_or_no=False))
     """
     kind: Any = Outcome
     within = AMOUNT

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.intervals import AMOUNT, ANY, SHARE, Range, mean_interval, paired
+from sortie.scenarios.intervals import AMOUNT, ANY, FLAG, SHARE, Range, mean_interval, paired
 from sortie.sim.results.outcome_fields import possible
 
 
@@ -84,12 +84,20 @@ def test_pairing_saves_what_the_common_part_was() -> None:
         ("deadline_miss_rate", SHARE), ("phases.1.deadline_miss_rate", SHARE), ("ap50.mission", SHARE), ("ap50.grounded_blind.mission", SHARE),
         ("mission.target_detected_share", SHARE), ("mission.target_longest_undetected_s", AMOUNT),
         ("phases.0.ap50.full_scene", SHARE), ("battery.3", SHARE), ("drones.2.soc", SHARE), ("medium_busy_fraction", SHARE),
-        ("drones.2.energy_j", AMOUNT), ("bytes.data_sent", AMOUNT), ("payload_fates.delivered", AMOUNT),
+        ("drones.2.airborne", FLAG), ("drones.2.energy_j", AMOUNT), ("bytes.data_sent", AMOUNT), ("payload_fates.delivered", AMOUNT),
         ("age_s.p99", AMOUNT), ("ap50.scored_fusions", AMOUNT), ("nothing.like_it", ANY), ("bytes.nothing", ANY),
     ],
 )  # fmt: skip
 def test_every_metric_has_its_range(metric: str, within: Range) -> None:
     assert possible(metric) == within
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 8), (8, 8), (3, 8), (1, 200)])
+def test_a_yes_or_no_has_the_exact_interval_also_where_all_are_equal(k: int, n: int) -> None:
+    found = mean_interval([1.0] * k + [0.0] * (n - k), FLAG)
+    exact = stats.binomtest(k, n).proportion_ci(method="exact")
+    assert (found.mean, found.count) == (k / n, n)
+    assert (found.low, found.high) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 def test_a_share_that_rounding_left_beside_its_end_is_at_the_end() -> None:
