@@ -117,6 +117,19 @@ def _handshakes() -> Tables:
     return {"handshakes": handshakes.table(rows, about)}
 
 
+def _requests() -> Tables:
+    import requests_of_cells
+
+    from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.detector import shipped
+
+    split = make_split(Benchmark(), "test", ROOT / "runs/bench", scenes=60)
+    rows = requests_of_cells.measure(load_weights(shipped("where2comm")), load_frames(split), workers=2)
+    about = "60 frames of the test split, five egos each; intervals over scenes, differences in points of AP."
+    return {"requests": requests_of_cells.table(rows, about)}
+
+
 def _link() -> Tables:
     import link
 
@@ -513,6 +526,7 @@ FIGURES: dict[str, Figure] = {
     "surrogate_in_flight": Figure(18, _surrogate_in_flight),
     "arms": Figure(20, _arms),
     "handshakes": Figure(5, _handshakes),
+    "requests": Figure(5, _requests),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out),
