@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sortie.perception.scene.town import Town
 from sortie.perception.scene.traffic import (
     TARGET_COLOUR,
-    TARGET_ID,
     TARGET_SIZE_M,
     Cars,
     TargetPath,
@@ -27,54 +28,59 @@ class SceneModel:
     Args:
         config: the scenario's `perception.scene`.
         target: the mission's target car, or None.
+        more_targets: further ones. Ids of targets are 0, 1 …; parked cars follow, from 1 at least, then moving ones.
         bounds: (x_min, y_min, x_max, y_max) of the route, ENU metres; drones outside it by more than
             about 50 m begin to miss cars. The town itself has no bounds.
 
     Making one costs tens of milliseconds: blocks are drawn, nothing is rasterised (`town.tile` does that on demand).
     """
 
-    def __init__(self, config: Scene, target: Target | None, bounds: tuple[float, float, float, float]) -> None:
+    def __init__(
+        self,
+        config: Scene,
+        target: Target | None,
+        bounds: tuple[float, float, float, float],
+        more_targets: Sequence[Target] = (),
+    ) -> None:
         if not (bounds[0] <= bounds[2] and bounds[1] <= bounds[3]):
             raise ValueError(f"bounds are {bounds}, must be (x_min, y_min, x_max, y_max)")
         self.config = config
-        self.made_of = config, target, bounds
+        self.made_of = config, target, bounds, tuple(more_targets)
         """Scenes that are made of the same are the same."""
         self.town = Town(config)
         self.rect = (bounds[0] - MARGIN_M, bounds[1] - MARGIN_M, bounds[2] + MARGIN_M, bounds[3] + MARGIN_M)
         self._parked_pose, self._parked_size, self._parked_colour = parked(self.town, self.rect)
         self._lanes = lanes(config, self.rect)
-        self._target = None if target is None else TargetPath.of(target)
-        n, m = len(self._parked_pose), len(self._lanes.s0_m)
-        self._parked_ids = np.arange(1, n + 1)
-        self._moving_ids = np.arange(n + 1, n + m + 1)
+        self.targets = [TargetPath.of(t) for t in (target, *more_targets) if t is not None]
+        n, m, first = len(self._parked_pose), len(self._lanes.s0_m), max(1, len(self.targets))
+        self._parked_ids = np.arange(first, n + first)
+        self._moving_ids = np.arange(n + first, n + m + first)
         self._xy_at: tuple[float, np.ndarray] | None = None
 
     @property
     def parked_cars(self) -> Cars:
-        """The parked cars inside `rect`, ids 1 … n."""
+        """The parked cars inside `rect`."""
         pose, size = self._parked_pose, self._parked_size
         x, y, yaw = pose.T
         return Cars(self._parked_ids, x, y, yaw, size[:, 0], size[:, 1], size[:, 2], self._parked_colour)
 
     def moving_cars(self, t_s: float) -> Cars:
-        """The target (id 0, if there is one) and the moving cars inside `rect` at `t_s`."""
+        """The targets and the moving cars inside `rect` at `t_s`."""
         x, y, inside = self._lanes.position_m(t_s)
         size, lane = self._lanes.size_m[inside], self._lanes
         yaw, colour = lane.yaw_rad[inside], lane.colour[inside]
         ids = self._moving_ids[inside]
         cars = Cars(ids, x[inside], y[inside], yaw, size[:, 0], size[:, 1], size[:, 2], colour)
-        if self._target is None:
+        k = len(self.targets)
+        if not k:
             return cars
-        tx, ty, heading = self._target.pose(t_s)
-        length, width, height = (np.array([v]) for v in TARGET_SIZE_M)
-        target = Cars(
-            np.array([TARGET_ID]), np.array([tx]), np.array([ty]), np.array([heading]), length, width, height,
-            np.array([TARGET_COLOUR], np.uint8),
-        )  # fmt: skip
-        return join(target, cars)
+        tx, ty, heading = np.array([path.pose(t_s) for path in self.targets]).T
+        length, width, height = np.tile(TARGET_SIZE_M, (k, 1)).T
+        colour = np.tile(np.array(TARGET_COLOUR, np.uint8), (k, 1))
+        return join(Cars(np.arange(k), tx, ty, heading, length, width, height, colour), cars)
 
     def cars_at(self, t_s: float) -> Cars:
-        """Every car inside `rect` at `t_s`, by id: the target (0), the parked ones, the moving ones.
+        """Every car inside `rect` at `t_s`, by id: the targets, the parked ones, the moving ones.
 
         A moving car keeps its id while it is inside; one that leaves may come back in elsewhere.
         """
@@ -86,8 +92,7 @@ class SceneModel:
         if self._xy_at is None or self._xy_at[0] != t_s:
             x, y, inside = self._lanes.position_m(t_s)
             parts = [self._parked_pose[:, :2], np.stack([x, y], axis=1)[inside]]
-            if self._target is not None:
-                parts.append(np.array([self._target.pose(t_s)[:2]]))
+            parts += [np.array([path.pose(t_s)[:2]]) for path in self.targets]
             self._xy_at = (t_s, np.ascontiguousarray(np.concatenate(parts).T))
         xs, ys = self._xy_at[1]
         return int(np.count_nonzero((xs - x_m) ** 2 + (ys - y_m) ** 2 <= radius_m * radius_m))

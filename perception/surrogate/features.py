@@ -81,20 +81,19 @@ class Looks:
 
 
 class Traffic:
-    """Every car of a scene as columns, parked ones first, then moving ones, then the target if there is one."""
+    """Every car of a scene as columns, parked ones first, then moving ones, then the targets."""
 
     def __init__(self, scene: SceneModel) -> None:
-        parked, lanes, target = scene.parked_cars, scene._lanes, scene._target
-        self._lanes, self._target = lanes, target
-        self.parked, self.count = len(parked), len(parked) + len(lanes.s0_m) + (target is not None)
-        extra = 1 if target is not None else 0
+        parked, lanes, extra = scene.parked_cars, scene._lanes, len(scene.targets)
+        self._lanes, self._targets = lanes, scene.targets
+        self.parked, self.count = len(parked), len(parked) + len(lanes.s0_m) + extra
         size = [
             np.stack([parked.length_m, parked.width_m], 1),
             lanes.size_m[:, :2],
-            np.array([TARGET_SIZE_M[:2]])[:extra],
+            np.tile(TARGET_SIZE_M[:2], (extra, 1)),
         ]
         self.size_m: Floats = np.concatenate(size)
-        colour = np.concatenate([parked.colour, lanes.colour, np.array([TARGET_COLOUR], np.uint8)[:extra]])
+        colour = np.concatenate([parked.colour, lanes.colour, np.tile(np.array(TARGET_COLOUR, np.uint8), (extra, 1))])
         self.tone: Floats = np.einsum("nc,c->n", colour, _TONE)
         self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
         self.parked_xy: Floats = np.stack([parked.x_m, parked.y_m], 1)
@@ -114,11 +113,11 @@ class Traffic:
         xy[:, moving, 0] = np.where(lanes.east, s, lanes.lateral_m)
         xy[:, moving, 1] = np.where(lanes.east, lanes.lateral_m, s)
         there[:, moving] = s <= lanes.limit_m
-        if self._target is not None:
-            pose = np.array([self._target.pose(t) for t in t_s.tolist()])
-            xy[:, -1] = pose[:, :2]
+        if self._targets:
             yaw = yaw.copy()
-            yaw[:, -1] = pose[:, 2]
+            for k, path in enumerate(self._targets, start=count - len(self._targets)):
+                pose = np.array([path.pose(t) for t in t_s.tolist()])
+                xy[:, k], yaw[:, k] = pose[:, :2], pose[:, 2]
         return xy, yaw, there
 
     def next_to(self, parked: Ints, xy: Floats, there: NDArray[np.bool_]) -> Floats:

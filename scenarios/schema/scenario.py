@@ -80,6 +80,11 @@ class Scenario(Section):
                 who = getattr(decision, end)
                 if who is not None and who >= n:
                     raise inconsistent(("expect_decisions", i, end), f"{who}", f"below fleet.drones = {n}")
+        for k, group in enumerate(self.mission.groups):
+            for i, who in enumerate(group.drones):
+                if who >= n:
+                    at = ("mission", "groups", k, "drones", i)
+                    raise inconsistent(at, f"{who}", f"below fleet.drones = {n}")
         degraded, detached = self.context.degraded_after_periods, self.context.detached_after_periods
         if detached <= degraded:
             bound = f"above degraded_after_periods = {degraded:g}"

@@ -1,4 +1,4 @@
-"""The mission as a function of time: phase, target and region of responsibility."""
+"""The mission as a function of time: each group's phase, target and region of responsibility."""
 
 from __future__ import annotations
 
@@ -7,48 +7,58 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sortie.fleet.agent import Task
-from sortie.perception.scene.traffic import TARGET_ID, TargetPath
+from sortie.perception.scene.traffic import TargetPath
 from sortie.policies.contract import PHASE_OF, Disc
 from sortie.scenarios.schema import Mission
 
 
 class MissionNow(NamedTuple):
-    """The mission at one instant; positions ENU."""
+    """A group's mission at one instant; positions ENU."""
 
     phase: str
     region: Disc | None
+    target: int
+    """Number of the target, -1 where there is none. It is the car's id in the scene."""
     target_xy: tuple[float, float] | None
 
     def task(self, own_xy_m: Sequence[float], footprint_m: float) -> Task:
         """What a drone at `own_xy_m` is to do; it names the target while it tracks it and has it in its footprint."""
-        phase, region, target = self
         targets: tuple[int, ...] = ()
-        if phase == "track" and target is not None:
-            dx_m, dy_m = target[0] - own_xy_m[0], target[1] - own_xy_m[1]
+        if self.phase == "track" and self.target_xy is not None:
+            dx_m, dy_m = self.target_xy[0] - own_xy_m[0], self.target_xy[1] - own_xy_m[1]
             if dx_m * dx_m + dy_m * dy_m <= footprint_m * footprint_m:
-                targets = (TARGET_ID,)
-        return Task(PHASE_OF[phase], region, targets)
+                targets = (self.target,)
+        return Task(PHASE_OF[self.phase], self.region, targets)
 
 
 class MissionPlan:
-    """Looks the mission up by time.
+    """Looks a group's mission up by time.
 
-    The region of a phase without a centre follows the target: the ground station cues the fleet with the
+    The region of a phase without a centre follows the phase's target: the ground station cues the drones with the
     target's true position, as the paper's track-a-target task does.
     """
 
-    def __init__(self, mission: Mission) -> None:
-        self._phases = mission.phases
-        self._begins_s = [p.at_s for p in mission.phases]
-        self._target = None if mission.target is None else TargetPath.of(mission.target)
+    def __init__(self, mission: Mission, drones: int) -> None:
+        self._phases = mission.phases_of
+        self._begins_s = [[p.at_s for p in phases] for phases in self._phases]
+        self._targets = [TargetPath.of(target) for target in mission.targets]
+        self.group_of = [mission.group_of(drone) for drone in range(drones)]
+        """The number of each drone's group."""
+        self.groups = sorted(set(self.group_of))
+        """The groups that have drones."""
 
-    def at(self, t_s: float) -> MissionNow:
-        """The mission at `t_s`."""
-        phase = self._phases[bisect_right(self._begins_s, t_s + 1e-9) - 1]
-        target = None if self._target is None else self._target.pose(t_s)[:2]
+    def at(self, t_s: float) -> dict[int, MissionNow]:
+        """The mission of each group that has drones, at `t_s`."""
+        return {group: self._of(group, t_s) for group in self.groups}
+
+    def _of(self, group: int, t_s: float) -> MissionNow:
+        phase = self._phases[group][bisect_right(self._begins_s[group], t_s + 1e-9) - 1]
+        number, target = -1, None
+        if self._targets:
+            number, target = phase.target, self._targets[phase.target].pose(t_s)[:2]
         region = phase.region
         if region is None:
-            return MissionNow(phase.phase, None, target)
+            return MissionNow(phase.phase, None, number, target)
         centre = region.centre_m or target
         assert centre is not None, "the schema asks for a target where a region has no centre"  # noqa: S101
-        return MissionNow(phase.phase, Disc(*centre, region.radius_m), target)
+        return MissionNow(phase.phase, Disc(*centre, region.radius_m), number, target)

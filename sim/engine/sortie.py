@@ -141,8 +141,10 @@ def build(
         frame_s=scenario.frame_s,
         up=up,
     )
-    scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
-    world = World(env, scenario, statuses, motion, batteries, air, scene, MissionPlan(scenario.mission), recorder)
+    mission = scenario.mission
+    scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
+    plan = MissionPlan(mission, len(drones))
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)

@@ -99,7 +99,7 @@ class World:
         self._headrooms = [(1.0, 1.0)] * n
         self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
         self.now = plan.at(0.0)
-        """The mission in this frame: the ground station's cue comes with the frame."""
+        """Each group's mission in this frame: the ground station's cue comes with the frame."""
 
     def start(self, on_second: Callable[[float], None], before_frame: Callable[[int], None] | None = None) -> None:
         """Begin the world's process; call once, before the agents start.
@@ -227,8 +227,8 @@ class World:
                 airborne,
             )
         )
-        phase, region, target = self.now
-        rows["mission"].append((now_s, phase, *(region or _NO_DISC), *(target or _NOWHERE)))
+        for group, (phase, region, target, target_xy) in self.now.items():
+            rows["mission"].append((now_s, group, phase, *(region or _NO_DISC), target, *(target_xy or _NOWHERE)))
 
     def _unfold_states(self, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
@@ -278,7 +278,9 @@ class OwnSenses:
 
     def task(self) -> Task:
         sensed = self._sensed
-        return self._world.now.task(sensed.capture.position_m, sensed.footprint_radius_m)
+        world = self._world
+        now = world.now[world.plan.group_of[self._drone]]
+        return now.task(sensed.capture.position_m, sensed.footprint_radius_m)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:

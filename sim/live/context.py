@@ -70,8 +70,9 @@ class ReplaySenses:
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
         motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
         self._flight = FlightSenses(motion, scenario.frame_s)
-        self._scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
-        self._plan = MissionPlan(scenario.mission)
+        mission = scenario.mission
+        self._scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
+        self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._drone, self._trace = drone, trace
         self._first = round(begin_s / scenario.frame_s)
         self._sensed = self._flight.at(self._first)[drone]
@@ -94,7 +95,8 @@ class ReplaySenses:
     def task(self) -> Task:
         """Phase, region and targets."""
         capture = self._sensed.capture
-        return self._plan.at(capture.t_s).task(capture.position_m, self._sensed.footprint_radius_m)
+        now = self._plan.at(capture.t_s)[self._plan.group_of[self._drone]]
+        return now.task(capture.position_m, self._sensed.footprint_radius_m)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """Cars in range: no detector runs here."""

@@ -32,6 +32,11 @@ FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 7
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
 
 
+def phase_lane(group: int) -> str:
+    """Where a group's phases are shown; 0 are the drones in no group."""
+    return f"lanes/phase_{group}" if group else "lanes/phase"
+
+
 class Charts:
     """Plots of one sortie; `begin` once, then `add` with the tables in order of time."""
 
@@ -46,7 +51,7 @@ class Charts:
         self._carried: dict[tuple[int, int], str] = {}
         self._lanes: dict[int, str] = {}
         self._lane_colours: dict[int, dict[str, c.Rgba]] = defaultdict(dict)
-        self._phase = ""
+        self._phase: dict[int, str] = {}
         self._event_texts: list[str] = []
 
     def begin(self) -> None:
@@ -57,7 +62,9 @@ class Charts:
             canvas.static(f"plots/battery/{i}", line(f"drone {i}", colour))
             canvas.static(f"plots/goodput/{i}", line(f"drone {i}", colour))
         phases = list(c.PHASES)
-        canvas.static("lanes/phase", rr.StateConfiguration(values=phases, colors=[c.PHASES[p] for p in phases]))
+        for group in range(len(self._scenario.mission.phases_of)):
+            states = rr.StateConfiguration(values=phases, colors=[c.PHASES[p] for p in phases])
+            canvas.static(phase_lane(group), states)
         canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
         canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
         canvas.static("plots/age/p99_ms", line("descriptor age p99, ms", (190, 190, 200, 255)))
@@ -176,12 +183,13 @@ class Charts:
     # --- lanes and logs --------------------------------------------------------------------------
 
     def _phases(self, mission: pa.Table) -> None:
-        for t_s, phase in zip(mission["t_s"].to_pylist(), mission["phase"].to_pylist(), strict=True):
-            if phase != self._phase:
-                if self._phase:
+        for t_s, group, phase in zip(*(mission[k].to_pylist() for k in ("t_s", "group", "phase")), strict=True):
+            before = self._phase.get(group)
+            if phase != before:
+                if before is not None:
                     self._marks("phase", [t_s])
-                self._phase = phase
-                self._state("lanes/phase", t_s, phase)
+                self._phase[group] = phase
+                self._state(phase_lane(group), t_s, phase)
 
     def _decisions(self, directives: pa.Table) -> None:
         """Log each change of what a link carries, in words; a drone's lane shows the highest rung of its links."""

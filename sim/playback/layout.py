@@ -12,6 +12,7 @@ from sortie.fleet.coverage import footprint_radius_m
 from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
+from sortie.sim.playback.charts import phase_lane
 
 SEEN = """
 **Boxes**: what drone {ego} makes of the scene: green, a car found; yellow, missed; red, a false alarm; the darker,
@@ -137,7 +138,8 @@ def lanes_view(
 ) -> rrb.View:
     """Events, phase and drones as lanes."""
     drones = range(min(scenario.fleet.drones, MAX_LANES))
-    lanes = [f"{root}/lanes/events", f"{root}/lanes/phase", *(f"{root}/lanes/drone_{i}" for i in drones)]
+    phases = (f"{root}/{phase_lane(group)}" for group in range(len(scenario.mission.phases_of)))
+    lanes = [f"{root}/lanes/events", *phases, *(f"{root}/lanes/drone_{i}" for i in drones)]
     return rrb.StateTimelineView(name=name, contents=lanes, time_view=time_axis(scenario))
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
@@ -18,12 +17,13 @@ import rerun.blueprint as rrb
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, partial_file
-from sortie.sim.playback.canvas import Canvas, Floats
+from sortie.sim.playback.canvas import Canvas
 from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
 from sortie.sim.playback.layout import blueprint, legend
 from sortie.sim.playback.scene import Drawing
-from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.record import Recorder, SortieRecord
+from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
 
 APPLICATION = "sortie"
@@ -38,8 +38,8 @@ class Playback:
         """Args: `name` is the recording's; a sortie that still flies has its scenario's."""
         canvas = Canvas(recording, scenario.context.rate_hz, root)
         self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
-        self._disc_t_s: Floats = np.zeros(0)
-        self._discs: Floats = np.zeros((0, 3))
+        self._mission, self._groups = scenario.mission, len(scenario.mission.phases_of)
+        self._missions = Recorder().tables()["mission"]
         if not root:
             recording.send_recording_name(name or f"{scenario.name} · {scenario.policy.name}")
         canvas.static("about", legend(scenario))
@@ -48,11 +48,10 @@ class Playback:
 
     def add(self, known_s: float, new: Mapping[str, pa.Table]) -> None:
         """Draw new rows of every table; all that happened before `known_s` is in them or came before."""
-        mission = new["mission"]
-        discs = np.column_stack([mission[f"region_{k}"].to_numpy() for k in ("x_m", "y_m", "radius_m")])
-        self._disc_t_s = np.concatenate([self._disc_t_s[-1:], mission["t_s"].to_numpy()])
-        self._discs = np.concatenate([self._discs[-1:], discs])
-        seen = list(sightings(new, self._disc_t_s, self._discs))
+        self._missions = pa.concat_tables(
+            [self._missions.slice(max(0, len(self._missions) - self._groups)), new["mission"]]
+        )
+        seen = list(sightings(new, Regions(self._missions, self._mission)))
         self._scene.add(known_s, new, seen)
         self._charts.add(known_s, new, seen)
 
@@ -117,4 +116,4 @@ def scene_of(record: SortieRecord) -> SceneModel:
     states, scenario = record.tables["states"], record.scenario
     x, y = states["x_m"].to_numpy(), states["y_m"].to_numpy()
     bounds = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
-    return SceneModel(scenario.perception.scene, scenario.mission.target, bounds)
+    return SceneModel(scenario.perception.scene, scenario.mission.target, bounds, scenario.mission.more_targets)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -41,13 +42,14 @@ class Drawing:
 
     def __init__(self, canvas: Canvas, scenario: Scenario, scene: SceneModel) -> None:
         self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
-        self._rate_hz, self._has_target = scenario.context.rate_hz, scenario.mission.target is not None
+        self._rate_hz, self._targets = scenario.context.rate_hz, len(scenario.mission.targets)
+        self._groups = range(len(scenario.mission.phases_of))
         n = self._n
         self._links, self._received = LinkArrows(canvas, n, scenario.context.rate_hz), ReceivedCells(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
         self._frames = 0
         self._resting: dict[int, Floats] = {}
-        self._disc_shown = False
+        self._discs_shown = dict.fromkeys(self._groups, False)
 
     # --- what holds at all times -----------------------------------------------------------------
 
@@ -67,13 +69,15 @@ class Drawing:
         self._links.begin()
         self._received.begin()
         canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
-        disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
-        canvas.static("world/mission/disc", disc)
-        if self._has_target:
+        for group in self._groups:
+            disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
+            canvas.static(f"{_mission_path(group)}/disc", disc)
+        for k in range(self._targets):
+            label = "target" if self._targets == 1 else f"target {k}"
             pin = rr.Arrows3D(
-                vectors=[(0, 0, -12)], origins=[(0, 0, 15)], radii=[0.6], colors=[c.TARGET], labels=["target"]
+                vectors=[(0, 0, -12)], origins=[(0, 0, 15)], radii=[0.6], colors=[c.TARGET], labels=[label]
             )
-            canvas.static("world/target/pin", pin)
+            canvas.static(f"{_target_path(k)}/pin", pin)
 
     def _town(self) -> None:
         canvas, (x0, y0, x1, y1) = self._canvas, self._scene.rect
@@ -128,7 +132,9 @@ class Drawing:
         self._links.add(t_s, position, airborne, new)
         self._received.add(known_s, t_s, position, attitude, new)
         self._cars(t_s, position)
-        self._mission(new["mission"])
+        for group in self._groups:
+            self._mission(group, new["mission"].filter(pc.equal(new["mission"]["group"], group)))
+        self._follow(t_s)
         self._seen(list(seen))
 
     def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
@@ -192,26 +198,26 @@ class Drawing:
             boxes = rr.Boxes3D.columns(**_car_boxes(every)).partition(lengths)
             self._canvas.columns("world/cars/moving", t_s, boxes)
 
-    def _mission(self, mission: pa.Table) -> None:
-        t_s = mission["t_s"].to_numpy()
-        x, y, radius, tx, ty = (
-            mission[k].to_numpy() for k in ("region_x_m", "region_y_m", "region_radius_m", "target_x_m", "target_y_m")
-        )
+    def _mission(self, group: int, mission: pa.Table) -> None:
+        t_s, path = mission["t_s"].to_numpy(), _mission_path(group)
+        x, y, radius = (mission[k].to_numpy() for k in ("region_x_m", "region_y_m", "region_radius_m"))
         there = ~np.isnan(radius)
-        before = np.concatenate([[self._disc_shown], there])[: len(there)]
+        before = np.concatenate([[self._discs_shown[group]], there])[: len(there)]
         for k in np.flatnonzero(there != before).tolist():
             ring = [CIRCLE] if there[k] else []
             strips = rr.LineStrips3D.columns(strips=ring).partition([len(ring)])
-            self._canvas.columns("world/mission/disc", t_s[k : k + 1], strips)
+            self._canvas.columns(f"{path}/disc", t_s[k : k + 1], strips)
         if len(there):
-            self._disc_shown = bool(there[-1])
+            self._discs_shown[group] = bool(there[-1])
         centre = np.column_stack([x, y, np.full(len(x), 0.6)])[there]
         scale = np.column_stack([radius, radius, np.ones(len(x))])[there]
-        self._canvas.columns("world/mission", t_s[there], rr.Transform3D.columns(translation=centre, scale=scale))
-        if self._has_target:
-            self._canvas.columns(
-                "world/target", t_s, rr.Transform3D.columns(translation=np.column_stack([tx, ty, np.zeros(len(tx))]))
-            )
+        self._canvas.columns(path, t_s[there], rr.Transform3D.columns(translation=centre, scale=scale))
+
+    def _follow(self, t_s: Floats) -> None:
+        """The pins over the targets."""
+        for k, path in enumerate(self._scene.targets):
+            xyz = [(*path.pose(t)[:2], 0.0) for t in t_s.tolist()]
+            self._canvas.columns(_target_path(k), t_s, rr.Transform3D.columns(translation=np.reshape(xyz, (-1, 3))))
 
     def _seen(self, seen: list[Sighting]) -> None:
         for i in sorted({s.drone for s in seen}):
@@ -286,6 +292,14 @@ def _car_boxes(cars: Cars) -> dict[str, Any]:
         "quaternions": c.about_z(cars.yaw_rad),
         "colors": c.packed(np.column_stack([cars.colour, np.full(len(cars), 255, np.uint8)])),
     }
+
+
+def _mission_path(group: int) -> str:
+    return f"world/mission/{group}" if group else "world/mission"
+
+
+def _target_path(k: int) -> str:
+    return f"world/target/{k}" if k else "world/target"
 
 
 def _flat_boxes(boxes: Boxes) -> dict[str, Any]:

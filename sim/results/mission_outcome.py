@@ -7,8 +7,11 @@ figures show it. `sortie.sim.results.outcome_fields.MissionOutcome` defines each
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -31,28 +34,49 @@ _INSTANT_S = 1e-6
 
 def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `mission` of the outcome."""
-    mission, states, n = record.tables["mission"], record.tables["states"], record.scenario.fleet.drones
-    t_s = mission["t_s"].to_numpy()
+    states, n = record.tables["states"], record.scenario.fleet.drones
+    t_s = states["t_s"].to_numpy()[::n]
     width_s = np.diff(t_s, append=record.scenario.duration_s)
     flying = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
     looks = np.reshape(states["looks"].to_numpy(), (-1, n))
     looking = flying & _looked_lately(looks, max(1, round(LOOK_S / record.scenario.frame_s)))
     pose = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=-1)
     pose = pose.reshape(-1, n, 7)
-    target = np.stack([mission[c].to_numpy() for c in ("target_x_m", "target_y_m")], axis=-1)
-    tracked = np.array(mission["phase"].to_pylist()) == "track"
-    tracked &= ~np.isnan(target[:, 0])
-    in_view = _in_any_view(target[:, None], pose, looking & tracked[:, None])[:, 0]
-    in_view_share, out_of_view_s = _share_and_gap(in_view, tracked, width_s)
-    detected_share, undetected_s = _detected(record, t_s, tracked)
+    groups = _groups(record.tables["mission"])
+    tracks = _tracked(groups, len(t_s))
+    seen = []
+    for target_xy_m, tracked in tracks.values():
+        in_view = _in_any_view(target_xy_m[:, None], pose, looking & tracked[:, None])[:, 0]
+        seen.append((in_view, tracked, width_s))
+    in_view_share, out_of_view_s = _share_and_gap(seen)
+    detected_share, undetected_s = _detected(record, t_s, {k: tracked for k, (_, tracked) in tracks.items()})
     return {
         "flown_share": 1.0 - float(width_s @ (~flying).sum(axis=1)) / (n * float(width_s.sum())),
-        "region_observed_share": _region_observed(record, t_s, pose, looking),
+        "region_observed_share": _region_observed(record, groups, t_s, pose, looking),
         "target_in_view_share": in_view_share,
         "target_longest_out_of_view_s": out_of_view_s,
         "target_detected_share": detected_share,
         "target_longest_undetected_s": undetected_s,
     }
+
+
+def _groups(missions: pa.Table) -> list[pa.Table]:
+    """The table `mission` by group of drones."""
+    return [missions.filter(pc.equal(missions["group"], g)) for g in pc.unique(missions["group"]).to_pylist()]
+
+
+def _tracked(groups: Sequence[pa.Table], frames: int) -> dict[int, tuple[Floats, Bools]]:
+    """Every target that a group tracks at some time: where it is [T, 2], and when a group tracks it [T]."""
+    out: dict[int, tuple[Floats, Bools]] = {}
+    for rows in groups:
+        target, tracking = rows["target"].to_numpy(), np.array(rows["phase"].to_pylist()) == "track"
+        xy_m = np.stack([rows[c].to_numpy() for c in ("target_x_m", "target_y_m")], axis=-1)
+        for k in np.unique(target[tracking & (target >= 0)]).tolist():
+            now = tracking & (target == k)
+            where, when = out.setdefault(k, (np.full((frames, 2), np.nan), np.zeros(frames, bool)))
+            where[now] = xy_m[now]
+            when |= now
+    return out
 
 
 def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats) -> Bools:
@@ -92,59 +116,71 @@ def _in_any_view(xy_m: Floats, pose: Floats, looking: Bools) -> Bools:
     return seen
 
 
-def _region_observed(record: SortieRecord, t_s: Floats, pose: Floats, looking: Bools) -> float | None:
-    """Share of the mission region's area that is in view, averaged over the time in which there is a region."""
+def _region_observed(
+    record: SortieRecord, groups: Sequence[pa.Table], t_s: Floats, pose: Floats, looking: Bools
+) -> float | None:
+    """Share of the mission regions' area that is in view, averaged over regions and the time in which there are any."""
     every = max(1, round(LOOK_S / record.scenario.frame_s))
-    disc = np.stack([record.tables["mission"][f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")], axis=-1)[
-        ::every
-    ]
     width_s = np.diff(t_s[::every], append=record.scenario.duration_s)
-    there = ~np.isnan(disc[:, 2])
-    if not there.any():
-        return None
+    shares = lasts_s = 0.0
+    for rows in groups:
+        disc = np.stack([rows[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")], axis=-1)[::every]
+        there = ~np.isnan(disc[:, 2])
+        if there.any():
+            seen = _disc_in_view(disc[there], pose[::every][there], looking[::every][there])
+            shares += float(seen @ width_s[there])
+            lasts_s += float(width_s[there].sum())
+    return shares / lasts_s if lasts_s else None
+
+
+def _disc_in_view(disc: Floats, pose: Floats, looking: Bools) -> Floats:
+    """Share of a disc [T, 3] that is in a drone's view: [T]."""
     k = np.arange(PLACES) + 0.5  # a sunflower's seeds: equal areas, and no row of them along a camera's edge
     turn, out = k * np.pi * (3.0 - math.sqrt(5.0)), np.sqrt(k / PLACES)
     seeds = np.stack([out * np.cos(turn), out * np.sin(turn)], axis=-1)
-    places = disc[there, None, :2] + disc[there, None, 2:] * seeds
-    seen = _in_any_view(places, pose[::every][there], looking[::every][there]).mean(axis=1)
-    return float(seen @ width_s[there] / width_s[there].sum())
+    places = disc[:, None, :2] + disc[:, None, 2:] * seeds
+    share: Floats = _in_any_view(places, pose, looking).mean(axis=1)
+    return share
 
 
-def _detected(record: SortieRecord, frame_s: Floats, tracked: Bools) -> tuple[float | None, float | None]:
+def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) -> tuple[float | None, float | None]:
     """Share of the scored instants at which a drone's boxes hold the target, and the longest time without."""
     scenario, boxes = record.scenario, record.tables["detections"]
-    if record.detector == "none" or scenario.mission.target is None:
+    if record.detector == "none" or not tracked:
         return None, None
     instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
     instants = instants[instants < scenario.duration_s - _INSTANT_S]
-    path = TargetPath.of(scenario.mission.target)
-    size_m = TARGET_SIZE_M[:2]
-    truth = np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, instants.tolist())]).reshape(-1, 5)
     columns = ("x_m", "y_m", "length_m", "width_m", "yaw_rad")
     found = np.stack([boxes[c].to_numpy() for c in columns], axis=-1)
     of = np.searchsorted(instants, boxes["t_s"].to_numpy() - _INSTANT_S)
-    _, which, iou = overlapping(found, truth, of, np.arange(len(instants)))
-    hit = np.zeros(len(instants), bool)
-    hit[which[iou >= FOUND_IOU]] = True
-    counted = tracked[np.searchsorted(frame_s, instants + _INSTANT_S, side="right") - 1]
-    return _share_and_gap(hit, counted, np.diff(instants, append=scenario.duration_s))
+    size_m, seen = TARGET_SIZE_M[:2], []
+    frame = np.searchsorted(frame_s, instants + _INSTANT_S, side="right") - 1
+    for k, now in tracked.items():
+        path = TargetPath.of(scenario.mission.targets[k])
+        truth = np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, instants.tolist())]).reshape(-1, 5)
+        _, which, iou = overlapping(found, truth, of, np.arange(len(instants)))
+        hit = np.zeros(len(instants), bool)
+        hit[which[iou >= FOUND_IOU]] = True
+        seen.append((hit, now[frame], np.diff(instants, append=scenario.duration_s)))
+    return _share_and_gap(seen)
 
 
-def _share_and_gap(seen: Bools, counted: Bools, width_s: Floats) -> tuple[float | None, float | None]:
-    """Share of the counted time that is seen, and the longest unbroken time that is counted and not seen.
+def _share_and_gap(targets: Iterable[tuple[Bools, Bools, Floats]]) -> tuple[float | None, float | None]:
+    """Share of the counted time that targets are seen, and the longest unbroken time that one is counted and not seen.
 
     Args:
-        seen, counted: [T] at instants that follow each other.
-        width_s: [T] each instant stands for so long.
+        targets: of each whether it is seen and whether that counts [T] at instants that follow each other, and for how
+            long each instant stands [T].
     """
-    if not counted.any():
-        return None, None
-    missed = counted & ~seen
-    longest_s = run_s = 0.0
-    for miss, lasts_s in zip(missed.tolist(), width_s.tolist(), strict=True):
-        run_s = run_s + lasts_s if miss else 0.0
-        longest_s = max(longest_s, run_s)
-    return 1.0 - float(width_s[missed].sum() / width_s[counted].sum()), longest_s
+    missed_s = counted_s = longest_s = 0.0
+    for seen, counted, width_s in targets:
+        missed, run_s = counted & ~seen, 0.0
+        missed_s += float(width_s[missed].sum())
+        counted_s += float(width_s[counted].sum())
+        for miss, lasts_s in zip(missed.tolist(), width_s.tolist(), strict=True):
+            run_s = run_s + lasts_s if miss else 0.0
+            longest_s = max(longest_s, run_s)
+    return (1.0 - missed_s / counted_s, longest_s) if counted_s else (None, None)
 
 
 def _looked_lately(looks: NDArray[np.int64], frames: int) -> Bools:

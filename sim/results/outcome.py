@@ -19,6 +19,7 @@ from sortie.radio.transmission import Status
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
+from sortie.sim.results.regions import Regions
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 
@@ -142,8 +143,8 @@ def _grounded_blind(record: SortieRecord, both: Both, ap: dict[str, float | None
     truths = record.tables["truths"]
     scored = both["full_scene"].keys()  # who left the air has cars and no fusion
     blind = [row not in scored for row in zip(truths["t_s"].to_pylist(), truths["drone"].to_pylist(), strict=True)]
-    t_s, x_m, y_m = (truths[c].to_numpy()[blind] for c in ("t_s", "x_m", "y_m"))
-    disc_x_m, disc_y_m, radius_m = _discs_at(record.tables["mission"], t_s).T
+    t_s, drone, x_m, y_m = (truths[c].to_numpy()[blind] for c in ("t_s", "drone", "x_m", "y_m"))
+    disc_x_m, disc_y_m, radius_m = Regions(record.tables["mission"], record.scenario.mission).at(t_s, drone).T
     inside = (x_m - disc_x_m) ** 2 + (y_m - disc_y_m) ** 2 <= radius_m**2
     missed = {"full_scene": len(t_s), "mission": int(np.count_nonzero(inside))}
     sought = {name: sum(m.truths for m in fusions.values()) for name, fusions in both.items()}
@@ -164,13 +165,12 @@ class _Fusions:
         tables = record.tables
         t_s, drone = tables["fusions"]["t_s"].to_numpy(), tables["fusions"]["drone"].to_numpy()
         within = (begin_s <= t_s) & (t_s < end_s)
-        self._t_s = t_s[within]
-        self._keys = list(zip(self._t_s.tolist(), drone[within].tolist(), strict=True))
+        self._discs = Regions(tables["mission"], record.scenario.mission).at(t_s[within], drone[within])
+        self._keys = list(zip(t_s[within].tolist(), drone[within].tolist(), strict=True))
         boxes, at = _boxes_of(self._keys, tables["detections"])
         self._truth, cars = _boxes_of(self._keys, tables["truths"])
         self._matches = judge(boxes, at, self._truth, cars, len(self._keys))
         self._boxes = boxes.take(self._matches.order)
-        self._missions = tables["mission"]
 
     def in_full(self) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the full scene."""
@@ -178,17 +178,11 @@ class _Fusions:
 
     def in_mission(self) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the mission disc, where there is one."""
-        disc = _discs_at(self._missions, self._t_s)
+        disc = self._discs
         images, cars = self._matches.image, self._matches.cars
         inside = self._matches.matched(_within(self._boxes, disc[images]), _within(self._truth, disc[cars]))
         there = ~np.isnan(disc[:, 2])
         return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
-
-
-def _discs_at(missions: pa.Table, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mission disc at times [n]: x, y and radius [n, 3], NaN where there is none."""
-    discs = np.column_stack([missions[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")])
-    return np.asarray(discs[np.searchsorted(missions["t_s"].to_numpy(), t_s, side="right") - 1])
 
 
 def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:

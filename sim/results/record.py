@@ -65,7 +65,9 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     ),
     "detections": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, score=F),
     "truths": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F),
-    "mission": dict(t_s=F, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target_x_m=F, target_y_m=F),
+    "mission": dict(
+        t_s=F, group=I, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target=I, target_x_m=F, target_y_m=F,
+    ),
     "medium": dict(t_s=F, busy_fraction=F, connected_drones=I),
     "topology": dict(
         t_s=F, connected=B, cut_drones=pa.list_(I), bottleneck_sender=I, bottleneck_receiver=I, bottleneck_mbps=F,
@@ -90,7 +92,8 @@ ABOUT = {
     "detections": "A box that an ego detected, ENU.",
     "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
     "it would have in the formation. Such a drone has no row in `fusions`.",
-    "mission": "The mission in a frame; NaN where there is no region or target.",
+    "mission": "The mission of a group of drones in a frame: 0 are those in no group, k those of `mission.groups[k - 1]`. NaN "
+    "where there is no region or target; `target` is the car's id, −1 without one.",
     "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "
     "drones have a usable link. What follows the last row is in `medium_busy_fraction` alone.",
     "topology": "Once a second where payloads are relayed: whether all drones reach all, who is outside the largest such "

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import average_precision
+from sortie.perception.scene.traffic import TargetPath
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import matched, transitions
@@ -89,7 +92,7 @@ def _drones(record: SortieRecord) -> int:
 
 def _moments(axes: Axes, record: SortieRecord) -> None:
     """Phase changes and events as lines through the figure; time runs along the whole sortie."""
-    for phase in record.scenario.mission.phases:
+    for phase in chain(*record.scenario.mission.phases_of):
         if 0 < phase.at_s < record.scenario.duration_s:
             axes.axvline(phase.at_s, color=MISSION, linewidth=1.0, linestyle="--")
     for t_s in record.tables["events"]["t_s"].to_pylist():
@@ -234,16 +237,16 @@ def _map(axes: Axes, record: SortieRecord) -> None:
         own = (x[drone == i], y[drone == i])
         axes.plot(own[0][::each], own[1][::each], color=colour(i), linewidth=1.0, label=f"drone {i}")
         axes.plot(own[0][-1:], own[1][-1:], "o", color=colour(i), markersize=4)
-    if record.scenario.mission.target is not None:
-        axes.plot(
-            _column(mission, "target_x_m")[::each], _column(mission, "target_y_m")[::each], ":", color=MISSION, label="target"
-        )  # fmt: skip
-    there = np.flatnonzero(~np.isnan(_column(mission, "region_radius_m")))
-    if len(there):
-        from matplotlib.patches import Circle
+    t_s = np.unique(_column(mission, "t_s"))[::each]
+    for k, target in enumerate(record.scenario.mission.targets):
+        way = np.array([TargetPath.of(target).pose(t)[:2] for t in t_s.tolist()])
+        axes.plot(*way.T, ":", color=MISSION, label="target" if k == 0 else "")
+    for rows in (mission.filter(pc.equal(mission["group"], g)) for g in pc.unique(mission["group"]).to_pylist()):
+        there = np.flatnonzero(~np.isnan(_column(rows, "region_radius_m")))
+        if len(there):
+            from matplotlib.patches import Circle
 
-        at = there[-1]
-        centre = (_column(mission, "region_x_m")[at], _column(mission, "region_y_m")[at])
-        axes.add_patch(Circle(centre, _column(mission, "region_radius_m")[at], fill=False, edgecolor=MISSION))
+            x_m, y_m, radius_m = (_column(rows, f"region_{c}")[there[-1]] for c in ("x_m", "y_m", "radius_m"))
+            axes.add_patch(Circle((x_m, y_m), radius_m, fill=False, edgecolor=MISSION))
     axes.set_aspect("equal")
     axes.legend(loc="best", ncols=3)

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
+from sortie.sim.results.regions import Regions
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,30 +32,28 @@ class Sighting:
     mission: Matched | None
 
 
-def sightings(
-    tables: Mapping[str, pa.Table], disc_t_s: NDArray[np.float64], discs: NDArray[np.float64]
-) -> Iterator[Sighting]:
+def sightings(tables: Mapping[str, pa.Table], regions: Regions) -> Iterator[Sighting]:
     """Judge every fusion in `tables["fusions"]`. Its boxes stand in the box tables in the same order.
 
     Cars about drones that left the air belong to no fusion and are left out.
 
     Args:
         tables: `fusions`, `detections` and `truths`, whole or a slice of whole fusions.
-        disc_t_s, discs: [n] times, and [n, 3] x, y, radius of the mission disc from each on; NaN where there is none.
+        regions: the mission discs.
     """
     fusions = tables["fusions"]
     flying = np.isin(_fusion_of(tables["truths"]), _fusion_of(fusions))
     boxes, truths = _boxes(tables["detections"]), _boxes(tables["truths"].filter(pa.array(flying)))
     at, truth_at = 0, 0
-    rows = zip(*(fusions[c].to_pylist() for c in ("t_s", "drone", "detections", "truths")), strict=True)
-    for t_s, drone, count, truth_count in rows:
+    discs = regions.at(fusions["t_s"].to_numpy(), fusions["drone"].to_numpy())
+    rows = zip(*(fusions[c].to_pylist() for c in ("t_s", "drone", "detections", "truths")), discs, strict=True)
+    for t_s, drone, count, truth_count, disc in rows:
         own = boxes.take(np.arange(at, at + count))
         truth = truths.take(np.arange(truth_at, truth_at + truth_count))
         at, truth_at = at + count, truth_at + truth_count
         full = match(own, truth)
         own = own.take(np.argsort(-own.score, kind="stable"))  # the order of full.hit
         hits = own.take(full.hit)
-        disc = discs[np.searchsorted(disc_t_s, t_s, side="right") - 1]
         mission = None if np.isnan(disc[2]) else match(own, truth, Disc(*disc.tolist()))
         yield Sighting(t_s, drone, hits, own.take(~full.hit), truth.take(_uncovered(truth, hits)), full, mission)
 

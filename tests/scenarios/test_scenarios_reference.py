@@ -106,6 +106,7 @@ def test_units_stand_in_names() -> None:
         "figure_of_merit",
         "cycles",
         "life_cycles",
+        "target",
     }
     units = {
         "m",

@@ -37,6 +37,8 @@ FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries a
 HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
 FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
+OTHER = "mission.more_targets=[{waypoints_m: [[0, 0], [60, 0]], speed_mps: 3}]"
+GROUP = "mission.groups=[{drones: [1, 2], phases: [{phase: search}, {at_s: 2, phase: track, target: 1, region: {radius_m: 32}}]}]"
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
@@ -148,6 +150,15 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.overrides.cycles": ("200", (TIRED,)),
     "fleet.overrides.payload_kg": ("0.5", (TIRED,)),
     "mission.phases.at_s": ("2", ()),
+    "mission.phases.target": ("1", (OTHER,)),
+    "mission.more_targets.waypoints_m": ("[[0, 60], [90, 60]]", (OTHER, GROUP)),
+    "mission.more_targets.speed_mps": ("8", (OTHER, GROUP)),
+    "mission.groups.drones": ("[1]", (OTHER, GROUP)),
+    "mission.groups.phases.at_s": ("2.5", (OTHER, GROUP)),
+    "mission.groups.phases.phase": ("return", (OTHER, GROUP)),
+    "mission.groups.phases.region.radius_m": ("20", (OTHER, GROUP)),
+    "mission.groups.phases.region.centre_m": ("[10, 0]", (OTHER, GROUP)),
+    "mission.groups.phases.target": ("0", (OTHER, GROUP)),
     "mission.phases.phase": ("return", ()),
     "mission.phases.region.radius_m": ("20", ()),
     "mission.phases.region.centre_m": ("[10, 0]", (FIXED,)),
@@ -287,6 +298,9 @@ def place(field: str, shared: tuple[str, ...]) -> str:
     last_phase = 0 if FIXED in shared else 1
     return (
         field.replace("fleet.overrides.", "fleet.overrides.0.")
+        .replace("mission.groups.phases.", "mission.groups.phases.1.")
+        .replace("mission.groups.", "mission.groups.0.")
+        .replace("mission.more_targets.", "mission.more_targets.0.")
         .replace("mission.phases.", f"mission.phases.{last_phase}.")
         .replace("events.", "events.0.")
         .replace("policy.changes.", "policy.changes.0.")

@@ -29,6 +29,7 @@ from sortie.sim.results.mission_outcome import sees_ground
 from sortie.sim.results.outcome import both_matched, outcome
 from sortie.sim.results.outcome_fields import check_number, open_keys
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.regions import Regions
 from sortie.sim.results.report import page
 from sortie.sim.results.sightings import sightings
 from sortie.sim.results.summary import outcome_table
@@ -294,8 +295,8 @@ def test_ap_with_grounded_drones_blind_is_that_of_fusions_without_detections(
 
 
 def test_what_the_playback_shows_of_survivors_does_not_shift(thinned: SortieRecord) -> None:
-    never = np.full((1, 3), np.nan)
-    shown = list(sightings(thinned.tables, np.zeros(1), never))
+    regions = Regions(thinned.tables["mission"], thinned.scenario.mission)
+    shown = list(sightings(thinned.tables, regions))
     assert [s.full.truths for s in shown] == thinned.tables["fusions"]["truths"].to_pylist()
     hits = [int(m.hit.sum()) for m in both_matched(thinned)["full_scene"].values()]
     assert [int(s.full.hit.sum()) for s in shown] == hits
