@@ -78,13 +78,19 @@ class Boxes:
     """[n]"""
     score: NDArray[Any]
     """[n]; ones for ground truth."""
+    car: NDArray[Any] = None  # type: ignore[assignment]  # filled in below
+    """[n] int32: of ground truth, which car it is; −1, which left out stands for, where nobody knows."""
+
+    def __post_init__(self) -> None:
+        if self.car is None:
+            object.__setattr__(self, "car", np.full(len(self.score), -1, np.int32))
 
     def __len__(self) -> int:
         return len(self.score)
 
     def take(self, which: NDArray[Any] | slice) -> Boxes:
         """The boxes at the given indices, under the given mask or in the given slice, in that order."""
-        return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which])
+        return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which], self.car[which])
 
     def inside(self, disc: Disc | None) -> Boxes:
         """The boxes whose centres are in the disc; all of them for None."""
@@ -99,7 +105,8 @@ class Boxes:
 
     def single(self) -> Boxes:
         """The same boxes in float32, as sorties record them."""
-        return Boxes(*(getattr(self, name).astype(np.float32) for name in self.__slots__))
+        xy, size, yaw, score = (v.astype(np.float32) for v in (self.xy_m, self.size_m, self.yaw_rad, self.score))
+        return Boxes(xy, size, yaw, score, self.car)
 
     @classmethod
     def empty(cls) -> Boxes:

@@ -146,7 +146,8 @@ class TorchDetector:
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         """The cars inside the ego's square at `t_s`, about its true position and heading at capture."""
-        return ground_truth(self._scene.cars_at(t_s).table(), ego.true_pose).single()
+        cars = self._scene.cars_at(t_s)
+        return ground_truth(cars.table(), ego.true_pose, identity=cars.ids).single()
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """The number of detections that the drone would send (renders and encodes: tens of milliseconds)."""

@@ -129,7 +129,8 @@ class SurrogateDetector:
     def _truth(self, t_s: Sequence[float], egos: Sequence[Capture]) -> BoxColumns:
         """As `ground_truth`, but in float32: at the square's edge, within a hundredth of a millimetre, the two may differ."""
         looks = self._eyes.look(replace(CaptureColumns.of(egos), t_s=np.asarray(t_s, float)), bare=True)
-        boxes = Boxes(looks.world_m, self._eyes.traffic.size_m[looks.car], looks.yaw_rad, np.ones(len(looks.car)))
+        traffic, car = self._eyes.traffic, looks.car
+        boxes = Boxes(looks.world_m, traffic.size_m[car], looks.yaw_rad, np.ones(len(car)), traffic.ids[car])
         return BoxColumns(looks.first, boxes.single())
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:

@@ -87,6 +87,9 @@ class Traffic:
         parked, lanes, extra = scene.parked_cars, scene._lanes, len(scene.targets)
         self._lanes, self._targets = lanes, scene.targets
         self.parked, self.count = len(parked), len(parked) + len(lanes.s0_m) + extra
+        ids = scene._parked_ids, scene._moving_ids, np.arange(extra)
+        self.ids: NDArray[np.int32] = np.concatenate(ids).astype(np.int32)
+        """[cars] as `Cars.ids`."""
         size = [
             np.stack([parked.length_m, parked.width_m], 1),
             lanes.size_m[:, :2],

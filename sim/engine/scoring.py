@@ -147,11 +147,18 @@ class Scorer:
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     """Columns of the table; each row gathered holds all boxes of a fusion."""
+    columns, boxes = _unfold_boxes(rows)
+    return [*columns, boxes.score.astype(np.float64)]
+
+
+def _unfold_boxes(rows: Sequence[tuple[Any, ...]]) -> tuple[list[Any], Boxes]:
+    """The columns that both tables of boxes have, and the boxes."""
     t_s, drones, several = zip(*rows, strict=True)
     boxes, counts = Boxes.join(several), [len(b) for b in several]
-    values = boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad, boxes.score
-    return [np.repeat(t_s, counts), np.repeat(drones, counts), *(v.astype(np.float64) for v in values)]
+    values = boxes.xy_m[:, 0], boxes.xy_m[:, 1], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), *(v.astype(np.float64) for v in values)], boxes
 
 
 def _unfold_truths(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
-    return _unfold_detections(rows)[:-1]
+    columns, boxes = _unfold_boxes(rows)
+    return [*columns, boxes.car]

@@ -20,6 +20,7 @@ from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
 from sortie.sim.results.regions import Regions
+from sortie.sim.results.tracking_outcome import tracking_outcome
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 
@@ -62,6 +63,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
         },
+        "tracking": tracking_outcome(record),
         "mission": mission_outcome(record),
         "bytes": {
             "context_sent": int(context_bytes),

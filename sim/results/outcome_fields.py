@@ -52,6 +52,18 @@ class Ap50(Accuracy):
     scored_fusions: Annotated[int, "How many fusions were scored."]
 
 
+class TrackingOutcome(TypedDict):
+    hota: Annotated[
+        float | None,
+        "HOTA (higher order tracking accuracy, Luiten et al. 2021), the mean over 19 limits of overlap, 0.05 to 0.95. A "
+        "tracker follows each drone's boxes after fusion; its confirmed tracks are judged by rotated IoU on the ground, "
+        "over all cars within range. Null where the detector does not know which car is which.",
+        SHARE,
+    ]
+    det_a: Annotated[float | None, "DetA, its part that judges detection.", SHARE]
+    ass_a: Annotated[float | None, "AssA, its part that judges whether tracks keep to their cars.", SHARE]
+
+
 class MissionOutcome(TypedDict):
     flown_share: Annotated[float, "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air.", SHARE]
     region_observed_share: Annotated[
@@ -159,6 +171,7 @@ class Outcome(TypedDict):
     duration_s: Annotated[float, "Length of the sortie."]
     frame_s: Annotated[float, "From one frame to the next."]
     ap50: Annotated[Ap50, "Accuracy of the drones that fly."]
+    tracking: Annotated[TrackingOutcome, "How well each drone that flies follows the cars, beside `ap50`."]
     mission: Annotated[
         MissionOutcome, "The mission of the whole fleet; null where there is no region, no target or no detector."
     ]

@@ -64,7 +64,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         detections=I, truths=I,
     ),
     "detections": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, score=F),
-    "truths": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F),
+    "truths": dict(t_s=F, drone=I, x_m=F, y_m=F, length_m=F, width_m=F, yaw_rad=F, car=I),
     "mission": dict(
         t_s=F, group=I, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target=I, target_x_m=F, target_y_m=F,
     ),
@@ -91,7 +91,8 @@ ABOUT = {
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
     "detections": "A box that an ego detected, ENU.",
     "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
-    "it would have in the formation. Such a drone has no row in `fusions`.",
+    "it would have in the formation. Such a drone has no row in `fusions`. `car` is the car's number, the targets first, the "
+    "same at all times; −1 where the detector does not know.",
     "mission": "The mission of a group of drones in a frame: 0 are those in no group, k those of `mission.groups[k - 1]`. NaN "
     "where there is no region or target; `target` is the car's id, −1 without one.",
     "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "

@@ -94,7 +94,7 @@ def with_sightings(record: SortieRecord) -> SortieRecord:
             false = [
                 (state["x_m"] + 9.0 * k, state["y_m"] + 31.0, 4.5, 1.8, 0.0, rng.uniform(0.1, 0.5)) for k in (0, 1)
             ]
-            made["truths"] += [(t_s, i, *b) for b in boxes]
+            made["truths"] += [(t_s, i, *b, car) for b, car in zip(boxes, cars.ids.tolist(), strict=True)]
             made["detections"] += [(t_s, i, *b) for b in found + false]
             made["fusions"].append((t_s, i, [], [], [], [], len(found) + len(false), len(boxes)))
     tables = {

@@ -1,0 +1,96 @@
+"""What a drone's own tracks say of other things: how late boxes move, and whether a target is where it is said to be.
+
+Free of torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, predicted
+from sortie.perception.tracking.association import GATE, assigned
+from sortie.perception.tracking.tracker import BOX_VARIANCE_M2
+from sortie.perception.types import Boxes
+
+CUE_VARIANCE_M2, CUE_SPEED_VARIANCE = 1.0**2, 1.0**2
+"""Of a cue's place and velocity along each axis."""
+AGREE = 13.28
+"""Squared Mahalanobis distance of place and velocity within which a track begins to be the target: 99 % (χ², four
+degrees)."""
+
+Cue = tuple[float, float, float, float]
+"""Where a target is believed to be, and its velocity: x, y, vx, vy, ENU."""
+
+
+def motion_of(tracks: Tracks, age_s: float) -> tuple[Floats, Floats]:
+    """Velocity [n, 2] with which tracks move on, and their variance of position [n] when they are older by `age_s`.
+
+    A track whose speed is not significant stands: it moves by nothing, and its position gets no less certain.
+    """
+    moves = tracks.moves
+    later = predicted(tracks, tracks.t_s + age_s).covariance[:, 0]
+    return np.where(moves[:, None], tracks.velocity_mps, 0.0), np.where(moves, later, tracks.covariance[:, 0])
+
+
+def motion_of_boxes(boxes: Boxes, t_s: float, age_s: float, tracks: Tracks) -> tuple[Floats, Floats]:
+    """The same of boxes detected at `t_s`, by the tracks of the drone that received them; NaN where it has none for a box."""
+    velocity: NDArray[np.float64] = np.full((len(boxes), 2), np.nan)
+    variance: NDArray[np.float64] = np.full(len(boxes), np.nan)
+    known = tracks.take(tracks.confirmed)
+    then = predicted(known, t_s)
+    one = np.zeros(len(boxes), np.int64)
+    i, j = assigned(
+        then.xy_m,
+        then.covariance[:, 0] + BOX_VARIANCE_M2,
+        np.zeros(len(then), np.int64),
+        boxes.xy_m.astype(np.float64),
+        one,
+    )
+    here = known.take(i)
+    moves = here.moves
+    velocity[j] = np.where(moves[:, None], here.velocity_mps, 0.0)
+    spread = here.covariance[:, 2] * age_s**2 + ACCELERATION_DENSITY * age_s**3 / 3.0
+    variance[j] = BOX_VARIANCE_M2 + np.where(moves, spread, 0.0)
+    return velocity, variance
+
+
+def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int], t_s: float) -> dict[int, int]:
+    """Which targets a drone follows: by target, the id of the confirmed track that is it.
+
+    A track becomes a target's when its place and velocity agree with the cue, one track to each target at most. It stays
+    the target's while it lives and its place agrees.
+
+    Args:
+        tracks: all tracks of the drone.
+        cues: where each target is believed to be at `t_s`.
+        before: what was followed until now, as returned.
+        t_s: now.
+    """
+    now = predicted(tracks.take(tracks.confirmed), t_s)
+    row = {track: k for k, track in enumerate(now.id.tolist())}
+    spread = now.covariance + np.array([CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE])
+    out: dict[int, int] = {}
+    for target, track in before.items():
+        k = row.get(track)
+        if target in cues and k is not None:
+            x_m, y_m = now.xy_m[k] - np.array(cues[target][:2])
+            if x_m * x_m + y_m * y_m < GATE * spread[k, 0]:
+                out[target] = track
+    for target in sorted(cues.keys() - out.keys()):
+        cost = _disagreement(now, spread, cues[target])
+        cost[[row[track] for track in out.values()]] = np.inf
+        best = int(cost.argmin()) if len(cost) else -1
+        if best >= 0 and cost[best] < AGREE:
+            out[target] = int(now.id[best])
+    return out
+
+
+def _disagreement(tracks: Tracks, spread: Floats, cue: Cue) -> Floats:
+    """Squared Mahalanobis distance [n] in place and velocity; `spread` [n, 3] is the covariance of the difference."""
+    off, faster = tracks.xy_m - np.array(cue[:2]), tracks.velocity_mps - np.array(cue[2:])
+    pp, pv, vv = spread.T
+    cost = vv * (off * off).sum(axis=1) - 2.0 * pv * (off * faster).sum(axis=1) + pp * (faster * faster).sum(axis=1)
+    return np.asarray(cost / (pp * vv - pv * pv))
