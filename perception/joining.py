@@ -4,6 +4,9 @@ Suppression keeps the best of the boxes that overlap, and every box that stands 
 stays, and the false positives of all drones add up. Averaging puts a car at the mean of all boxes for it, weighted by
 score. Its score is the mean over all drones that looked there, also those that saw nothing (weighted boxes fusion: R.
 Solovyev, W. Wang, T. Gabruseva, Image and Vision Computing 107, 2021).
+
+Weight and age count under both rules. A peer's score is multiplied by its weight, and by the chance that a box of its age
+still covers its car (`sortie.perception.lateness`). In a mean, a place counts by the inverse of its variance as well.
 """
 
 from __future__ import annotations
@@ -17,19 +20,31 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.geometry import in_square
+from sortie.perception.lateness import (
+    moving_m2,
+    own_age_s,
+    reach_m,
+    stands,
+    still_right,
+    still_right_of,
+    variance_m2,
+    within,
+)
 from sortie.perception.metrics.ap import best_first, rivals, standing
-from sortie.perception.types import Boxes, Share
+from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 
 NMS_IOU = 0.15
 """Boxes that overlap by more are of one car."""
 OWN_WEIGHT = 2.0
 """Weight of an ego's boxes that come from fused maps; a drone that looked alone weighs 1. Of 1, 2, 3 and 5, tried on the
-calibration's held-out scenes, 1 and 2 lie within 0.01 of AP of each other and 5 up to 0.05 below."""
+calibration's held-out scenes, 1 and 2 lie within 0.01 of AP of each other and 5 up to 0.05 below. Suppression does not use
+it."""
 LATE_MIN_SCORE = 0.2
 """In late fusion peers send boxes with a score above this."""
 Rule = Literal["nms", "average"]
 Pose = tuple[float, float, float]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +52,21 @@ class SourceBoxes:
     """The boxes of one drone, and where it looked for them."""
 
     boxes: Boxes
+    """Places as they were at the capture."""
     weight: float
-    """Its weight against the others'."""
+    """Its weight against the others': the directive's fusion weight × the receiver's trust."""
     pose: Pose
     """x, y, yaw of its square when it looked, ENU."""
     roi: Disc | None = None
     """Where its boxes were requested; outside it a missing box means nothing."""
     truncated: bool = False
     """Weaker boxes were left out, so a missing box means nothing anywhere."""
+    age_s: float = 0.0
+    """From the capture to the fusion."""
+    velocity_mps: NDArray[np.floating] | None = None
+    """[n, 2] velocity of each box, ENU: it is moved by velocity × age before it is joined. NaN or None: it stays."""
+    variance_m2: NDArray[np.floating] | None = None
+    """[n] variance of each place along each axis at the fusion, after that move. NaN or None: by the age."""
 
 
 def source_of(share: Share, alone: Boxes) -> SourceBoxes:
@@ -53,7 +75,7 @@ def source_of(share: Share, alone: Boxes) -> SourceBoxes:
     if share.representation == "tracks":
         truncated = len(boxes) > budget.MAX_TRACKS
         boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))
-    return SourceBoxes(boxes, share.weight, share.capture.est_pose, share.roi, truncated)
+    return SourceBoxes(boxes, share.weight, share.capture.est_pose, share.roi, truncated, share.age_s)
 
 
 def sendable(boxes: Boxes) -> Boxes:
@@ -71,6 +93,28 @@ class EgoSources(NamedTuple):
     fused: bool
     """Whether peers' maps were fused into those."""
     others: Sequence[SourceBoxes]
+    age_s: float = 0.0
+    """From its own capture to the fusion."""
+    looked: bool = True
+    """False: a drone without a look of its own. Its silence means nothing."""
+
+    @classmethod
+    def of(
+        cls, ego: Capture, shares: Sequence[Share], own: Boxes, fused: bool, others: Sequence[SourceBoxes]
+    ) -> EgoSources:
+        """For a detector's job; `others` are the boxes of the shares that are not fused as maps."""
+        return cls(ego.est_pose, own, fused, others, own_age_s(ego, shares), ego.looked or fused)
+
+    def sources(self) -> list[SourceBoxes]:
+        """Its own boxes, if it has any, and those of the peers that count."""
+        weight = OWN_WEIGHT if self.fused else 1.0
+        own = [SourceBoxes(self.own, weight, self.pose, age_s=self.age_s)] if self.looked else []
+        return own + [o for o in self.others if o.weight > 0.0]
+
+    @property
+    def freshest_s(self) -> float:
+        """What ages are compared with: the youngest look at hand; 0 for a drone that has none of its own."""
+        return min([self.age_s, *(o.age_s for o in self.others if o.weight > 0.0)]) if self.looked else 0.0
 
 
 def joined(pose: Pose, own: Boxes, fused: bool, others: Sequence[SourceBoxes], rule: Rule) -> Boxes:
@@ -83,28 +127,37 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
 
     Args:
         egos: one without peers' boxes keeps its own as they are.
-        rule: `nms`: of boxes that overlap by more than `NMS_IOU` the best stays; a weight only counts as zero or not.
-            `average`: the mean place, size and heading of those boxes, by weight times score. The score is the mean over
-            all drones that looked there.
+        rule: `nms`: of boxes that overlap by more than `NMS_IOU` the best stays, after scores are multiplied by weight and
+            by what their age leaves of them. `average`: the mean place, size and heading of those boxes, by weight, score
+            and precision. The score is the mean over all drones that looked there, and no more than weight and age leave.
     """
     out = [ego.own for ego in egos]
     receivers = [k for k, ego in enumerate(egos) if ego.others]
     if not receivers:
         return out
-    sources_of = [
-        [SourceBoxes(e.own, OWN_WEIGHT if e.fused else 1.0, e.pose), *(o for o in e.others if o.weight > 0.0)]
-        for e in (egos[k] for k in receivers)
-    ]
+    sources_of = [egos[k].sources() for k in receivers]
     every = [s for sources in sources_of for s in sources]
-    boxes = Boxes.join([s.boxes for s in every])
-    source = np.repeat(np.arange(len(every)), [len(s.boxes) for s in every])
+    if not every:
+        return out
+    counts = [len(s.boxes) for s in every]
+    boxes = Boxes.join([_moved(s) for s in every])
+    source = np.repeat(np.arange(len(every)), counts)
     first = np.cumsum([0, *map(len, sources_of)])  # of each ego's sources
-    ego = np.repeat(np.arange(len(receivers)), np.diff(first))[source]
+    ego_of = np.repeat(np.arange(len(receivers)), np.diff(first))  # of each source
+    freshest_s = np.array([egos[k].freshest_s for k in receivers])[ego_of]
+    known = np.concatenate([_given(s.variance_m2, len(s.boxes)) for s in every])
+    ego = ego_of[source]
     here = in_square(boxes.xy_m, np.array([egos[k].pose for k in receivers])[ego][:, None])[:, 0]
-    boxes, source, ego = boxes.take(here), source[here], ego[here]
-    rank = boxes.score if rule == "nms" else boxes.score * np.array([s.weight for s in every])[source]
-    order = best_first(rank, ego)
-    boxes, source, ego = boxes.take(order), source[order], ego[order]
+    boxes, source, ego, known = boxes.take(here), source[here], ego[here], known[here]
+    left = _left(boxes, np.array([s.age_s for s in every])[source], freshest_s[source], known)
+    weight = np.array([s.weight for s in every])[source]
+    if rule == "nms":
+        score = (boxes.score * (np.minimum(weight, 1.0) * left)).astype(np.float32)
+        boxes = Boxes(boxes.xy_m, boxes.size_m, boxes.yaw_rad, score)
+        order = best_first(score, ego)
+    else:
+        order = best_first(boxes.score * weight * left, ego)
+    boxes, source, ego, left, known = boxes.take(order), source[order], ego[order], left[order], known[order]
     i, j, iou = rivals(boxes.table(), ego)
     i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]
     kept = standing(len(ego), i, j)
@@ -122,17 +175,74 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     for n, (k, a, b) in enumerate(zip(receivers, ends, ends[1:], strict=False)):
         some = slice(a, b)
         if a < b:
-            out[k] = _averaged(boxes.take(some), source[some] - first[n], group[some] - group[a], sources_of[n])
+            members = _Members(group[some] - group[a], source[some] - first[n], left[some], known[some])
+            out[k] = _averaged(boxes.take(some), members, sources_of[n], float(freshest_s[first[n]]))
         else:
             out[k] = Boxes.empty()
     return out
 
 
-def _averaged(boxes: Boxes, source: NDArray[np.intp], group: NDArray[np.intp], sources: Sequence[SourceBoxes]) -> Boxes:
-    """One box per group; `source` [n] is the index of each box's drone in `sources`."""
+def _moved(source: SourceBoxes) -> Boxes:
+    """The boxes of a source where they are at the fusion, as far as their velocities are known."""
+    boxes, velocity = source.boxes, source.velocity_mps
+    if velocity is None:
+        return boxes
+    xy = boxes.xy_m + np.nan_to_num(velocity) * source.age_s
+    return Boxes(xy.astype(np.float32), boxes.size_m, boxes.yaw_rad, boxes.score)
+
+
+def _given(values: NDArray[np.floating] | None, count: int) -> Floats:
+    return np.full(count, np.nan) if values is None else np.asarray(values, np.float64)
+
+
+def _left(boxes: Boxes, age_s: Floats, freshest_s: Floats, known_m2: Floats) -> Floats:
+    """What lateness leaves of each box's score, [n]: 1 for the freshest.
+
+    Args:
+        known_m2: [n] the variance of a place where it is known, else NaN.
+    """
+    reach = reach_m(boxes.size_m)
+    chance = np.where(np.isnan(known_m2), still_right(reach, age_s), still_right_of(reach, known_m2))
+    return np.asarray(np.minimum(chance / still_right(reach, freshest_s), 1.0))
+
+
+class _Members(NamedTuple):
+    """For each box of one ego, [n]."""
+
+    group: NDArray[np.intp]
+    """Boxes of one car have one number, from 0 on without gaps."""
+    source: NDArray[np.intp]
+    """Its source's index."""
+    left: Floats
+    """What lateness leaves of its score."""
+    known_m2: Floats
+    """The variance of its place where it is known, else NaN."""
+
+    def precisions(self, boxes: Boxes, age_s: Floats, freshest_s: float) -> tuple[Floats, Floats]:
+        """What each place counts in a mean, and each score in a vote, [n] each.
+
+        A late box close to the freshest of its car tells that the car stands, and then it counts in full.
+        """
+        anchor = np.lexsort((-boxes.score, age_s, self.group))
+        anchor = anchor[np.unique(self.group[anchor], return_index=True)[1]][self.group]
+        off_m = np.hypot(*(boxes.xy_m - boxes.xy_m[anchor]).T.astype(np.float64))
+        still, reach = stands(off_m, age_s - age_s[anchor]), reach_m(boxes.size_m)
+        fresh_m2, late_m2 = moving_m2(freshest_s), moving_m2(age_s)
+        precise = still + (1.0 - still) * np.minimum(fresh_m2 / late_m2, 1.0)
+        left = still + (1.0 - still) * np.minimum(within(reach, late_m2) / within(reach, fresh_m2), 1.0)
+        alone = off_m == 0.0
+        given = ~np.isnan(self.known_m2)
+        precise = np.where(given, np.minimum(variance_m2(freshest_s) / self.known_m2, 1.0), precise)
+        return precise, np.where(given | alone, self.left, left)
+
+
+def _averaged(boxes: Boxes, of: _Members, sources: Sequence[SourceBoxes], freshest_s: float) -> Boxes:
+    """One box per group."""
+    group, source = of.group, of.source
     count = int(group.max()) + 1
-    weights = np.array([s.weight for s in sources])
-    weight = np.maximum(boxes.score, 1e-6).astype(np.float64) * weights[source]
+    weights, ages_s = np.array([s.weight for s in sources]), np.array([s.age_s for s in sources])
+    precise, left = of.precisions(boxes, ages_s[source], freshest_s)
+    weight = np.maximum(boxes.score, 1e-6).astype(np.float64) * weights[source] * precise
     total = np.bincount(group, weight, count)
 
     def mean(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -145,10 +255,15 @@ def _averaged(boxes: Boxes, source: NDArray[np.intp], group: NDArray[np.intp], s
     yaw = np.arctan2(mean(np.sin(twice)), mean(np.cos(twice))) / 2.0
     first = np.unique(group, return_index=True)[1]
     yaw = np.where(np.cos(yaw - boxes.yaw_rad[first]) < 0.0, yaw + np.pi, yaw)
-    best = np.zeros((count, len(sources)))
+    best, votes = np.zeros((2, count, len(sources)))
     np.maximum.at(best, (group, source), boxes.score)
-    counted = np.where(_looked(sources, xy) | (best > 0.0), weights, 0.0)
-    score = (counted * best).sum(axis=1) / counted.sum(axis=1)
+    np.maximum.at(votes, (group, source), left)
+    # that a late drone saw nothing says as little as its boxes do
+    reach = reach_m(size)[:, None]
+    silent = np.minimum(still_right(reach, ages_s) / still_right(reach, freshest_s), 1.0)
+    votes = weights * np.where(best > 0.0, votes, np.where(_looked(sources, xy), silent, 0.0))
+    # less than one whole vote is not made up to one: a single late box has the score that its age leaves
+    score = (votes * best).sum(axis=1) / np.maximum(votes.sum(axis=1), 1.0)
     order = np.argsort(-score, kind="stable")
     return Boxes(xy, size, yaw, score).single().take(order)
 

@@ -28,6 +28,8 @@ class Capture(NamedTuple):
     """Its estimated position, ENU."""
     est_yaw_rad: float
     """Its estimated heading, from east towards north."""
+    looked: bool = True
+    """False: the drone's pose alone. It has no images, so no features and no boxes of its own."""
 
     @property
     def est_pose(self) -> tuple[float, float, float]:
@@ -56,9 +58,11 @@ class Share(NamedTuple):
     roi: Disc | None
     """Its region of interest; None is everywhere."""
     weight: float
-    """Fusion weight from the directive, 0 … 1."""
+    """Fusion weight, 0 … 1: the directive's × the receiver's trust."""
     missing: tuple[int, ...] = ()
     """Ranks (0 the best) of the cells that were sent and did not arrive."""
+    age_s: float = 0.0
+    """From the capture to the fusion, as the receiver knows it. What it leaves of a share is in `perception.lateness`."""
 
     @property
     def is_map(self) -> bool:

@@ -23,7 +23,8 @@ from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import NMS_IOU, Pose, SourceBoxes, joined, sendable, source_of
+from sortie.perception.joining import NMS_IOU, EgoSources, Pose, SourceBoxes, joined_many, sendable, source_of
+from sortie.perception.lateness import weighed
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
@@ -125,10 +126,14 @@ class TorchDetector:
         """Render what the jobs need and compute the rest in the background; calling the result waits for the boxes."""
         if self._fusion.shares == "nothing":
             jobs = [(ego, ()) for ego, _ in jobs]
-        known = self._encode([c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))])
+        elif self._fusion.shares == "features":
+            jobs = [(ego, weighed(ego, shares)) for ego, shares in jobs]
+        seen = [c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))]
+        known = self._encode([c for c in seen if c.looked])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         look = {s.capture for s in shared if not s.is_map}
-        look |= {ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)}
+        alone = [ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
+        look |= {ego for ego in alone if ego.looked}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
                 self._look_alone(capture)
@@ -258,12 +263,14 @@ class TorchDetector:
         out = self._fuse(ego, maps, now, known) if maps else None
         if out is not None:
             own = self._place(out, ego.est_pose)
+        elif not ego.looked:
+            own = Boxes.empty()
         elif (alone := known[ego].boxes) is not None:
             own = alone.result()
         else:
             own = self._place(self._head(known[ego].features.result()[None]), ego.est_pose)
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
-        return joined(ego.est_pose, own, out is not None, late, self._config.join)
+        return joined_many([EgoSources.of(ego, shares, own, out is not None, late)], self._config.join)[0]
 
     def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Tensor | None:
         """The head's output after fusion; None where no peer takes part in any cell."""
@@ -283,10 +290,34 @@ class TorchDetector:
         def said(at: Tensor) -> Tensor:
             return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
 
+        if not ego.looked:
+            return self._head(self._fuse_without_own(said, part[0, 1:], arrived, weight[0]))
         own, theirs = known[ego].features.result(), [known[s.capture].features.result() for s in maps]
         weight = self._net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
         fused = self._net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         return self._head(fused)
+
+    def _fuse_without_own(
+        self, said: Callable[[Tensor], Tensor], part: Tensor, arrived: Tensor, weight: Tensor
+    ) -> Tensor:
+        """The fused map [1, c, h, w] of peers alone: in each cell the one that counts most takes the ego's place.
+
+        Args:
+            said: as `features` of `Fusion.fuse`.
+            part, arrived: [k, h, w] which peer takes part in which cell, and which cells it sent; weight: [k].
+        """
+        k, height, width = part.shape
+        lead = (weight[:, None, None] * arrived).argmax(dim=0)  # of equals the first
+        own = said(torch.arange(height * width)).view(k, height, width, -1)
+        own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, own.shape[-1]))[0].permute(2, 0, 1)
+        own = own * arrived.any(dim=0)
+        follows = part & (torch.arange(k)[:, None, None] != lead)
+        if not bool(follows.any()):
+            return own[None]
+        there = torch.cat([torch.ones_like(part[:1]), follows])
+        weights = F.pad(weight / weight.max(), (1, 0), value=1.0)
+        fused: Tensor = self._net.fusion.fuse(own, said, there, weights)
+        return fused
 
     def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""
@@ -299,7 +330,7 @@ class TorchDetector:
             lies, part = self._map_pose(share, now), _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)
-            said = SourceBoxes(self._place(out, lies), share.weight, lies, part[1], cut)
+            said = SourceBoxes(self._place(out, lies), share.weight, lies, part[1], cut, share.age_s)
         else:
             alone = known[share.capture].boxes
             assert alone is not None  # noqa: S101 (requested with the job)

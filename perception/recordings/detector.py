@@ -13,7 +13,8 @@ from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import CELLS, CHANNELS, FULL
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import NMS_IOU, SourceBoxes, joined, sendable, source_of
+from sortie.perception.joining import NMS_IOU, EgoSources, SourceBoxes, joined_many, sendable, source_of
+from sortie.perception.lateness import own_age_s, weighed
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.recordings.exchange import Sent, fused, load_fusion, received_boxes
 from sortie.perception.recordings.recording import RecordingError, open_recording
@@ -84,16 +85,20 @@ class RecordedDetector:
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
         config, pose = self._config, self._pose(ego)
         at = (self._frame(ego), ego.drone)
+        if self._fuse is not None:
+            shares = weighed(ego, shares)
         weighted = [s for s in shares if s.weight > 0.0]
         maps = [self._sent(s, now) for s in weighted if s.is_map]
-        if self._fuse is not None and maps:
+        if self._fuse is not None and maps and ego.looked:
             local = fused(self._fuse, self._recording, at, pose, maps, config.unsent_cells)
         else:
-            local = received_boxes(self._recording, at, pose, maps)
+            own_at, freshest_s = (at, own_age_s(ego, shares)) if ego.looked else (None, 0.0)
+            local = received_boxes(self._recording, own_at, pose, maps, freshest_s)
         own = Boxes.placed(local[local[:, 5] >= config.score_threshold], pose)
         own = suppress(own, NMS_IOU)
         late = [self._source(s) for s in weighted if not s.is_map]
-        return joined(pose, own, bool(maps), late, config.join)
+        sources = EgoSources.of(ego, shares, own, bool(maps), late)._replace(pose=pose)
+        return joined_many([sources], config.join)[0]
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:
         capture, config = share.capture, self._config
@@ -106,7 +111,7 @@ class RecordedDetector:
                 rank = self._recording.rank(frame, capture.drone, config.cells_by)
             cells = budget.select(rank, share.rho, share.roi, *est, share.missing)
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
-        return Sent(frame, capture.drone, cells, self._pose(lies), share.weight)
+        return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)
 
     def _source(self, share: Share) -> SourceBoxes:
         said = source_of(share, self._alone(share.capture, self._pose(share.capture)))

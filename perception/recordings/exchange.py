@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.lateness import reach_m, still_right
 from sortie.perception.recordings.recording import Floats, Recording, RecordingError, cells_of
 
 Fuse = Callable[[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]], Any]
@@ -38,6 +39,8 @@ class Sent:
     pose: tuple[float, float, float]
     """What places it in the world."""
     weight: float = 1.0
+    age_s: float = 0.0
+    """From the capture to the fusion."""
 
 
 def load_fusion(reference: str) -> Fuse:
@@ -72,20 +75,27 @@ def fusion_hash(reference: str | None) -> str:
 
 
 def received_boxes(
-    recording: Recording, ego: tuple[int, int], pose: tuple[float, float, float], sent: Sequence[Sent]
+    recording: Recording,
+    ego: tuple[int, int] | None,
+    pose: tuple[float, float, float],
+    sent: Sequence[Sent],
+    freshest_s: float = 0.0,
 ) -> Floats:
     """[m, 6]: the ego's own boxes and those of its peers whose cells were sent, in the ego's frame, before suppression.
 
     Args:
-        ego: its recorded frame and its drone; pose: what places it in the world.
+        ego: its recorded frame and its drone, None where it has no look of its own; pose: what places it in the world.
+        freshest_s: the age of its own look; scores of what is older are multiplied by what that leaves.
     """
     geometry = recording.geometry
-    parts = [recording.boxes(*ego)]
+    parts = [np.zeros((0, 6))] if ego is None else [recording.boxes(*ego)]
     for s in sent:
         boxes = recording.boxes(s.frame, s.drone)
         row, column, inside = cells_of(boxes, geometry)
         arrived = inside & s.cells[row.clip(0, CELLS - 1), column.clip(0, CELLS - 1)]
         here = moved(boxes[arrived], s.pose, pose)
+        reach = reach_m(here[:, 2:4])
+        here[:, 5] *= s.weight * np.minimum(still_right(reach, s.age_s) / still_right(reach, freshest_s), 1.0)
         parts.append(here[(np.abs(here[:, :2]) < geometry.half_extent_m).all(axis=1)])
     return np.concatenate(parts)
 

@@ -14,10 +14,21 @@ from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import FULL
 from sortie.perception.joining import EgoSources, joined_many, source_of
+from sortie.perception.lateness import weighed
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import Drawn, DrawSource
-from sortie.perception.surrogate.exchange import FeatureShares, alarm_covariates, covariates, mean_shift, pair
+from sortie.perception.surrogate.exchange import (
+    NO_PEER,
+    FeatureShares,
+    Led,
+    alarm_covariates,
+    covariates,
+    lead_of,
+    mean_shift,
+    pair,
+    received_only,
+)
 from sortie.perception.surrogate.features import CaptureColumns, Eyes, Ints, Looks, axes, off_axes, square, turned
 from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
@@ -110,7 +121,7 @@ class SurrogateDetector:
     def detect_many(self, moments: Sequence[Sequence[Job]]) -> BoxColumns:
         """The same for many moments at once, job after job; a moment's jobs are those of one instant."""
         jobs = [
-            (ego, shares if self._config.fusion != "none" else (), {e.drone: e for e, _ in moment})
+            (ego, weighed(ego, shares) if self._config.fusion != "none" else (), {e.drone: e for e, _ in moment})
             for moment in moments
             for ego, shares in moment
         ]
@@ -158,8 +169,13 @@ class SurrogateDetector:
     # --- one batch ---------------------------------------------------------------------------------
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
-        queries = [(ego, shares) for ego, shares, _ in jobs]
-        late = {s.capture: None for _, shares in queries for s in shares if not s.is_map and s.weight > 0.0}
+        late = {s.capture: None for _, shares, _ in jobs for s in shares if not s.is_map and s.weight > 0.0}
+        leads = {m: lead for m, (ego, shares, _) in enumerate(jobs) if not ego.looked and (lead := lead_of(shares))}
+        queries: list[Job] = [(ego, shares) for ego, shares, _ in jobs]
+        for m, lead in leads.items():
+            rest = [s for s in queries[m][1] if s is not lead]
+            queries[m] = lead.capture, [s._replace(weight=s.weight / lead.weight) for s in rest]
+        queries += [(c, ()) for c in late]
         captures = list(dict.fromkeys(c for ego, shares in queries for c in (ego, *(s.capture for s in shares))))
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
@@ -167,22 +183,31 @@ class SurrogateDetector:
         draws = self._draw_source.of(captures, looks)
         p = self.parameters
         confidence = p.confidence(looks.covariates, draws.look)
-        queries += [(c, ()) for c in late]
         lies = None
         if not self._config.motion_compensation:
-            lies = [[now.get(s.capture.drone, s.capture).est_pose for s in shares] for _, shares, now in jobs]
-            lies += [[] for _ in late]
+            nows = [now for _, _, now in jobs] + [{}] * len(late)
+            lies = [
+                [now.get(s.capture.drone, s.capture).est_pose for s in shares]
+                for (_, shares), now in zip(queries, nows, strict=True)
+            ]
         exchange = FeatureShares.of(queries, column, lies)
-        fused = self._fuse(exchange, looks, fleet, confidence, draws)
-        if not late:
+        led = None
+        if leads:
+            led = Led(list(leads), FeatureShares.of([(s.capture, [s]) for s in leads.values()], column))
+        fused = self._fuse(exchange, looks, fleet, confidence, draws, led)
+        blind = [m for m, (ego, _, _) in enumerate(jobs) if not ego.looked]
+        if not late and not blind:
             return fused
         boxes = list(fused)
+        for m in blind:
+            ego, shares, _ = jobs[m]
+            boxes[m] = received_only(boxes[m], ego, shares) if m in leads else Boxes.empty()
         alone = dict(zip(late, boxes[len(jobs) :], strict=True))
         with_maps = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
         sources = []
-        for own, (ego, shares, _), f in zip(boxes, jobs, with_maps, strict=False):
+        for m, (own, (ego, shares, _), f) in enumerate(zip(boxes, jobs, with_maps, strict=False)):
             others = [source_of(s, alone[s.capture]) for s in shares if not s.is_map and s.weight > 0.0]
-            sources.append(EgoSources(ego.est_pose, own, f, others))
+            sources.append(EgoSources.of(ego, shares, own, f or m in leads, others))
         out = joined_many(sources, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
@@ -193,23 +218,27 @@ class SurrogateDetector:
         fleet: CaptureColumns,
         confidence: NDArray[np.float32],
         draws: Drawn,
+        led: Led | None = None,
     ) -> BoxColumns:
         p, config = self.parameters, self._config
         pairs = pair(exchange, looks, fleet)
         zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
         cars = np.diff(looks.first)[looks.capture]
-        rank = p.rank(rank_covariates(looks.covariates, confidence, cars), draws.rank, config.cells_by)[pairs.peer]
-        everything = exchange.cells >= exchange.allowed
-        sent = pairs.aimed & (
-            (rank < (exchange.cells / np.maximum(exchange.allowed, 1.0))[pairs.row]) | everything[pairs.row]
-        )
-        exchange.drop_missing(sent, rank, pairs.row)
-        x = covariates(pairs, exchange, looks, confidence, sent, rank, zeros[pairs.row])
+        ranks = p.rank(rank_covariates(looks.covariates, confidence, cars), draws.rank, config.cells_by)
+        rank = ranks[pairs.peer]
+        sent = exchange.sent(pairs, rank)
+        own = confidence[pairs.look]
+        if led is not None:
+            came = led.came(pairs, looks, fleet, ranks)
+            own = np.where(came, own, np.float32(NO_PEER))
+        x = covariates(pairs, exchange, looks, confidence, sent, rank, zeros[pairs.row], own)
         score = p.find(x, draws.find[pairs.look])
+        if led is not None:
+            score = np.where(came | sent.any(axis=1), score, np.float32(0.0))
         here = np.flatnonzero(score >= max(p.floor, config.score_threshold))
         look, row, x, score = pairs.look[here], pairs.row[here], x[here], score[here]
-        at, own = looks.xy_m[look], exchange.ego[row]
-        heading = looks.yaw_rad[look] - fleet.yaw_rad[own]
+        at = looks.xy_m[look]
+        heading = looks.yaw_rad[look] - fleet.yaw_rad[exchange.ego[row]]
         angle, hand = axes(heading, at)
         offset_draw = draws.offset_draw[look].copy()
         along = np.where(angle == heading, 1.0, -1.0)  # what lies to one side of a car does so for all who look

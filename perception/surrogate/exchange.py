@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
-from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.geometry import CELLS, FULL, in_square
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Ints, Looks, beside, square
-from sortie.perception.types import Capture, Share
+from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Scene
 
@@ -65,6 +65,13 @@ class FeatureShares:
         for at, ranks in self.missing.items():
             out[at] -= len(ranks)
         return out
+
+    def sent(self, pairs: Pairs, rank: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """[n, k] which senders' cells with the car arrived; `rank` [n, k] the fraction of cells that rank above it."""
+        everything = self.cells >= self.allowed
+        sent = pairs.aimed & ((rank < (self.cells / np.maximum(self.allowed, 1.0))[pairs.row]) | everything[pairs.row])
+        self.drop_missing(sent, rank, pairs.row)
+        return sent
 
     def drop_missing(self, sent: NDArray[np.bool_], rank: NDArray[np.float32], row: Ints) -> None:
         """Take back, of what was sent [n, k], what did not arrive; `rank` [n, k] and `row` [n] as in `covariates`."""
@@ -187,6 +194,7 @@ def covariates(
     sent: NDArray[np.bool_],
     rank: NDArray[np.float32],
     zeros: NDArray[np.bool_],
+    own_confidence: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """What fusion makes of each pair depends on: [n, 28] float32, as `FUSED_COVARIATES`.
 
@@ -195,6 +203,7 @@ def covariates(
         sent: [n, k] whether the cell that holds the car was sent.
         rank: [n, k] the fraction of the sender's cells that rank above the car's: how much of what is about it was sent too.
         zeros: [n] whether cells that were not sent take part as zeros.
+        own_confidence: [n] the ego's, where it is not what it gives the cars on its own.
     """
     n, k = pairs.peer.shape
     first, second = np.full((2, n), NO_PEER, np.float32)
@@ -228,10 +237,48 @@ def covariates(
     most = np.log(np.maximum(part * CELLS**2, 1.0)) / 8.0
     own = looks.covariates[pairs.look]
     columns = (
-        confidence[pairs.look], first, second, mean, many, total, silent, total / (1.0 + total + silent), shift_first, off / count,
+        confidence[pairs.look] if own_confidence is None else own_confidence, first, second, mean, many, total, silent, total / (1.0 + total + silent), shift_first, off / count,
         spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in _OWN),
     )  # fmt: skip
     return beside(n, columns)
+
+
+def lead_of(shares: Sequence[Share]) -> Share | None:
+    """The map that takes the place of an ego's own where it has none: the one that counts most."""
+    return max((s for s in shares if s.is_map and s.weight > 0.0), key=lambda s: s.weight, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Led:
+    """Egos without a look of their own: a peer's map takes its place, as far as it was sent."""
+
+    rows: list[int]
+    """Of the exchange."""
+    maps: FeatureShares
+    """Each row's leading map, as sent to the very drone that made it."""
+
+    def came(self, pairs: Pairs, looks: Looks, fleet: CaptureColumns, ranks: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """[n] whether the ego's own cell with the car is there; in rows that are not led it is.
+
+        Args:
+            ranks: [looks] the fraction of the drone's cells that rank above each car's.
+        """
+        out = np.ones(len(pairs.row), bool)
+        its = pair(self.maps, looks, fleet)
+        sent = self.maps.sent(its, ranks[its.peer])[:, 0]
+        for k, row in enumerate(self.rows):
+            out[pairs.row == row] = sent[its.row == k]
+        return out
+
+
+def received_only(boxes: Boxes, ego: Capture, shares: Sequence[Share]) -> Boxes:
+    """The boxes in an ego's square and in a disc that a map was requested of; those of a drone that has no look of its own."""
+    asked = np.zeros(len(boxes), bool)
+    for s in shares:
+        if s.is_map and s.weight > 0.0:
+            x, y, radius = (0.0, 0.0, np.inf) if s.roi is None or s.representation == "raw" else s.roi
+            asked |= (boxes.xy_m[:, 0] - x) ** 2 + (boxes.xy_m[:, 1] - y) ** 2 <= radius**2
+    return boxes.take(asked & in_square(boxes.xy_m, [ego.est_pose])[:, 0])
 
 
 def mean_shift(

@@ -18,11 +18,14 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import Recorder
 
 
-def as_share(received: Received, trust: float = 1.0) -> Share:
-    """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender."""
+def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
+    """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender.
+
+    What its age leaves of it is the detector's to say: it differs between maps and boxes.
+    """
     payload = received.payload
     name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
-    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing)
+    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s)
 
 
 Job = tuple[Capture, list[Share]]
@@ -35,7 +38,7 @@ class Ego(NamedTuple):
     here: Capture
     """Where it is."""
     job: Job | None
-    """What it fuses; None where its own capture is too old, so that it detects nothing."""
+    """What it fuses; None where its own capture is too old and nothing fresh was received, so that it detects nothing."""
     flying: bool = True
     """False for a drone that left the air: it fuses nothing, and the cars about its place in the plan are recorded."""
 
@@ -93,7 +96,7 @@ class Scorer:
             if not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
             elif agent.here is not None and agent.latest is not None:
-                moment[1].append(Ego(agent.here, self._job(agent, agent.latest, now_s)))
+                moment[1].append(Ego(agent.here, self._job(agent, agent.here, agent.latest, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
             self._begun.append(self._ahead.begin(jobs_of(moment)))
@@ -134,15 +137,21 @@ class Scorer:
                 )
             )  # fmt: skip
 
-    def _job(self, agent: Agent, look: Capture, now_s: float) -> Job | None:
-        """The agent's capture and recent shares, by ascending peer; None where its own capture is too old."""
+    def _job(self, agent: Agent, here: Capture, look: Capture, now_s: float) -> Job | None:
+        """The agent's capture and recent shares, by ascending peer.
+
+        Where its own capture is too old it has its present pose alone, and fuses what its peers sent; None where that is
+        nothing.
+        """
         config = self._scenario.perception
         limit_s = config.max_age_s + 1e-9
-        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
-            return None
         memory = agent.memory
         held = [received for _, received in sorted(memory.held.items()) if now_s - received.capture.t_s <= limit_s]
-        return look, [as_share(r, memory.trust_in(r.capture.drone)) for r in held]
+        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
+            if not held:
+                return None
+            look = here._replace(looked=False)
+        return look, [as_share(r, memory.trust_in(r.capture.drone), now_s - r.capture.t_s) for r in held]
 
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from perception_examples import cross
 
 from sortie.perception.joining import NMS_IOU, OWN_WEIGHT, EgoSources, Rule, SourceBoxes, joined, joined_many, source_of
+from sortie.perception.lateness import SIGMA0_M, reach_m, still_right
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.metrics.overlap import iou_pairs
 from sortie.perception.network.detector import TorchDetector
@@ -91,6 +92,82 @@ def test_who_could_not_see_a_place_or_left_weak_boxes_out_does_not_vote_it_down(
     assert (len(cut.boxes), cut.truncated, whole.truncated) == (12, True, False)
     at = replace(cut, pose=HERE)
     assert joined(HERE, own, False, [at], "average").score.tolist().count(pytest.approx(0.6)) == 1
+
+
+CAR = np.array([[4.5, 1.9]])
+
+
+def left(age_s: float) -> float:
+    """What an age leaves of a car's score."""
+    return float(still_right(reach_m(CAR), age_s)[0])
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_a_peers_score_is_discounted_by_weight_and_age(rule: Rule) -> None:
+    """A drone without a look of its own, so that nobody else's silence counts."""
+
+    def score(**changes: float) -> float:
+        peer = replace(source((0, 0, 0.8)), **changes)
+        return float(joined_many([EgoSources(HERE, boxes(), False, [peer], looked=False)], rule)[0].score[0])
+
+    assert score() == pytest.approx(0.8)
+    assert score(weight=0.05) == pytest.approx(0.04)
+    assert score(age_s=0.3) == pytest.approx(0.8 * left(0.3))
+    assert score(weight=0.5, age_s=0.3) == pytest.approx(0.4 * left(0.3))
+    assert score(age_s=60.0) > 0.3  # cars that stand stay
+
+
+def test_under_suppression_an_own_box_stands_against_a_late_or_a_doubted_one() -> None:
+    own = boxes((0, 0, 0.5))
+    for peer, stays in (
+        (source((0.6, 0, 0.8)), 0.6),
+        (source((0.6, 0, 0.8), weight=0.5), 0.0),
+        (replace(source((0.6, 0, 0.8)), age_s=0.5), 0.0),
+    ):
+        out = joined(HERE, own, False, [peer], "nms")
+        assert out.xy_m[:, 0].tolist() == pytest.approx([stays])
+
+
+def test_ages_count_beside_the_freshest_look() -> None:
+    """All of one age: as if all were fresh. An own look that is the oldest gives way."""
+    own, peer = boxes((0, 0, 0.6)), source((0.6, 0, 0.5), (40, 0, 0.5))
+    for rule in get_args(Rule):
+        fresh = joined(HERE, own, False, [peer], rule)
+        (alike,) = joined_many([EgoSources(HERE, own, False, [replace(peer, age_s=0.3)], age_s=0.3)], rule)
+        np.testing.assert_allclose(alike.table(), fresh.table())
+        np.testing.assert_allclose(alike.score, fresh.score)
+    (resting,) = joined_many([EgoSources(HERE, own, False, [replace(peer, age_s=0.1)], age_s=1.0)], "nms")
+    assert sorted(resting.xy_m[:, 0].tolist()) == pytest.approx([0.6, 40.0])
+    assert resting.score.tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_in_a_mean_a_late_place_counts_less_unless_the_car_stands() -> None:
+    own = boxes((0, 0, 0.5))
+    (near,) = joined(HERE, own, False, [replace(source((0.3, 0, 0.5)), age_s=1.0)], "average").xy_m[:, 0]
+    (far,) = joined(HERE, own, False, [replace(source((2.4, 0, 0.5)), age_s=1.0)], "average").xy_m[:, 0]
+    assert 0.14 < near < 0.15  # half-way is 0.15
+    assert 0.0 < far < 0.1  # half-way is 1.2
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_boxes_with_a_velocity_are_moved_and_a_known_variance_takes_the_ages_place(rule: Rule) -> None:
+    velocity = np.array([[10.0, 0.0], [np.nan, np.nan]])
+    peer = replace(source((0, 0, 0.5), (40, 0, 0.5)), age_s=0.5, velocity_mps=velocity)
+    blind = EgoSources(HERE, boxes(), False, [peer], looked=False)
+    assert sorted(joined_many([blind], rule)[0].xy_m[:, 0].tolist()) == pytest.approx([5.0, 40.0])
+    sure = replace(peer, variance_m2=np.array([SIGMA0_M**2, np.nan]))
+    out = joined_many([blind._replace(others=[sure])], rule)[0]
+    assert out.score.tolist() == pytest.approx([0.5, 0.5 * left(0.5)])
+    assert out.xy_m[:, 0].tolist() == pytest.approx([5.0, 40.0])
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_a_drone_without_a_look_has_its_peers_boxes_and_no_vote(rule: Rule) -> None:
+    peer = source((0, 0, 0.6), (30, 0, 0.4), (200, 0, 0.9))
+    (out,) = joined_many([EgoSources(HERE, boxes(), False, [peer], looked=False)], rule)
+    assert out.score.tolist() == pytest.approx([0.6, 0.4])
+    (nobody,) = joined_many([EgoSources(HERE, boxes(), False, [replace(peer, weight=0.0)], looked=False)], rule)
+    assert len(nobody) == 0
 
 
 def plainly(own: Boxes, others: list[SourceBoxes]) -> list[tuple[float, float, float]]:
@@ -175,7 +252,7 @@ def test_many_egos_at_once_are_each_as_alone(rule: Rule) -> None:
     together = joined_many(egos, rule)
     assert len(together) == len(egos)
     for many, ego in zip(together, egos, strict=True):
-        alone = joined(*ego, rule)
+        alone = joined(*ego[:4], rule)
         for field in ("xy_m", "size_m", "yaw_rad", "score"):
             assert getattr(many, field).tobytes() == getattr(alone, field).tobytes()
     assert together[0] is egos[0].own

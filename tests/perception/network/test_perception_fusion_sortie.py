@@ -8,6 +8,7 @@ from fusion_age import earlier, measure
 from perception_examples import capture, cross
 
 from sortie.perception.joining import LATE_MIN_SCORE, sendable
+from sortie.perception.lateness import map_weight
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector, shipped
 from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.when2com import When2com
@@ -142,3 +143,44 @@ def test_compensation_gains() -> None:
     assert fresh.gain.delta == 0.0
     assert late.gain.delta > 0.05
     assert late.gain.ap_b < fresh.gain.ap_b
+
+
+@pytest.mark.parametrize("fusion", ["disconet", "v2vnet", "where2comm"])
+def test_a_drone_without_a_look_fuses_its_peers_maps_alone(
+    fusion: str, scene: SceneModel, fleet: list[Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One whole map seen from the place where it was made is that drone's own; nothing is rendered for the ego."""
+    peer, other = fleet[1], fleet[2]
+    blind = peer._replace(drone=0, looked=False)
+    detector = TorchDetector(scene, Perception(fusion=fusion), seed=1)
+    whole = Share(peer, "features", 1.0, None, 0.5)
+    one, both, none, boxes, alone = detector.detect(
+        [
+            (blind, [whole]),
+            (blind, [whole, Share(other, "features", 0.25, None, 1.0)]),
+            (blind, []),
+            (blind, shares([peer], "detections")),
+            (peer, []),
+        ]
+    )
+    np.testing.assert_allclose(one.table(), alone.table(), atol=1e-3)
+    np.testing.assert_allclose(one.score, alone.score, atol=1e-4)
+    assert same(boxes, alone)
+    assert len(none) == 0
+    assert len(both) > 0
+    assert not same(both, one)
+    assert blind not in detector._kept
+
+
+def test_a_late_map_counts_less(scene: SceneModel, fleet: list[Capture]) -> None:
+    late = [Share(earlier(c, 0.3, 5.0), "features", 1.0, None, 1.0) for c in fleet[1:]]
+    detector = TorchDetector(scene, Perception(), seed=1)
+    ageless, aged, weak = detector.detect(
+        [
+            (fleet[0], late),
+            (fleet[0], [s._replace(age_s=0.395) for s in late]),
+            (fleet[0], [s._replace(weight=map_weight(0.395, 0.095)) for s in late]),
+        ]
+    )
+    assert not same(aged, ageless)
+    np.testing.assert_allclose(aged.score, weak.score, atol=1e-5)

@@ -28,6 +28,7 @@ from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.hashing import uniform
 from sortie.perception.surrogate.rows import assign_boxes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target
 
 BOUNDS = (-50.0, -50.0, 50.0, 50.0)
@@ -383,3 +384,33 @@ def test_older_maps_than_any_that_was_fitted_give_no_more_false_alarms_than_the_
 
     np.testing.assert_allclose(expected(age_s), expected(0.4), rtol=1e-3)
     assert expected(0.4).sum() < 100
+
+
+def test_a_drone_without_a_look_has_what_its_peers_sent(detector: SurrogateDetector) -> None:
+    """A whole map, from where it was made, is that drone's own; of a part it has the cells that came."""
+    fleet = cross(10.0, 20.0, 0.3)
+    peer, other = fleet[1], fleet[2]
+    blind = peer._replace(drone=0, looked=False)
+    whole, part = Share(peer, "raw", 1.0, None, 0.5), Share(peer, "features", 0.003, None, 0.5)
+    disc = Disc(*peer.position_m[:2], 30.0)
+    one, few, near, both, none, boxes, alone = detector.detect(
+        [
+            (blind, [whole]),
+            (blind, [part]),
+            (blind, [Share(peer, "features", 1.0, disc, 1.0)]),
+            (blind, [whole, Share(other, "raw", 1.0, None, 0.5)]),
+            (blind, []),
+            (blind, [Share(peer, "detections", 0.0, None, 1.0)]),
+            (peer, []),
+        ]
+    )
+    inside = alone.take(in_square(alone.xy_m, [blind.est_pose])[:, 0])
+    same([one], [inside])
+    assert set(boxes.xy_m[:, 0]) <= set(inside.xy_m[:, 0])
+    assert len(boxes) > 0.8 * len(inside)
+    assert 0 < len(few) < len(one)
+    assert 0 < len(near) < len(one)
+    assert (np.hypot(*(near.xy_m - disc[:2]).T) <= 32.0).all()
+    together = detector.detect([(peer, [Share(other, "raw", 1.0, None, 1.0)])])[0]
+    same([both], [together.take(in_square(together.xy_m, [blind.est_pose])[:, 0])])
+    assert len(none) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import pyarrow.compute as pc
@@ -11,7 +12,7 @@ from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome import both_matched, outcome
 from sortie.sim.results.record import SortieRecord
 
 SEEING = ("perception.detector=surrogate", "perception.sample_rate_hz=1")
@@ -119,3 +120,31 @@ def test_a_landing_says_what_brought_it_down(override: str, why: str) -> None:
     landed = [row["text"] for row in record.tables["events"].to_pylist() if row["kind"] == "landed"]
     assert len(landed) == 5
     assert all(why in text for text in landed)
+
+
+def served(kind: Representation, rho: float, view: FleetView) -> list[Directive]:
+    """Drone 0 rests and sends nothing; the others send to all at 10 Hz."""
+    if view.ego == 0:
+        return resting([0] * 8, view)
+    return [Directive(view.ego, p, kind, rho, None, 10.0, reason="serves") for p in view.peers]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rho"),
+    [(Representation.DETECTIONS, 0.0), (Representation.TRACKS, 0.0), (Representation.FEATURES, 0.25)],
+)
+def test_a_drone_that_rests_fuses_what_its_peers_send(kind: Representation, rho: float) -> None:
+    record = run_sortie(example(*SEEING), partial(served, kind, rho))
+    table = record.tables["fusions"]
+    rows = [r for r in table.to_pylist() if r["t_s"] > 1.0]
+    resting_rows, awake = ([r for r in rows if (r["drone"] == 0) == rests] for rests in (True, False))
+    assert all(r["peers"] == [1, 2, 3, 4] for r in resting_rows)
+    assert min(r["detections"] for r in resting_rows) > 10
+    hits = {
+        rests: np.mean(
+            [m.hit.sum() for (t_s, d), m in both_matched(record)["full_scene"].items() if t_s > 1 and (d == 0) == rests]
+        )
+        for rests in (True, False)
+    }
+    assert hits[True] > 0.5 * hits[False]
+    assert awake
