@@ -97,7 +97,7 @@ class PeerMemory:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
-        return FleetView(self.drone, self._period_s, known, self.ages_s(now_s))
+        return FleetView(self.drone, self._period_s, known, self.ages_s(now_s), self._rules.detached_after_periods)
 
     def trust_in(self, peer: int) -> float:
         """Trust in a peer, 0 … 1. The fusion weight of its payloads is multiplied by it."""

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from sortie.policies.contract import Directive, Representation
+from sortie.policies.contract import ROUNDING_PERIODS, Directive, Representation
 
 DEGRADED_RATE_HZ = 2.0
 """A degraded link carries detections at most this often, as the worked policy's lowest rung does."""
-
-_ROUNDING_PERIODS = 1e-6  # an age of exactly three periods, computed in floats, is not older than three periods
 
 
 class LinkHealth(IntEnum):
@@ -30,7 +28,7 @@ def health(
     """Health of the link to a peer whose latest descriptor is `age_s` old (None: never heard)."""
     if age_s is None:
         return LinkHealth.DETACHED
-    periods = age_s / period_s - _ROUNDING_PERIODS
+    periods = age_s / period_s - ROUNDING_PERIODS
     if periods > detached_after_periods:
         return LinkHealth.DETACHED
     return LinkHealth.DEGRADED if periods > degraded_after_periods else LinkHealth.FRESH

@@ -37,6 +37,12 @@ FEATURE_MAP_MEGABITS = 8 * FEATURE_CELLS * FEATURE_CELL_BYTES / 1e6
 """A whole feature map."""
 
 
+DETACHED_AFTER_PERIODS = 10.0
+"""The plane's second threshold of age, in periods of a descriptor."""
+ROUNDING_PERIODS = 1e-6
+"""An age of exactly three periods, computed in floats, is not older than three periods."""
+
+
 class TaskPhase(IntEnum):
     """What a drone is doing, as its descriptor states it."""
 
@@ -114,6 +120,8 @@ class FleetView(NamedTuple):
     period_s: float
     descriptors: Mapping[int, Descriptor]
     age_s: Mapping[int, float]
+    detached_after_periods: float = DETACHED_AFTER_PERIODS
+    """A peer whose descriptor is older than this is detached: nothing reaches it, and nothing comes from it."""
 
     @property
     def me(self) -> Descriptor | None:
@@ -125,6 +133,22 @@ class FleetView(NamedTuple):
         """Ids of the other drones heard, ascending."""
         ego = self.ego
         return tuple([i for i in sorted(self.descriptors) if i != ego])
+
+    @property
+    def attached(self) -> FleetView:
+        """The view without detached peers; the view itself where there are none.
+
+        Example:
+            >>> heard = {i: None for i in range(3)}
+            >>> list(FleetView(0, 0.1, heard, {0: 0.0, 1: 0.2, 2: 1.5}).attached.descriptors)
+            [0, 1]
+        """
+        limit_s = (self.detached_after_periods + ROUNDING_PERIODS) * self.period_s
+        near = [i for i, age_s in self.age_s.items() if i == self.ego or age_s <= limit_s]
+        if len(near) == len(self.age_s):
+            return self
+        descriptors, ages_s = self.descriptors, self.age_s
+        return self._replace(descriptors={i: descriptors[i] for i in near}, age_s={i: ages_s[i] for i in near})
 
     @property
     def full_sharing_maps(self) -> int:

@@ -16,6 +16,7 @@ from math import floor, fsum, isfinite, log2, log10
 from pathlib import Path
 from typing import NamedTuple
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.coverage_cells import sees
 from sortie.policies.catalogue.prior.full import RATE_HZ
 from sortie.policies.contract import (
@@ -104,6 +105,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
     return float(min(1.0, 2.0 ** (floor(STEPS_A_HALVING * log2(max(share, 1e-6))) / STEPS_A_HALVING)))
 
 
+@among_attached
 def arm(view: FleetView, *, index: int = 0, sent_budget: float = 0.25) -> list[Directive]:
     """Always the same arm, for `sortie learn` and comparisons."""
     return spend(view, ARMS[index % len(ARMS)], sent_budget, "fixed arm")
@@ -124,11 +126,13 @@ def features(view: FleetView, sent_budget: float) -> tuple[float, ...]:
     return log10(max(sent_budget, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
 
 
+@among_attached
 def boxes(view: FleetView) -> list[Directive]:
     """Boxes to every peer, whatever the context: the cheapest way of sharing."""
     return spend(view, BOXES, 0.0, "fixed")
 
 
+@among_attached
 def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """Rules over mission, coverage, budget and links: feature cells of a tracked region that it sees, otherwise boxes.
 
@@ -149,6 +153,7 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     return spend(view, MAPS, sent_budget, "a region")
 
 
+@among_attached
 def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
     seen = features(view, sent_budget)

@@ -18,6 +18,7 @@ import random
 from collections.abc import Callable, Collection, Sequence
 from math import floor
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, nothing
 from sortie.policies.geometry import peers_by_overlap
@@ -29,6 +30,7 @@ RESHUFFLE_S = 10
 # --- each receiver has k senders -------------------------------------------------------------------
 
 
+@among_attached
 def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive]:
     """Features to every peer (all-4 at N = 5), whatever the context.
 
@@ -46,6 +48,7 @@ def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive
     ]
 
 
+@among_attached
 def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover most of its footprint; the budget is as for `everyone`."""
     return _serve(
@@ -53,12 +56,14 @@ def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list
     )
 
 
+@among_attached
 def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover least of its footprint; the budget is as for `everyone`."""
     what = f"the {k} that cover least of the receiver's footprint"
     return _serve(view, k, received_budget, what, lambda _, by: by[max(0, len(by) - k) :])
 
 
+@among_attached
 def random_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0, salt: int = 0) -> list[Directive]:
     """Each receiver gets features from k peers drawn anew every `RESHUFFLE_S`; the budget is as for `everyone`.
 
@@ -106,6 +111,7 @@ def _rho(received_budget: float, maps: int, place: int, k: int) -> float:
 # --- each sender has k receivers -------------------------------------------------------------------
 
 
+@among_attached
 def best_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -> list[Directive]:
     """Each drone sends features to the k peers that cover most of its own footprint.
 
@@ -117,6 +123,7 @@ def best_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -
     return _send_to(view, peers_by_overlap(view)[:k], sent_budget, f"the {k} that cover most of the sender's footprint")
 
 
+@among_attached
 def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -> list[Directive]:
     """Each drone sends features to the k peers that cover least of its own footprint; as `best_k_receivers`."""
     return _send_to(
@@ -124,6 +131,7 @@ def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) 
     )
 
 
+@among_attached
 def random_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0, salt: int = 0) -> list[Directive]:
     """Each drone sends features to k peers drawn anew every `RESHUFFLE_S`; as `best_k_receivers`."""
     return _send_to(view, _draw(view, salt, view.ego, view.peers, k), sent_budget, f"{k} drawn at random")
@@ -147,6 +155,7 @@ def _draw(view: FleetView, salt: int, whose: int, among: Sequence[int], k: int) 
     return draw.sample(sorted(among), min(k, len(among)))
 
 
+@among_attached
 def silence(view: FleetView) -> list[Directive]:
     """Nothing to anyone: five single drones."""
     return [nothing(view.ego, p, "fixed: silence") for p in view.peers]

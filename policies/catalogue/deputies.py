@@ -7,6 +7,7 @@ the place of a better one; trust (`sortie.fleet.trust`) is for that.
 
 from __future__ import annotations
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.coverage_cells import seen_well
 from sortie.policies.catalogue.freshness import freshness
 from sortie.policies.catalogue.worked import (
@@ -26,6 +27,7 @@ RESTING_DUTY_PERCENT = 50
 SLOW_DEADLINE_S = 0.5
 
 
+@among_attached
 def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directive]:
     """Each receiver is served by the k drones that add most: unseen cells × link × battery, nearer ones first on ties."""
     me = view.me

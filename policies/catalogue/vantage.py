@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from math import fsum, hypot
 
 from sortie.policies.catalogue.baselines import everyone
-from sortie.policies.catalogue.freshness import GONE_PERIODS
 from sortie.policies.contract import Directive, FleetView, Reposition, TaskPhase, looks_from
 
 NEAR_M = 5.0
@@ -26,10 +25,8 @@ def over_region(view: FleetView) -> Reposition | None:
     me = view.me
     if me is None or me.region is None or me.task_phase != TaskPhase.TRACK:
         return None
-    fresh = [d.position_m for i, d in view.descriptors.items() if view.age_s[i] <= GONE_PERIODS * view.period_s]
-    if not fresh:
-        return None
-    middle_x, middle_y = (fsum(p[axis] for p in fresh) / len(fresh) for axis in (0, 1))
+    there = [d.position_m for d in view.attached.descriptors.values()]
+    middle_x, middle_y = (fsum(p[axis] for p in there) / len(there) for axis in (0, 1))
     dx_m, dy_m = me.region.x_m - middle_x, me.region.y_m - middle_y
     far_m = hypot(dx_m, dy_m)
     share = 0.0 if far_m < NEAR_M else MOST_M / far_m if far_m > MOST_M else 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.contract import Directive, FleetView, LinkState, Representation, TaskPhase, nothing
 from sortie.policies.geometry import peers_by_overlap
 
@@ -20,6 +21,7 @@ NO_GOODPUT = {
 NOT_CHOSEN = f"not among the {TOP_PEERS} most overlapping peers"
 
 
+@among_attached
 def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     """Battery picks representation and rate, the link may lower both, the phase the ROI, overlap the peers.
 

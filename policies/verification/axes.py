@@ -73,10 +73,10 @@ class _WatchedDescriptor:
 
 
 def observe(policy: Callable[..., Sequence[Directive]], views: Iterable[FleetView]) -> Observed:
-    """Run a policy on views that record what is read."""
+    """Run a policy on views that record what is read. That it leaves out detached peers is the plane's rule, no decision."""
     read: set[str] = set()
     decided: set[str] = set()
-    for view in views:
+    for view in (v.attached for v in views):
         watched = {i: cast(Descriptor, _WatchedDescriptor(d, read)) for i, d in view.descriptors.items()}
         for directive in policy(view._replace(descriptors=watched)):
             decided |= decisions_of(directive)

@@ -115,7 +115,8 @@ class _Rebuilding:
 
     def function(self, found: Any) -> Callable[..., Any]:
         """A copy of a callable with confined globals."""
-        found = getattr(found, "__wrapped__", found)  # the result of a cached function depends on its arguments alone
+        if hasattr(found, "cache_info"):  # the result of a cached function depends on its arguments alone
+            found = found.__wrapped__
         if isinstance(found, functools.partial):
             return functools.partial(self.function(found.func), *found.args, **found.keywords)
         if isinstance(found, types.MethodType):

@@ -31,6 +31,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import parameters, viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
+from sortie.policies.verification.invariants import just_heard
 from sortie.policies.verification.views import draw_view, draw_views, shrink
 
 VIEWS = 300
@@ -226,11 +227,13 @@ def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
 def age_monotone(policy: Policy, view: FleetView) -> str | None:
     """The plane's second rule: an older descriptor raises no directive's representation, budget or rate.
 
-    Each descriptor's age is raised by itself, and all together, beyond each of the plane's two thresholds.
+    Each descriptor's age is raised by itself, and all together, beyond each of the plane's two thresholds. A peer that is
+    detached has left the fleet, and its place may go to others: no directive may be higher than it was with that peer and
+    than it is without.
     """
     before = _decide(policy, view)
     for who, add_s, older in older_views(view):
-        raised = raised_part(before, _decide(policy, older))
+        raised = raised_part(before, _decide(policy, older), _decide(policy, without_detached(view, older)))
         if raised is not None:
             return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
     return None
@@ -244,26 +247,51 @@ def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, Fleet
             yield who, add_s, view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
 
 
-def raised_part(before: Iterable[Directive], after: Iterable[Directive]) -> str | None:
-    """The first directive of `after` with a higher representation, budget (of the same representation) or rate than `before`."""
-    usual = _by_peer(before)
+def without_detached(view: FleetView, older: FleetView) -> FleetView:
+    """A view without the peers that are detached in an older one."""
+    left = older.attached.descriptors
+    if len(left) == len(view.descriptors):
+        return view
+    return view._replace(
+        descriptors={i: d for i, d in view.descriptors.items() if i in left},
+        age_s={i: a for i, a in view.age_s.items() if i in left},
+    )
+
+
+def raised_part(
+    before: Iterable[Directive], after: Iterable[Directive], without: Iterable[Directive] = ()
+) -> str | None:
+    """The first directive of `after` that is higher than that of `before`, and than that of `without` if there is one.
+
+    Higher is a higher representation, a higher budget of the same representation, or a higher rate.
+    """
+    usual, instead = _by_peer(before), _by_peer(without)
     for d in after:
-        old = usual.get(d.destination)
-        link = f"directive {d.source}→{d.destination}"
-        if old is None:
-            if d.representation > 0:
-                return f"{link}: there was none before"
-        elif d.representation > old.representation:
-            return f"{link}: representation rises from {int(old.representation)} to {int(d.representation)}"
-        elif d.representation == old.representation and d.rho > old.rho:
-            return f"{link}: rho rises from {old.rho} to {d.rho}"
-        elif d.rate_hz > old.rate_hz:
-            return f"{link}: rate_hz rises from {old.rate_hz} to {d.rate_hz}"
+        raised = _rise(usual.get(d.destination), d)
+        if raised and (d.destination not in instead or _rise(instead[d.destination], d)):
+            return f"directive {d.source}→{d.destination}: {raised}"
+    return None
+
+
+def _rise(old: Directive | None, d: Directive) -> str | None:
+    """In what a directive is higher than the one before."""
+    if old is None:
+        return "there was none before" if d.representation > 0 else None
+    if d.representation > old.representation:
+        return f"representation rises from {int(old.representation)} to {int(d.representation)}"
+    if d.representation == old.representation and d.rho > old.rho:
+        return f"rho rises from {old.rho} to {d.rho}"
+    if d.rate_hz > old.rate_hz:
+        return f"rate_hz rises from {old.rate_hz} to {d.rate_hz}"
     return None
 
 
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
-    """The fleet keeps every budget that the policy takes (`_SPENT`), if each drone decides on this one view."""
+    """The fleet keeps every budget that the policy takes (`_SPENT`), if each drone decides on this one view.
+
+    All are just heard: a drone that is detached for the others would count itself in.
+    """
+    view = just_heard(view)
     takes: Callable[..., Any] = policy
     known = parameters(policy)
     for name, (whose, full_maps) in _SPENT.items():

@@ -85,7 +85,7 @@ WORDS: dict[str, Word] = {
     "cpu": _view_word("the ego's CPU headroom, 0 … 1", lambda s: s.me.cpu_headroom),
     "gpu": _view_word("the ego's GPU headroom, 0 … 1", lambda s: s.me.gpu_headroom),
     "phase": _view_word("the ego's: transit, search, track, returning or landing", lambda s: s.me.task_phase),
-    "peers": _view_word("how many peers were heard", lambda s: len(s.view.peers)),
+    "peers": _view_word("how many peers are attached", lambda s: len(s.view.attached.peers)),
     "region": _view_word("the ego has a region of responsibility", lambda s: s.me.region is not None, "truth"),
     "targets": _view_word("the ego reports priority targets", lambda s: bool(s.me.priority_target_ids), "truth"),
     "target_in_region": _view_word(

@@ -32,7 +32,7 @@ from typing import Literal
 
 from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, find_wrong_type
 from sortie.policies.verification.confine import uses_builtin
-from sortie.policies.verification.conformance import missing_links, older_views, raised_part
+from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
 from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
 from sortie.policies.verification.ranges import FleetOfRanges
 from sortie.policies.verification.symbols import Path, Refused, explore
@@ -111,10 +111,13 @@ def keeps_contract(policy: Policy, view: RepeatableView) -> str | None:
 
 
 def only_falls_with_age(policy: Policy, view: RepeatableView) -> str | None:
-    """Raising any ages raises no directive's representation, budget or rate."""
+    """Raising any ages raises no directive's representation, budget or rate (`conformance.age_monotone`)."""
     before = list(policy(view.now()))
     for older in view.older():
-        raised = raised_part(before, policy(older))
+        after = policy(older)
+        if raised_part(before, after) is None:
+            continue
+        raised = raised_part(before, after, policy(without_detached(view.now(), older)))
         if raised is not None:
             ages = ", ".join(f"{i}: {a!r}" for i, a in older.age_s.items())
             return f"with ages raised to {ages} s, {raised}"

@@ -9,12 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.contract import COVERAGE_BYTES, PHASE_NAMES, PHASE_OF, Descriptor, Disc, FleetView, TaskPhase
+from sortie.policies.contract import (
+    COVERAGE_BYTES,
+    DETACHED_AFTER_PERIODS,
+    PHASE_NAMES,
+    PHASE_OF,
+    Descriptor,
+    Disc,
+    FleetView,
+    TaskPhase,
+)
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import SILENT_MBPS
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
+GONE = "detached_after_periods"
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
@@ -144,8 +154,10 @@ def to_json(view: FleetView) -> str:
         }
         drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
     inner = ",\n  ".join(drones)
+    usual = view.detached_after_periods == DETACHED_AFTER_PERIODS
+    gone = "" if usual else f'"{GONE}": {view.detached_after_periods!r}, '
     return (
-        f'{{"ego": {view.ego}, "period_s": {view.period_s!r}, "drones": ['
+        f'{{"ego": {view.ego}, "period_s": {view.period_s!r}, {gone}"drones": ['
         + (f"\n  {inner}\n" if inner else "")
         + "]}\n"
     )
@@ -177,7 +189,8 @@ def from_json(text: str) -> FleetView:
     period_s = _number(data, "period_s", "view", 0.0)
     if period_s == 0:
         raise ViewError("view.period_s is 0, must be above 0")
-    return FleetView(int(ego), float(period_s), descriptors, age_s)
+    gone_after = _number({GONE: DETACHED_AFTER_PERIODS} | data, GONE, "view", 0.0)
+    return FleetView(int(ego), float(period_s), descriptors, age_s, float(gone_after))
 
 
 def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from math import exp
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import NO_GOODPUT
 from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView
@@ -19,6 +20,7 @@ STEPS = 4
 """Weights are multiples of a quarter, so that noise of the goodput changes no directive. They are at least a quarter."""
 
 
+@among_attached
 def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED_FOR_S) -> list[Directive]:
     """SyncNet-style: full maps to every peer, weighted by the delay that follows from the link's goodput."""
     me = view.me

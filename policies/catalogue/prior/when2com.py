@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from math import exp
 
+from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
 from sortie.policies.contract import Directive, FleetView, nothing
@@ -21,6 +22,7 @@ MATCH_BYTES = 32 * 4 + 4
 """Bytes that each drone sends to each peer first: its own query of 32 floats, and its score for the peer's query."""
 
 
+@among_attached
 def when2com(
     view: FleetView, *, rho: float = 1.0, threshold: float = KEPT_ABOVE, sharpness: float = SHARPNESS
 ) -> list[Directive]:

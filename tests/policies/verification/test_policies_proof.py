@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from sortie.policies.catalogue.baselines import everyone, random_k
+from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
@@ -220,8 +221,8 @@ def test_what_is_answered_as_in_flight_is_searched(policy: Decide) -> None:
 def test_a_number_in_a_reason_is_no_obstacle() -> None:
     def explains(view: FleetView) -> list[Directive]:
         return [
-            d._replace(reason=f"{charge(view):.0%}" if d.destination == 1 else f"{charge(view):.0%} left")
-            for d in everyone(view)
+            full_sharing(view.ego, p, 1.0, f"{charge(view):.0%}" if p == 1 else f"{charge(view):.0%} left")
+            for p in view.peers
         ]
 
     assert [v.outcome for v in prove(explains, parse("rho <= 1\nrepresentation >= features"), max_drones=3)] == [

@@ -37,7 +37,7 @@ from sortie.policies.contract import (
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
 from sortie.policies.verification.confine import Reached, confined
-from sortie.policies.verification.conformance import RULES, full_view, raised_part
+from sortie.policies.verification.conformance import RULES, full_view, raised_part, without_detached
 from sortie.policies.verification.views import draw_view, draw_views
 from sortie.scenarios.reading.load import ScenarioError, loads
 
@@ -194,8 +194,9 @@ def test_age_never_raises_what_the_plane_enforces(name: str, number: int, data: 
         links = {p: health(v.age_s[p], v.period_s, 3.0, 10.0) for p in v.peers}
         return [cap_by_age(d, links[d.destination], v.age_s[d.destination]) for d in POLICIES[name](v)]
 
-    assert raised_part(POLICIES[name](view), POLICIES[name](older)) is None
-    assert raised_part(enforced(view), enforced(older)) is None
+    without = without_detached(view, older)
+    assert raised_part(POLICIES[name](view), POLICIES[name](older), POLICIES[name](without)) is None
+    assert raised_part(enforced(view), enforced(older), enforced(without)) is None
 
 
 # --- 3: context only -----------------------------------------------------------------------------
