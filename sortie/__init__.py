@@ -15,7 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sortie._api import CampaignResult, Comparison, campaign, check, compare, env, fly, load, open_run
+    from sortie._api import CampaignResult, Comparison, campaign, check, compare, env, fly, load, open_run, replay
     from sortie._run import Run
     from sortie.policies.contract import (
         Descriptor,
@@ -34,19 +34,22 @@ if TYPE_CHECKING:
     from sortie.scenarios.reading.nodes import ScenarioError
     from sortie.scenarios.schema import Scenario
     from sortie.sim.folders import RunError
+    from sortie.sim.studies.replayed import Replay
 
     __version__: str
 
 __all__ = [
-    "load", "fly", "compare", "campaign", "check", "env", "open_run",
-    "Run", "Comparison", "CampaignResult", "Scenario",
+    "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run",
+    "Run", "Comparison", "Replay", "CampaignResult", "Scenario",
     "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
     "Reposition", "looks_from", "SortieError", "ScenarioError", "PolicyError", "RunError",
     "__version__",
 ]  # fmt: skip
 
 _HOMES = {
-    "sortie._api": ("load", "fly", "compare", "campaign", "check", "env", "open_run", "Comparison", "CampaignResult"),
+    "sortie._api": (
+        "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "Comparison", "CampaignResult",
+    ),
     "sortie._run": ("Run",),
     "sortie.policies.contract": (
         "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
@@ -56,6 +59,7 @@ _HOMES = {
     "sortie.scenarios.reading.nodes": ("ScenarioError",),
     "sortie.scenarios.schema": ("Scenario",),
     "sortie.sim.folders": ("RunError",),
+    "sortie.sim.studies.replayed": ("Replay",),
 }  # fmt: skip
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

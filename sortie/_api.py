@@ -1,4 +1,4 @@
-"""The public functions: load, fly, compare, campaign, check, env, open_run."""
+"""The public functions: load, fly, compare, replay, campaign, check, env, open_run."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sortie.sim.env import SortieEnv
     from sortie.sim.results.summary import Summary
     from sortie.sim.studies.compare import Compared, Gain
+    from sortie.sim.studies.replayed import Replay
 
 ScenarioLike = str | Path | Mapping[str, object] | Scenario
 """A library scenario's name, a file, plain sections, or a scenario that was loaded before."""
@@ -244,6 +245,39 @@ def compare(
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
     return Comparison(*compare_policies(flown, chosen, progress=progress))
+
+
+def replay(run: Run, policy: PolicyLike | None = None) -> Replay:
+    """Decide again over the views that a run kept, and compare with what was decided in flight.
+
+    The recorded world does not answer: a decision that differs changes no later view. Policies' own answers are
+    compared, before staleness and damping.
+
+    Args:
+        run: one that was flown with `record.views`.
+        policy: who decides; None takes the policies that decided in flight, each where it did. They must give the same
+            decisions, if they are functions of the view alone.
+
+    Raises:
+        RunError: the run kept no views, or a function decided in flight that the scenario does not name.
+        PolicyError: an unknown policy, or one that fails on a view or breaks its contract.
+
+    Example:
+        >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none", "record.views": True})
+        >>> sortie.replay(run).same
+        True
+        >>> sortie.replay(run, "silence").table.column_names[:5]
+        ['t_s', 'drone', 'decision', 'peer', 'fields']
+    """
+    from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, plan_of
+    from sortie.sim.identity import name_of
+    from sortie.sim.studies.replay import replay as decide_again
+
+    if not isinstance(run, Run):
+        raise RunError(f"run: {run!r}, must be a Run, as sortie.open_run gives it")
+    chosen, function = _with_policy(run.scenario, policy)
+    plan = plan_of(chosen.policy) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
+    return decide_again(run.record, plan, as_flown=policy is None)
 
 
 @dataclass(frozen=True, eq=False)

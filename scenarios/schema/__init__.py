@@ -35,6 +35,7 @@ from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
 from sortie.scenarios.schema.perception import Perception, Scene
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import MIN_TILE_BYTES, Bursts, Radio
+from sortie.scenarios.schema.record import RecordSection
 from sortie.scenarios.schema.scenario import Scenario, json_schema
 
 __all__ = [
@@ -72,6 +73,7 @@ __all__ = [
     "PolicyChange",
     "PolicyCommand",
     "Radio",
+    "RecordSection",
     "Region",
     "Route",
     "Scenario",

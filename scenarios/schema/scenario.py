@@ -17,6 +17,7 @@ from sortie.scenarios.schema.mission import Mission
 from sortie.scenarios.schema.perception import Perception
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import Radio
+from sortie.scenarios.schema.record import RecordSection
 
 
 class Scenario(Section):
@@ -32,6 +33,7 @@ class Scenario(Section):
     context: Context = Context()
     perception: Perception = Perception()
     policy: PolicySection = PolicySection()
+    record: RecordSection = RecordSection()
     events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
     expect: tuple[Expectation, ...] = Field(
         (), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`."

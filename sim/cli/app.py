@@ -25,6 +25,7 @@ from sortie.sim.cli import (
     live,
     paper,
     recording,
+    replay,
     report,
     study,
     train,
@@ -62,7 +63,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_,
     "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,
     "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
-    "import": import_log.import_log, "live": live.live,
+    "replay": replay.replay, "import": import_log.import_log, "live": live.live,
 }  # fmt: skip
 for name, command in COMMANDS.items():
     app.command(name)(command)

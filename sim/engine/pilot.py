@@ -22,6 +22,7 @@ from sortie.policies.contract import (
     PolicyError,
     Reposition,
     TaskPhase,
+    Viewpoint,
     check_directives,
     check_reposition,
 )
@@ -62,10 +63,18 @@ class PolicyPlan(NamedTuple):
     replays: tuple[tuple[float, int, FleetView], ...] = ()
 
     @property
+    def policies(self) -> tuple[NamedPolicy, ...]:
+        """Every policy that may decide."""
+        return (self.first, *(policy for _, policy in self.changes))
+
+    @property
     def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
-        policies = (self.first, *(policy for _, policy in self.changes))
-        return any(viewpoint_of(policy.decide) is not None for policy in policies)
+        return any(viewpoint_of(policy.decide) is not None for policy in self.policies)
+
+
+Keep = Callable[[int, str, FleetView, Sequence[Directive], Reposition | None], None]
+"""Takes a decision: drone, policy, the view that it read, its directives, and the viewpoint that it asked for."""
 
 
 def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyPlan:
@@ -96,6 +105,40 @@ def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyP
 def named_policy(name: str, params: Mapping[str, object]) -> NamedPolicy:
     inside = ", ".join(f"{k}={v}" for k, v in params.items())
     return NamedPolicy(f"{name}({inside})" if inside else name, resolve(name, params), handshake_bytes(name, params))
+
+
+def ask(policy: NamedPolicy, view: FleetView) -> Sequence[Directive]:
+    """A policy's directives for a view, not yet checked against the contract.
+
+    Raises:
+        PolicyError: the policy fails, or returns no sequence.
+    """
+    try:
+        answer = policy.decide(view)
+    except PolicyError:
+        raise
+    except Exception as error:
+        what = f"raises {describe_error(error)}"
+        raise PolicyError(f"policy {policy.name!r} on drone {view.ego} {what}") from error
+    if type(answer) is not list and (isinstance(answer, Directive) or not isinstance(answer, Sequence)):
+        what = f"returns {type(answer).__name__}, must be a sequence of directives"
+        raise PolicyError(f"policy {policy.name!r} on drone {view.ego} {what}")
+    return answer
+
+
+def ask_viewpoint(policy: NamedPolicy, viewpoint: Viewpoint, view: FleetView) -> Reposition | None:
+    """The place that a policy's viewpoint chooses; None keeps its slot.
+
+    Raises:
+        PolicyError: the function fails, or breaks the contract.
+    """
+    try:
+        asked = viewpoint(view)
+    except Exception as error:
+        what = f"its viewpoint raises {describe_error(error)}"
+        raise PolicyError(f"policy {policy.name!r} on drone {view.ego}: {what}") from error
+    check_reposition(asked, view)
+    return asked
 
 
 class Audit:
@@ -139,9 +182,18 @@ class Pilot:
         plan: PolicyPlan,
         audit: Audit,
         request_viewpoint: Callable[[int, Reposition | None], None] | None = None,
+        keep: Keep | None = None,
     ) -> None:
-        """Args: `request_viewpoint` takes the viewpoints that the policy chooses; None where no policy of the plan does."""
-        self.drone, self.policy, self._request = drone, plan.first, request_viewpoint
+        """Put a pilot together.
+
+        Args:
+            drone: whose pilot it is.
+            plan: the scenario's policies.
+            audit: counts what breaks invariants.
+            request_viewpoint: takes the viewpoints that the policy chooses; None where no policy of the plan does.
+            keep: takes every decision; None keeps none.
+        """
+        self.drone, self.policy, self._request, self._keep = drone, plan.first, request_viewpoint, keep
         self._viewpoint = viewpoint_of(plan.first.decide)
         changes = enumerate(plan.changes)
         self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
@@ -176,12 +228,17 @@ class Pilot:
         self._place = -1
         decisions = self._audit.decisions
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
-        if self._viewpoint is not None and self._request is not None:
-            self._request(self.drone, self._requested_viewpoint(view if self._shown is None else self._shown))
-        if not self._rules and self._shown is None:
-            return self._decide(view)
         shown, self._shown = self._shown, None
-        directives = self._decide_within_rules(view if shown is None else shown)
+        read, asked = view if shown is None else shown, None
+        if self._viewpoint is not None and self._request is not None:
+            asked = ask_viewpoint(self.policy, self._viewpoint, read)
+            self._request(self.drone, asked)
+        directives = ask(self.policy, read)
+        if self._keep is not None:
+            check_directives(directives, read)  # before its parts are read
+            self._keep(self.drone, self.policy.name, read, directives, asked)
+        if self._rules or shown is not None:
+            directives = self._within_rules(read, directives)
         if shown is not None:
             self._judge_shown(shown, directives)
         return directives
@@ -194,35 +251,10 @@ class Pilot:
             if place > self._place:  # else a later one of the list came with the phase
                 self.take_over(policy, f"phase {PHASE_NAMES[TaskPhase(me.task_phase)]}", place)
 
-    def _requested_viewpoint(self, view: FleetView) -> Reposition | None:
-        """The viewpoint that the policy chooses; None keeps its slot."""
-        assert self._viewpoint is not None  # noqa: S101
-        try:
-            asked = self._viewpoint(view)
-        except Exception as error:
-            what = f"its viewpoint raises {describe_error(error)}"
-            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {what}") from error
-        check_reposition(asked, view)
-        return asked
-
-    def _decide(self, view: FleetView) -> Sequence[Directive]:
-        try:
-            answer = self.policy.decide(view)
-        except PolicyError:
-            raise
-        except Exception as error:
-            what = f"raises {describe_error(error)}"
-            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}") from error
-        if type(answer) is not list and (isinstance(answer, Directive) or not isinstance(answer, Sequence)):
-            what = f"returns {type(answer).__name__}, must be a sequence of directives"
-            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone} {what}")
-        return answer
-
-    def _decide_within_rules(self, view: FleetView) -> Sequence[Directive]:
+    def _within_rules(self, view: FleetView, directives: Sequence[Directive]) -> Sequence[Directive]:
         name, audit = self.policy.name, self._audit
-        directives = self._decide(view)
         check_directives(directives, view)  # before the rules read them
-        fresh = self._decide(just_heard(view)) if self._asks_fresh else ()
+        fresh = ask(self.policy, just_heard(view)) if self._asks_fresh else ()
         if self._shielded:
             directives = enforce(self._rules, view, directives, fresh)
             for d in directives:

@@ -37,6 +37,7 @@ from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
+from sortie.sim.results.views import Journal
 
 KEY_ID = 1
 PHASE_SHARE, PHASE_S = 0.1, 0.01
@@ -113,6 +114,8 @@ class Parts:
     """None without a detector."""
     audit: Audit
     notes: AgentNotes
+    journal: Journal | None
+    """None where no views are kept."""
 
 
 def build(
@@ -154,7 +157,9 @@ def build(
     if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
-    pilots = [Pilot(i, policies, audit, None if choreography is None else choreography.request) for i in drones]
+    journal = Journal(env) if scenario.record.views else None
+    request = None if choreography is None else choreography.request
+    pilots = [Pilot(i, policies, audit, request, None if journal is None else journal.decided) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     detector = detector_of(scene, scenario.perception, seed, replication)
     count_boxes = None if detector is None else detector.count_boxes
@@ -181,7 +186,7 @@ def build(
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
         scenario, env, recorder, scene, batteries, air, world, transport, choreography, pilots, agents, detector, scorer,
-        audit, notes,
+        audit, notes, journal,
     )  # fmt: skip
 
 
@@ -219,6 +224,8 @@ def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRe
     air, notes, recorder = parts.air, parts.notes, parts.recorder
     tables = recorder.tables()
     recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
+    if parts.journal is not None:
+        tables |= parts.journal.tables()
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
         scenario=parts.scenario,

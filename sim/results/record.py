@@ -120,6 +120,8 @@ class SortieRecord:
     detector: str
     """The detector that flew, as `sortie.sim.identity.name_of` names it; `none` without one."""
     tables: Mapping[str, pa.Table]
+    """Those of `TABLES`. Where the scenario keeps views, also those of `sortie.sim.results.views`, which are no part of
+    the fingerprint: what is kept changes nothing that flies."""
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""
     calibration: str | None = None
@@ -136,7 +138,7 @@ class SortieRecord:
         The code's digest stays out of it: a change of code that leaves every value as it was leaves the fingerprint too.
         """
         digest = hashlib.sha256(f"{release_of(self.version)}/{self.policy}/{self.seed}/{self.replication}".encode())
-        for name in sorted(self.tables):
+        for name in sorted(self.tables.keys() & TABLES.keys()):
             digest.update(name.encode())
             for column in self.tables[name].column_names:
                 digest.update(column.encode())

@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
+from sortie.sim.results import views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
@@ -57,6 +58,13 @@ def page() -> str:
         *table(
             ("table", "a row is", "columns"),
             ((f"`{name}`", ABOUT[name], _columns(columns)) for name, columns in TABLES.items()),
+        ),
+        "",
+        "With `record.views: true` these too. They are no part of the fingerprint.",
+        "",
+        *table(
+            ("table", "a row is", "columns"),
+            ((f"`{name}`", views.ABOUT[name], _columns(columns)) for name, columns in views.TABLES.items()),
         ),
         "",
     ]
@@ -103,6 +111,8 @@ def _columns(columns: dict[str, pa.DataType]) -> str:
 def _kind(type_: pa.DataType) -> str:
     if pa.types.is_list(type_):
         return f" (list{_kind(type_.value_type)})"
+    if pa.types.is_struct(type_):
+        return f" ({', '.join(field.name for field in type_)})"
     name = _COLUMNS[type_]
     return f" {name}" if name else ""
 

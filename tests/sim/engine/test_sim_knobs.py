@@ -21,8 +21,8 @@ from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 
-NOT_KNOBS = ("name", "description", "expect", "expect_decisions")
-"""Words for people, and what is asserted about the outcome."""
+NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record")
+"""Words for people, what is asserted about the outcome, and what is kept beside the record."""
 
 JAM = "events=[{kind: jam, at_s: 1, position_m: [0, 0, 60], power_dbm: 0, until_s: 4}]"
 DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"

@@ -1,0 +1,18 @@
+"""`record`: what a run keeps beside its tables."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from sortie.scenarios.schema.base import Section
+
+
+class RecordSection(Section):
+    views: bool = Field(
+        False,
+        description="Keep the exact view and answer of every decision, for `sortie replay`; `sim/README.md` says what it costs.",
+    )
+    disagreement: bool = Field(
+        False,
+        description="Measure how often two drones' views lead to different choices about a link; takes time after the flight.",
+    )

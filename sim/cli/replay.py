@@ -1,0 +1,34 @@
+"""`sortie replay`: decide again over the views that a run kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import sortie
+from sortie.sim.cli.console import err, out
+from sortie.sim.cli.options import PolicyOption
+from sortie.sim.folders import ensure_files
+
+
+def replay(
+    run: Annotated[Path, typer.Argument(help="A run's folder, flown with --set record.views=true.")],
+    policy: PolicyOption = None,
+    expect_same: Annotated[bool, typer.Option("--expect-same", help="Exit with code 1 if a decision differs.")] = False,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write every difference here, as CSV.")] = None,
+) -> None:
+    """Decide again over the recorded views of a run, and print where the decisions differ and why.
+
+    Without --policy the policies that flew decide again. The recorded world does not answer to other decisions.
+    """
+    ensure_files(out_file)
+    replayed = sortie.replay(sortie.open_run(run), policy)
+    out.print(replayed.summary())
+    if out_file is not None:
+        replayed.save(out_file)
+        out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
+    if expect_same and not replayed.same:
+        err.print(f"[red]{len(replayed.differences)} differences[/red]")
+        raise typer.Exit(1)

@@ -1,0 +1,146 @@
+"""The views and answers that a run keeps are those that flew, to the last bit, in whatever the fleet meets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import sortie
+from sortie.policies.catalogue.worked import worked
+from sortie.policies.contract import Directive, Disc, FleetView, Representation
+from sortie.policies.verification.views import draw_view, to_json
+from sortie.sim.results import arrow_types
+from sortie.sim.results.views import decisions
+
+SHORT = {"duration_s": 6, "perception.detector": "none", "record.views": True}
+SHOWN = draw_view(3, 7)
+MEETS: dict[str, dict[str, object]] = {
+    "nothing": {},
+    "losses": {
+        "fleet.formation.spacing_m": 150,
+        "radio.bursts.good_to_bad": 0.3,
+        "events": [{"kind": "link_drop", "at_s": 1, "drone": 1, "loss_db": 40, "until_s": 4}],
+    },
+    "a lie that costs trust": {
+        "events": [{"kind": "lie", "at_s": 1, "drone": 1}],
+        "duration_s": 12,
+    },
+    "a wrong clock": {"events": [{"kind": "clock_skew", "at_s": 1, "drone": 1, "skew_s": -0.37}]},
+    "a small descriptor": {"context.form": "small"},
+    "rare descriptors": {"context.publish_every": 7},
+    "a lost drone": {"events": [{"kind": "drone_lost", "at_s": 2, "drone": 1}]},
+    "an attack on an open plane": {
+        "context.authentication": False,
+        "events": [{"kind": "spoof", "at_s": 1, "drone": 1, "attack": "forged"}],
+    },
+    "a view that it is shown": {
+        "fleet.drones": 20,
+        "duration_s": 3,
+        "policy.replays": [{"at_s": 1, "drone": SHOWN.ego, "view": json.loads(json.dumps(to_json(SHOWN)))}],
+    },
+}
+
+
+def flown(overrides: Mapping[str, object]) -> tuple[sortie.Run, list[FleetView], list[Sequence[Directive]]]:
+    """A flight of the worked policy, and every view and answer as they were, in their order."""
+    views, answers = [], []
+
+    def spy(view: FleetView) -> list[Directive]:
+        views.append(view)
+        answers.append(worked(view))
+        return answers[-1]
+
+    return sortie.fly("track_target", {**SHORT, **overrides}, policy=spy), views, answers
+
+
+@pytest.mark.parametrize("meets", MEETS)
+def test_kept_views_are_those_that_flew(meets: str, tmp_path: Path) -> None:
+    run, views, answers = flown(MEETS[meets])
+    kept = list(decisions(sortie.open_run(run.save(tmp_path / "run", recording=False)).tables))
+    assert [d.view for d in kept] == views
+    assert [list(d.directives) for d in kept] == answers
+    # equal in their types too, the sign of a zero, and the reasons, which are no part of equality
+    if meets != "a view that it is shown":  # which is from JSON, where 1 and 1.0 are the same
+        assert repr([(d.view, list(d.directives)) for d in kept]) == repr(list(zip(views, answers, strict=True)))
+
+
+def test_these_flights_meet_what_they_are_to_meet() -> None:
+    """Otherwise the test above would show nothing: some drones hear less, doubt, or read another clock."""
+    _, calm, _ = flown({})
+    assert max(max(view.age_s.values()) for view in calm) < 0.5
+    for meets, at_least_s in {
+        "losses": 0.5,
+        "a wrong clock": 0.3,
+        "a lost drone": 3.0,
+        "rare descriptors": 0.6,
+    }.items():
+        _, views, _ = flown(MEETS[meets])
+        assert max(max(view.age_s.values()) for view in views) > at_least_s, meets
+    run, views, _ = flown(MEETS["a lie that costs trust"])
+    assert run.outcome["distrusted_by"]["1"] > 0
+    doubted = [v for v in views if v.ego != 1 and 1 in v.descriptors and v.descriptors[1].battery_soc == 0.0]
+    assert doubted
+    assert any(view == SHOWN for view in flown(MEETS["a view that it is shown"])[1])
+
+
+def test_keeping_views_changes_nothing_that_flies() -> None:
+    losses = MEETS["losses"]
+    kept = sortie.fly("track_target", {**SHORT, **losses})
+    plain = sortie.fly("track_target", {**SHORT, **losses, "record.views": False})
+    assert kept.fingerprint == plain.fingerprint
+    assert set(kept.tables) - set(plain.tables) == {"views", "view_descriptors", "view_directives"}
+
+
+def test_what_a_policy_says_is_kept_before_the_shield() -> None:
+    rules = {"policy.invariants": "rho <= 0.1", "policy.shield": True}
+    run, _, answers = flown(rules)
+    assert run.outcome["policies"]["shield_interventions"] > 0
+    assert [list(d.directives) for d in decisions(run.tables)] == answers
+
+
+def test_a_wrong_directive_is_reported_as_without_views() -> None:
+    with pytest.raises(sortie.PolicyError, match="a policy returns Directive, got NoneType"):
+        sortie.fly("track_target", SHORT, policy=lambda view: [None for _ in view.peers])  # type: ignore[misc]
+
+
+class Colour(IntEnum):
+    RED = 3
+
+
+class Grown(NamedTuple):
+    """Fields as a later descriptor may have them."""
+
+    whole: int
+    numbers: tuple[float, ...]
+    pairs: tuple[tuple[int, bytes], ...]
+    disc: Disc | None
+    discs: tuple[Disc, ...]
+    by_id: Mapping[int, float]
+    colour: Colour
+    maybe: tuple[float, float] | None = None
+    name: str = ""
+
+
+class Odd(NamedTuple):
+    ids: set[int]
+
+
+def test_new_fields_survive_and_a_type_without_a_column_is_named() -> None:
+    rows = [
+        Grown(2**60, (0.1, -0.0), ((1, b"a"), (7, b"")), None, (Disc(1.0, 2.0, 3.0),), {4: 0.3}, Colour.RED),
+        Grown(-1, (), (), Disc(1e300, -0.0, 5e-324), (), {}, Colour.RED, (1 / 3, 2.0), "ρ"),
+    ]
+    assert repr(arrow_types.from_table(Grown, arrow_types.to_table(Grown, rows))) == repr(rows)
+    with pytest.raises(TypeError, match=r"Odd.ids: set\[int\] has no form as a column"):
+        arrow_types.columns_of(Odd)
+
+
+def test_rungs_come_back_as_rungs() -> None:
+    kept = [Directive(0, 1, Representation.RAW, reason="x")]
+    (back,) = arrow_types.from_table(Directive, arrow_types.to_table(Directive, kept))
+    assert back.representation is Representation.RAW
