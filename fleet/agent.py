@@ -23,6 +23,7 @@ from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
+from sortie.perception.motion import Tracks
 from sortie.perception.types import Capture
 from sortie.policies.contract import (
     Descriptor,
@@ -61,6 +62,8 @@ class Senses(Protocol):
     def platform(self) -> Platform: ...
     def task(self) -> Task: ...
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int: ...
+    def perceived(self, capture: Capture) -> None: ...
+    def tracks_in(self, capture: Capture, roi: Disc | None) -> Tracks | None: ...
 
 
 class Modem(Protocol):
@@ -253,15 +256,17 @@ class Agent:
         if not self.status.airborne:
             return
         self.latest = capture = cast(Capture, computed.value)
+        self._senses.perceived(capture)
         handshake_bytes = self._handshake_bytes()
         if handshake_bytes:
             self._shake_hands(handshake_bytes, capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
+        tracks_in = partial(self._senses.tracks_in, capture)
         made: dict[tuple[Any, ...], Payload | None] = {}  # what goes to several peers is made once
         for directive in self._gate.due(self._env.now):
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
-                made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes)
+                made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes, tracks_in)
             payload = made[what]
             if payload is not None:
                 self.status.work.payload_bytes += payload.size_bytes

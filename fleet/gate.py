@@ -12,6 +12,7 @@ from typing import NamedTuple
 from sortie.fleet import tiles
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
+from sortie.perception.motion import Tracks
 from sortie.policies.contract import Directive, Disc, Representation
 from sortie.scenarios.representation import BOXES, NAME_OF
 
@@ -21,10 +22,13 @@ HEADER_BYTES = 40
 _EPSILON_S = 1e-6
 # members of an enumeration are slow to look up
 _NONE, _FEATURES, _RAW = Representation.NONE, Representation.FEATURES, Representation.RAW
+_TRACKS = Representation.TRACKS
 _RELIABLE = tuple(rung in BOXES for rung in Representation)
 
 CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
+TracksIn = Callable[[Disc | None], Tracks | None]
+"""What the drone's own tracker sends of a region; None where it has no tracker."""
 
 
 class Payload(NamedTuple):
@@ -42,6 +46,8 @@ class Payload(NamedTuple):
     """Cells of a tile, 0 where the payload is one sample."""
     tile_bytes: int | None = None
     """Bytes of a tile, None where the payload is one sample."""
+    tracks: Tracks | None = None
+    """The tracks that it carries, as they are read from its bytes; None where it carries none, or no tracker runs."""
 
     @property
     def reliable(self) -> bool:
@@ -56,13 +62,17 @@ def make_payload(
     est_yaw_rad: float,
     count_boxes: CountBoxes,
     tile_limit_bytes: int | None = None,
+    tracks_in: TracksIn | None = None,
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
-    Args: `tile_limit_bytes`: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
+    Args:
+        tile_limit_bytes: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
+        tracks_in: gives the tracks of a region that the drone sends; without a tracker, boxes are counted in their place.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
+    tracks = None
     if rung == _NONE:
         return None
     if rung == _FEATURES:
@@ -73,11 +83,13 @@ def make_payload(
             t = tiles.cut(cells, tile_limit_bytes)
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
+    elif rung == _TRACKS and tracks_in is not None and (tracks := tracks_in(roi)) is not None:
+        boxes = len(tracks)
     elif rung != _RAW:
         boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
     size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes)
-    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes)
+    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks)
 
 
 class Gate:

@@ -31,6 +31,7 @@ from sortie.perception.lateness import (
     within,
 )
 from sortie.perception.metrics.ap import best_first, rivals, standing
+from sortie.perception.tracking.following import boxes_of, motion_of, motion_of_boxes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 
@@ -69,13 +70,23 @@ class SourceBoxes:
     """[n] variance of each place along each axis at the fusion, after that move. NaN or None: by the age."""
 
 
-def source_of(share: Share, alone: Boxes) -> SourceBoxes:
-    """The boxes in a share, given the sender's own boxes `alone`, best first."""
+def source_of(share: Share, alone: Boxes | None) -> SourceBoxes:
+    """The boxes in a share, and how they move: tracks by their own velocity, boxes by that of the receiver's tracks of them.
+
+    Args: `alone`: the sender's own boxes, best first; None where the share brings its own (`Share.is_detected`).
+    """
+    where = share.weight, share.capture.est_pose, share.roi
+    tracks, age_s = share.tracks, share.age_s
+    if alone is None:
+        assert tracks is not None  # noqa: S101 (what `is_detected` says)
+        cut = len(tracks) >= budget.MAX_TRACKS
+        return SourceBoxes(boxes_of(tracks), *where, cut, age_s, *motion_of(tracks, age_s))
     boxes, truncated = alone.inside(share.roi), False
     if share.representation == "tracks":
         truncated = len(boxes) > budget.MAX_TRACKS
         boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))
-    return SourceBoxes(boxes, share.weight, share.capture.est_pose, share.roi, truncated, share.age_s)
+    motion = (None, None) if tracks is None else motion_of_boxes(boxes, share.capture.t_s, age_s, tracks)
+    return SourceBoxes(boxes, *where, truncated, age_s, *motion)
 
 
 def sendable(boxes: Boxes) -> Boxes:

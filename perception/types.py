@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.geometry import to_world
+from sortie.perception.motion import Tracks
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
 
@@ -63,11 +64,18 @@ class Share(NamedTuple):
     """Ranks (0 the best) of the cells that were sent and did not arrive."""
     age_s: float = 0.0
     """From the capture to the fusion, as the receiver knows it. What it leaves of a share is in `perception.lateness`."""
+    tracks: Tracks | None = None
+    """Of a payload of tracks: the tracks that came. Of detections: the receiver's own tracks, which say how late boxes move."""
 
     @property
     def is_map(self) -> bool:
         """Whether it holds feature cells rather than boxes."""
         return self.representation in MAP_NAMES
+
+    @property
+    def is_detected(self) -> bool:
+        """Whether it holds boxes that a detector finds in its capture; tracks bring their own."""
+        return not self.is_map and (self.representation != "tracks" or self.tracks is None)
 
 
 @dataclass(frozen=True, slots=True)

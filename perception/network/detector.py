@@ -128,10 +128,10 @@ class TorchDetector:
             jobs = [(ego, ()) for ego, _ in jobs]
         elif self._fusion.shares == "features":
             jobs = [(ego, weighed(ego, shares)) for ego, shares in jobs]
-        seen = [c for ego, shares in jobs for c in (ego, *(s.capture for s in shares))]
+        seen = [c for ego, shares in jobs for c in (ego, *(s.capture for s in shares if s.is_map or s.is_detected))]
         known = self._encode([c for c in seen if c.looked])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        look = {s.capture for s in shared if not s.is_map}
+        look = {s.capture for s in shared if s.is_detected}
         alone = [ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
         look |= {ego for ego in alone if ego.looked}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
@@ -330,12 +330,13 @@ class TorchDetector:
             lies, part = self._map_pose(share, now), _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)
-            said = SourceBoxes(self._place(out, lies), share.weight, lies, part[1], cut, share.age_s)
-        else:
-            alone = known[share.capture].boxes
-            assert alone is not None  # noqa: S101 (requested with the job)
-            said = source_of(share, alone.result())
-        return replace(said, boxes=self._sendable(said.boxes))
+            boxes = self._sendable(self._place(out, lies))
+            return SourceBoxes(boxes, share.weight, lies, part[1], cut, share.age_s)
+        if not share.is_detected:
+            return source_of(share, None)
+        alone = known[share.capture].boxes
+        assert alone is not None  # noqa: S101 (requested with the job)
+        return source_of(share, self._sendable(alone.result()))
 
     def _sendable(self, boxes: Boxes) -> Boxes:
         """Those of a drone's boxes that it sends: in late fusion only confident ones."""

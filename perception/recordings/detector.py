@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,8 +113,9 @@ class RecordedDetector:
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)
 
     def _source(self, share: Share) -> SourceBoxes:
-        said = source_of(share, self._alone(share.capture, self._pose(share.capture)))
-        return replace(said, boxes=self._sendable(said.boxes))
+        if not share.is_detected:
+            return source_of(share, None)
+        return source_of(share, self._sendable(self._alone(share.capture, self._pose(share.capture))))
 
     def _sendable(self, boxes: Boxes) -> Boxes:
         """Those of a drone's boxes that it sends: in late fusion only confident ones."""

@@ -169,14 +169,16 @@ class SurrogateDetector:
     # --- one batch ---------------------------------------------------------------------------------
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
-        late = {s.capture: None for _, shares, _ in jobs for s in shares if not s.is_map and s.weight > 0.0}
+        late = {s.capture: None for _, shares, _ in jobs for s in shares if s.is_detected and s.weight > 0.0}
         leads = {m: lead for m, (ego, shares, _) in enumerate(jobs) if not ego.looked and (lead := lead_of(shares))}
         queries: list[Job] = [(ego, shares) for ego, shares, _ in jobs]
         for m, lead in leads.items():
             rest = [s for s in queries[m][1] if s is not lead]
             queries[m] = lead.capture, [s._replace(weight=s.weight / lead.weight) for s in rest]
         queries += [(c, ()) for c in late]
-        captures = list(dict.fromkeys(c for ego, shares in queries for c in (ego, *(s.capture for s in shares))))
+        captures = list(
+            dict.fromkeys(c for ego, shares in queries for c in (ego, *(s.capture for s in shares if s.is_map)))
+        )
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
         looks = self._eyes.look(fleet)
@@ -196,7 +198,7 @@ class SurrogateDetector:
             led = Led(list(leads), FeatureShares.of([(s.capture, [s]) for s in leads.values()], column))
         fused = self._fuse(exchange, looks, fleet, confidence, draws, led)
         blind = [m for m, (ego, _, _) in enumerate(jobs) if not ego.looked]
-        if not late and not blind:
+        if not blind and all(s.is_map or s.weight <= 0.0 for _, shares, _ in jobs for s in shares):
             return fused
         boxes = list(fused)
         for m in blind:
@@ -206,7 +208,11 @@ class SurrogateDetector:
         with_maps = (exchange.arrived[: len(jobs)].sum(axis=1) > 0).tolist()
         sources = []
         for m, (own, (ego, shares, _), f) in enumerate(zip(boxes, jobs, with_maps, strict=False)):
-            others = [source_of(s, alone[s.capture]) for s in shares if not s.is_map and s.weight > 0.0]
+            others = [
+                source_of(s, alone.get(s.capture) if s.is_detected else None)
+                for s in shares
+                if not s.is_map and s.weight > 0.0
+            ]
             sources.append(EgoSources.of(ego, shares, own, f or m in leads, others))
         out = joined_many(sources, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))

@@ -6,13 +6,15 @@ Free of torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.lateness import SIGMA0_M
 from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, predicted
 from sortie.perception.tracking.association import GATE, assigned
-from sortie.perception.tracking.tracker import BOX_VARIANCE_M2
+from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S
 from sortie.perception.types import Boxes
 
 CUE_VARIANCE_M2, CUE_SPEED_VARIANCE = 1.0**2, 1.0**2
@@ -25,14 +27,21 @@ Cue = tuple[float, float, float, float]
 """Where a target is believed to be, and its velocity: x, y, vx, vy, ENU."""
 
 
+def boxes_of(tracks: Tracks) -> Boxes:
+    """Tracks as boxes, each at its own time."""
+    return Boxes(tracks.xy_m, tracks.size_m, tracks.yaw_rad, tracks.score).single()
+
+
 def motion_of(tracks: Tracks, age_s: float) -> tuple[Floats, Floats]:
     """Velocity [n, 2] with which tracks move on, and their variance of position [n] when they are older by `age_s`.
 
-    A track whose speed is not significant stands: it moves by nothing, and its position gets no less certain.
+    A track whose speed is not significant stands: it moves by nothing, and its position gets no less certain. One that
+    moves is as certain as a fresh box was when it was last seen.
     """
+    late_s = age_s + tracks.t_s - tracks.seen_s
+    spread = tracks.covariance[:, 2] * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3.0
     moves = tracks.moves
-    later = predicted(tracks, tracks.t_s + age_s).covariance[:, 0]
-    return np.where(moves[:, None], tracks.velocity_mps, 0.0), np.where(moves, later, tracks.covariance[:, 0])
+    return np.where(moves[:, None], tracks.velocity_mps, 0.0), SIGMA0_M**2 + np.where(moves, spread, 0.0)
 
 
 def motion_of_boxes(boxes: Boxes, t_s: float, age_s: float, tracks: Tracks) -> tuple[Floats, Floats]:
@@ -50,10 +59,7 @@ def motion_of_boxes(boxes: Boxes, t_s: float, age_s: float, tracks: Tracks) -> t
         one,
     )
     here = known.take(i)
-    moves = here.moves
-    velocity[j] = np.where(moves[:, None], here.velocity_mps, 0.0)
-    spread = here.covariance[:, 2] * age_s**2 + ACCELERATION_DENSITY * age_s**3 / 3.0
-    variance[j] = BOX_VARIANCE_M2 + np.where(moves, spread, 0.0)
+    velocity[j], variance[j] = motion_of(replace(here, seen_s=here.t_s), age_s)  # it is the box that is so old
     return velocity, variance
 
 
@@ -61,7 +67,7 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
     """Which targets a drone follows: by target, the id of the confirmed track that is it.
 
     A track becomes a target's when its place and velocity agree with the cue, one track to each target at most. It stays
-    the target's while it lives and its place agrees.
+    the target's while it lives, had a box within `COAST_S`, and its place agrees.
 
     Args:
         tracks: all tracks of the drone.
@@ -69,7 +75,7 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
         before: what was followed until now, as returned.
         t_s: now.
     """
-    now = predicted(tracks.take(tracks.confirmed), t_s)
+    now = predicted(tracks.take(tracks.confirmed & (t_s - tracks.seen_s <= COAST_S)), t_s)
     row = {track: k for k, track in enumerate(now.id.tolist())}
     spread = now.covariance + np.array([CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE])
     out: dict[int, int] = {}

@@ -55,6 +55,12 @@ class Perception(Section):
     sample_rate_hz: float = Field(
         2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
     )
+    tracking_rate_hz: float = Field(
+        2.0,
+        gt=0,
+        le=10,
+        description="How often a drone's tracker takes in the drone's own detections; at scored frames, where there are enough.",
+    )
     compute_delay_s: float = Field(0.03, ge=0, le=5, description="From sensing to features ready to send.")
     fusion_delay_s: float = Field(0.095, ge=0, le=5, description="From a frame's begin to its fusion and scoring.")
     max_age_s: float = Field(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from typing import Any
 
@@ -109,6 +110,21 @@ class Scenario(Section):
         share = min(1.0, self.perception.sample_rate_hz / self.context.rate_hz)
         before = [math.floor((frame - 1) * share + 1e-9) for frame in range(self.frames + 1)]
         return [frame for frame in range(self.frames) if before[frame + 1] > before[frame]]
+
+    @property
+    def tracked_frames(self) -> list[int]:
+        """The frames from which trackers take in a look, `perception.tracking_rate_hz` of them a second.
+
+        One in each period: the first scored frame in it, where images are computed anyway, or else its first frame.
+        """
+        each = max(1.0, self.context.rate_hz / self.perception.tracking_rate_hz)
+        scored = self.scored_frames
+        frames = []
+        for k in range(math.ceil(self.frames / each - 1e-9)):
+            first, last = math.ceil(k * each - 1e-9), math.ceil((k + 1) * each - 1e-9)
+            at = bisect_left(scored, first)
+            frames.append(scored[at] if at < len(scored) and scored[at] < last else first)
+        return frames
 
 
 def json_schema() -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 from sortie.fleet.agent import Task
@@ -21,14 +21,13 @@ class MissionNow(NamedTuple):
     """Number of the target, -1 where there is none. It is the car's id in the scene."""
     target_xy: tuple[float, float] | None
 
-    def task(self, own_xy_m: Sequence[float], footprint_m: float) -> Task:
-        """What a drone at `own_xy_m` is to do; it names the target while it tracks it and has it in its footprint."""
-        targets: tuple[int, ...] = ()
-        if self.phase == "track" and self.target_xy is not None:
-            dx_m, dy_m = self.target_xy[0] - own_xy_m[0], self.target_xy[1] - own_xy_m[1]
-            if dx_m * dx_m + dy_m * dy_m <= footprint_m * footprint_m:
-                targets = (self.target,)
-        return Task(PHASE_OF[self.phase], self.region, targets)
+    def task(self, follows: Callable[[int, tuple[float, float]], bool]) -> Task:
+        """What a drone is to do. In phase `track` it names the target while it has a track of it.
+
+        Args: `follows` says whether the drone follows a target, by its number and where the ground station believes it is.
+        """
+        named = self.phase == "track" and self.target_xy is not None and follows(self.target, self.target_xy)
+        return Task(PHASE_OF[self.phase], self.region, (self.target,) if named else ())
 
 
 class MissionPlan:

@@ -12,6 +12,7 @@ import simpy
 from sortie.fleet.agent import Agent
 from sortie.fleet.memory import Received
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
+from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
@@ -25,7 +26,8 @@ def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Shar
     """
     payload = received.payload
     name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
-    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s)
+    tracks = payload.tracks
+    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s, tracks)
 
 
 Job = tuple[Capture, list[Share]]
@@ -67,13 +69,17 @@ class Scorer:
         agents: Sequence[Agent],
         recorder: Recorder,
         planned: Callable[[int, int], Capture],
+        own_tracks: Callable[[int], Tracks],
     ) -> None:
-        """Args: `planned` gives where a drone is in a frame, or would be had it not left the air."""
+        """Args:
+        planned: where a drone is in a frame, or would be had it not left the air.
+        own_tracks: what a drone's own tracker follows.
+        """
         self._env, self._scenario, self._detector = env, scenario, detector
         # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
-        self._agents, self._recorder, self._planned = agents, recorder, planned
+        self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
@@ -151,7 +157,11 @@ class Scorer:
             if not held:
                 return None
             look = here._replace(looked=False)
-        return look, [as_share(r, memory.trust_in(r.capture.drone), now_s - r.capture.t_s) for r in held]
+        shares = [as_share(r, memory.trust_in(r.capture.drone), now_s - r.capture.t_s) for r in held]
+        if any(s.representation == "detections" for s in shares):
+            own = self._own_tracks(agent.drone)
+            shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]
+        return look, shares
 
 
 def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:

@@ -22,6 +22,7 @@ from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, make_detector
 from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
@@ -31,8 +32,10 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
+from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
 from sortie.sim.identity import code_version, name_of, own_files
@@ -163,13 +166,20 @@ def build(
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
     detector = detector_of(scene, scenario.perception, seed, replication)
     count_boxes = None if detector is None else detector.count_boxes
+
+    def capture_of(drone: int, frame: int) -> Capture:
+        return world.sensed(drone, frame).capture
+
+    ahead = captures_ahead(scenario, capture_of)
+    own_boxes: OwnBoxesOf = TargetSeen(scene) if detector is None else OwnBoxes(detector, ahead)
+    tracking = FleetTracking(scenario, own_boxes)
     agents = [
         Agent(
             env,
             memories[i],
             rules=rules,
             policy=pilots[i],
-            senses=OwnSenses(world, i, count_boxes),
+            senses=OwnSenses(world, i, tracking, count_boxes),
             modem=transport.modem(i),
             gate=Gate(),
             log=notes,
@@ -181,7 +191,7 @@ def build(
     ]
     scorer = None
     if detector is not None:
-        scorer = Scorer(env, scenario, detector, agents, recorder, lambda i, frame: world.sensed(i, frame).capture)
+        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks)
     schedule(scenario, world, transport, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(

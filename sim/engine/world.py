@@ -24,13 +24,16 @@ from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.plane import DroneStatus
 from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.tracking.wire import content
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
 from sortie.radio import Air
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.tracking import FleetTracking
 from sortie.sim.results.record import Recorder
 
 NAN = float("nan")
@@ -263,10 +266,14 @@ class OwnSenses:
     """One drone's own sensors (sortie.fleet.agent.Senses); it shows the agent no other drone."""
 
     def __init__(
-        self, world: World, drone: int, count_boxes: Callable[[Capture, Disc | None], int] | None = None
+        self,
+        world: World,
+        drone: int,
+        tracking: FleetTracking,
+        count_boxes: Callable[[Capture, Disc | None], int] | None = None,
     ) -> None:
-        """Args: `count_boxes` counts what the detector reports; None counts the cars in range."""
-        self._world, self._drone, self._count_boxes = world, drone, count_boxes
+        """Args: `count_boxes` counts what the detector reports; None counts the cars in range, and there are no tracks."""
+        self._world, self._drone, self._tracking, self._count_boxes = world, drone, tracking, count_boxes
         self._sensed = world.sensed(drone, 0)
 
     def sense(self, frame: int) -> Sensed:
@@ -277,15 +284,22 @@ class OwnSenses:
         return self._world.platform(self._drone)
 
     def task(self) -> Task:
-        sensed = self._sensed
-        world = self._world
+        now_s, world = self._sensed.capture.t_s, self._world
         now = world.now[world.plan.group_of[self._drone]]
-        return now.task(sensed.capture.position_m, sensed.footprint_radius_m)
+        return now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:
             return self._count_boxes(capture, roi)
         return cars_in_reach(self._world.scene, capture, roi)
+
+    def perceived(self, capture: Capture) -> None:
+        self._tracking.perceived(capture)
+
+    def tracks_in(self, capture: Capture, roi: Disc | None) -> Tracks | None:
+        if self._count_boxes is None:
+            return None
+        return content(self._tracking.tracks(self._drone), roi, capture.est_position_m, capture.t_s)
 
 
 def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:

@@ -22,6 +22,7 @@ from sortie.policies.contract import Disc
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.tracking import FleetTracking, TargetSeen
 from sortie.sim.engine.world import cars_in_reach, route_bounds
 
 
@@ -73,6 +74,7 @@ class ReplaySenses:
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
         self._plan = MissionPlan(mission, scenario.fleet.drones)
+        self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace
         self._first = round(begin_s / scenario.frame_s)
         self._sensed = self._flight.at(self._first)[drone]
@@ -94,10 +96,17 @@ class ReplaySenses:
 
     def task(self) -> Task:
         """Phase, region and targets."""
-        capture = self._sensed.capture
-        now = self._plan.at(capture.t_s)[self._plan.group_of[self._drone]]
-        return now.task(capture.position_m, self._sensed.footprint_radius_m)
+        now_s = self._sensed.capture.t_s
+        now = self._plan.at(now_s)[self._plan.group_of[self._drone]]
+        return now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """Cars in range: no detector runs here."""
         return cars_in_reach(self._scene, capture, roi)
+
+    def perceived(self, capture: Capture) -> None:
+        """The drone looked: it finds a target that it has in view."""
+        self._tracking.perceived(capture)
+
+    def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
+        """No tracks: no detector runs here."""

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.lateness import SIGMA0_M
 from sortie.perception.metrics.assignment import least_cost
 from sortie.perception.motion import ACCELERATION_DENSITY, MOVES_AT, Tracks, predicted
 from sortie.perception.tracking.following import followed, motion_of, motion_of_boxes
@@ -162,8 +163,8 @@ def test_received_tracks_go_on_and_what_stands_stays() -> None:
     tracks = driving()
     velocity, variance = motion_of(tracks, 1.0)
     np.testing.assert_allclose(velocity, [[8.0, 0.0], [0.0, 0.0]], atol=0.1)
-    assert variance[0] > tracks.covariance[0, 0]
-    assert variance[1] == tracks.covariance[1, 0]
+    assert variance[0] > 1.5 * variance[1]
+    assert variance[1] == SIGMA0_M**2
     assert (tracks.moves == (np.hypot(*tracks.velocity_mps.T) > MOVES_AT * np.sqrt(tracks.covariance[:, 2]))).all()
 
 

@@ -39,6 +39,7 @@ BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends d
 FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
 OTHER = "mission.more_targets=[{waypoints_m: [[0, 0], [60, 0]], speed_mps: 3}]"
 GROUP = "mission.groups=[{drones: [1, 2], phases: [{phase: search}, {at_s: 2, phase: track, target: 1, region: {radius_m: 32}}]}]"
+TRACK = "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]"
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
@@ -203,6 +204,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "context.trust": ("false", (LIE,)),
     "perception.detector": ("torch", ("duration_s=4",)),
     "perception.compute_delay_s": ("0.05", ()),
+    "perception.tracking_rate_hz": ("5", (TRACK,)),
     "policy.name": ("deputies", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),

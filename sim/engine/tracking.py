@@ -1,0 +1,168 @@
+"""The trackers of a sortie: what each drone follows, in flight.
+
+A drone's tracker takes in its own detections of some of its looks, `Scenario.tracked_frames`. They are computed when
+somebody needs tracks: a payload of tracks, late boxes that are to be moved, or a mission with a target. Looks older than
+`WARM_UP_S` are not made up for then.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sortie.perception.motion import Tracks
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.traffic import TARGET_SIZE_M
+from sortie.perception.surrogate.line_of_sight import HeightField
+from sortie.perception.tracking.following import followed
+from sortie.perception.tracking.tracker import step
+from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.schema import Scenario
+from sortie.sim.results.mission_outcome import sees_ground
+
+WARM_UP_S = 4.0
+"""Longer than a track is confirmed in and coasts, so that what a tracker follows does not depend on when it began."""
+CUE_S = 0.5
+"""A target's velocity is the difference of the ground station's cues over this time."""
+CUE_MOST_S = 2.5
+"""... of this time at most, where cues come more rarely."""
+AHEAD = 100
+"""Captures that are expected next and computed together."""
+_INSTANT_S = 1e-6
+
+OwnBoxesOf = Callable[[Sequence[Capture]], Sequence[Boxes]]
+
+
+class _Followed(NamedTuple):
+    """What a drone followed when that was last judged."""
+
+    target: int
+    tracks: dict[int, int]
+    """By target, the id of its track."""
+    judged_by: Tracks | None
+    at_s: float
+
+
+class FleetTracking:
+    """Every drone's tracker."""
+
+    def __init__(self, scenario: Scenario, own_boxes: OwnBoxesOf) -> None:
+        """Args: `own_boxes` gives each capture's detections by its drone alone."""
+        n = scenario.fleet.drones
+        self._looks_s = [frame * scenario.frame_s for frame in scenario.tracked_frames]
+        self._own_boxes = own_boxes
+        self._taken = [0] * n
+        self._waiting: deque[Capture] = deque()
+        self._tracks, self._next_id = Tracks.empty(), np.zeros(n, np.int64)
+        self._of: dict[int, Tracks] = {}
+        self._cues: dict[int, deque[tuple[float, tuple[float, float]]]] = {}
+        self._followed = [_Followed(-1, {}, None, -math.inf)] * n
+
+    def perceived(self, capture: Capture) -> None:
+        """A drone's perception has worked on a capture; its tracker takes it in if a look is due."""
+        drone, t_s = capture.drone, capture.t_s
+        due = self._taken[drone]
+        if due < len(self._looks_s) and t_s >= self._looks_s[due] - _INSTANT_S:
+            self._taken[drone] = bisect_right(self._looks_s, t_s + _INSTANT_S)
+            self._waiting.append(capture)
+            while self._waiting[0].t_s < t_s - WARM_UP_S:
+                self._waiting.popleft()
+
+    def tracks(self, drone: int) -> Tracks:
+        """What a drone follows, after the last look of its tracker; tentative tracks too."""
+        if self._waiting:
+            self._catch_up()
+        if drone not in self._of:
+            self._of[drone] = self._tracks.take(self._tracks.owner == drone)
+        return self._of[drone]
+
+    def follows(self, drone: int, target: int, cue_m: tuple[float, float], now_s: float) -> bool:
+        """Whether a drone has a confirmed track of a target, by the ground station's cue: where it is believed to be.
+
+        It is judged anew after a look of the drone's tracker, and `CUE_S` after the last time.
+        """
+        cues = self._cues.setdefault(target, deque())
+        if not cues or cues[-1][0] < now_s - _INSTANT_S:
+            cues.append((now_s, cue_m))
+        while len(cues) > 2 and cues[1][0] <= now_s - CUE_S + _INSTANT_S:
+            cues.popleft()
+        since_s, (x_m, y_m) = cues[0]
+        lasts_s = now_s - since_s
+        if not CUE_S - _INSTANT_S <= lasts_s <= CUE_MOST_S:
+            return False
+        tracks, before = self.tracks(drone), self._followed[drone]
+        if tracks is not before.judged_by or target != before.target or now_s >= before.at_s + CUE_S - _INSTANT_S:
+            cue = (*cue_m, (cue_m[0] - x_m) / lasts_s, (cue_m[1] - y_m) / lasts_s)
+            is_ = followed(tracks, {target: cue}, before.tracks, now_s)
+            before = self._followed[drone] = _Followed(target, is_, tracks, now_s)
+        return target in before.tracks
+
+    def _catch_up(self) -> None:
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        self._of.clear()
+        rounds: list[dict[int, tuple[Capture, Boxes]]] = []  # each holds one look of a drone at most, in order of time
+        behind = dict.fromkeys(range(len(self._taken)), 0)
+        for capture, boxes in zip(waiting, self._own_boxes(waiting), strict=True):
+            k = behind[capture.drone]
+            behind[capture.drone] += 1
+            if k == len(rounds):
+                rounds.append({})
+            rounds[k][capture.drone] = capture, boxes
+        for looks in rounds:
+            looks_s = np.full(len(self._taken), np.nan)
+            looks_s[list(looks)] = [capture.t_s for capture, _ in looks.values()]
+            seen = [boxes for _, boxes in looks.values()]
+            owner = np.repeat(list(looks), [len(boxes) for boxes in seen])
+            self._tracks, self._next_id, _ = step(self._tracks, Boxes.join(seen), owner, looks_s, self._next_id)
+
+
+def captures_ahead(
+    scenario: Scenario, capture_of: Callable[[int, int], Capture]
+) -> Callable[[float], Iterable[Capture]]:
+    """The next captures that trackers take in, if all drones fly on and perceive in every frame.
+
+    Args:
+        capture_of: a drone's capture in a frame.
+    """
+    frames, n = scenario.tracked_frames, scenario.fleet.drones
+    starts_s = [frame * scenario.frame_s for frame in frames]
+
+    def coming(after_s: float) -> Iterable[Capture]:
+        first = bisect_right(starts_s, after_s + _INSTANT_S)
+        return (capture_of(drone, frame) for frame in frames[first : first + max(1, AHEAD // n)] for drone in range(n))
+
+    return coming
+
+
+class TargetSeen:
+    """Own detections where no detector flies: a drone finds a target, and nothing else, wherever it has it in view.
+
+    In view: in the picture of one of its cameras, within its feature map, and not hidden by houses or trees. It is found
+    where it is, with a score of 1.
+    """
+
+    def __init__(self, scene: SceneModel) -> None:
+        self._scene = scene
+
+    def __call__(self, captures: Sequence[Capture]) -> list[Boxes]:
+        """The targets that each capture shows."""
+        return [self._seen(capture) for capture in captures]
+
+    @cached_property
+    def _heights(self) -> HeightField:
+        return HeightField(self._scene)
+
+    def _seen(self, capture: Capture) -> Boxes:
+        pose = np.array([path.pose(capture.t_s) for path in self._scene.targets])
+        position, attitude = np.array([capture.position_m]), np.array([capture.orientation_xyzw])
+        seen = sees_ground(pose[None, :, :2], position, attitude)[0]
+        seen &= self._heights.seen(pose[:, 0], pose[:, 1], np.repeat(position, len(pose), axis=0))
+        size = np.tile(TARGET_SIZE_M[:2], (len(pose), 1))
+        return Boxes(pose[:, :2], size, pose[:, 2], np.ones(len(pose))).take(seen)
