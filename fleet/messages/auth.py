@@ -65,15 +65,28 @@ class Dropped:
     detail: str
 
 
+class Unsealed(NamedTuple):
+    """The content of a datagram with a valid tag."""
+
+    content: bytes
+    key_id: int
+    counter: int
+
+
 @lru_cache(maxsize=256)  # its sender and whoever hears it compute the same one
 def tag(key: bytes, stamped: bytes) -> bytes:
     """HMAC-SHA256 (RFC 2104), truncated to its first 16 B (RFC 2104 §5 allows half the hash)."""
+    return _tag(key, stamped)
+
+
+def _tag(key: bytes, stamped: bytes) -> bytes:
+    """`tag`, computed anew."""
     mac = _keyed(key).copy()
     mac.update(stamped)
     return mac.digest()[:TAG_BYTES]
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _keyed(key: bytes) -> hmac.HMAC:
     """The key hashed in already: a copy of this and the message take half the time of both together."""
     return hmac.new(key, digestmod="sha256")
@@ -110,7 +123,26 @@ class Sealer:
             raise OverflowError("the counter is used up: take a new key")
         self.counter += 1
         stamped = payload + _STAMP.pack(self.key_id, self.counter)
-        return stamped + tag(self._key, stamped)
+        return stamped + _tag_of(self._key, stamped)
+
+
+def _tag_of(key: bytes, stamped: bytes) -> bytes:
+    """The tag, from the cache if others may compute the same: payloads have one receiver and would fill the memory."""
+    return tag(key, stamped) if len(stamped) <= MAX_DESCRIPTOR_BYTES + _STAMP.size else _tag(key, stamped)
+
+
+def unseal(data: bytes, keys: Mapping[int, bytes]) -> Unsealed | Dropped:
+    """Check the tag of a sealed datagram. Whether its counter is new is the receiver's own question."""
+    size = len(data) - TRAILER_BYTES
+    if size < 0:
+        return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {TRAILER_BYTES}")
+    key_id, counter = _STAMP.unpack_from(data, size)
+    key = keys.get(key_id)
+    if key is None:
+        return Dropped(DropReason.UNKNOWN_KEY, f"key id {key_id}")
+    if not hmac.compare_digest(_tag_of(key, data[:-TAG_BYTES]), data[-TAG_BYTES:]):
+        return Dropped(DropReason.FORGED, f"the tag does not fit key {key_id}")
+    return Unsealed(data[:size], key_id, counter)
 
 
 def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dropped:
@@ -131,13 +163,10 @@ def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dro
         return Dropped(DropReason.TRUNCATED, f"{len(data)} B, must be at least {least + trailer}")
     key_id, counter, payload = None, 0, data
     if keys is not None:
-        key_id, counter = _STAMP.unpack_from(data, size)
-        key = keys.get(key_id)
-        if key is None:
-            return Dropped(DropReason.UNKNOWN_KEY, f"key id {key_id}")
-        if not hmac.compare_digest(tag(key, data[:-TAG_BYTES]), data[-TAG_BYTES:]):
-            return Dropped(DropReason.FORGED, f"the tag does not fit key {key_id}")
-        payload = data[:size]
+        unsealed = unseal(data, keys)
+        if isinstance(unsealed, Dropped):
+            return unsealed
+        payload, key_id, counter = unsealed
     try:
         return Opened(decode_descriptor(payload), key_id, counter)
     except MalformedDatagram as error:

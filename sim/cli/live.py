@@ -41,6 +41,13 @@ def live(
     domain: Annotated[
         int | None, typer.Option(help="DDS domain; default: ROS_DOMAIN_ID, or 0.", min=0, max=MAX_DOMAIN)
     ] = None,
+    key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Master key of the fleet (32 bytes or 64 hex digits; mode 600). Default: SORTIE_KEY, or a random key.",
+        ),
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
     ] = None,
@@ -62,6 +69,7 @@ def live(
     if policy is not None:
         flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
     with user_errors():
+        from sortie.sim.live.seals import find_key
         from sortie.sim.live.session import fly_live
 
     ensure_files(out_file)
@@ -73,6 +81,7 @@ def live(
             loss=loss,
             kill=killed,
             domain=number,
+            key=find_key(key),
             progress=lambda what, done, of: report(what, round(done), round(of)),
         )
     _show(result)

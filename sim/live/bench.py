@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 
-from sortie.fleet.messages.auth import Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind, links
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
 from sortie.sim.live.messages import unpack_bytes
-from sortie.sim.live.node import open_descriptor
 from sortie.sim.live.reports import Count, Report, SinceLastReport
 
 PAYLOAD_DEPTH = 16
@@ -26,16 +23,13 @@ class Bench:
         topics = [CONTEXT, *(Topic(kind, *link) for link in links(drones) for kind in (TopicKind.DIRECTIVE, *PAYLOADS))]
         self._readers = [self._bus.reader(topic, depths.get(topic.kind, PAYLOAD_DEPTH)) for topic in topics]
         self.counts: dict[Topic, Count] = dict.fromkeys(topics, Count())
-        """By topic: bytes of CDR as serialised, payloads without the header of their message."""
-        self.heard: Counter[int] = Counter()
-        """Number of descriptors by their publisher."""
+        """By topic: bytes of CDR as serialised, seals included, payloads without the header of their message."""
         self._began_cpu_s = 0.0
 
     def begin(self) -> None:
         """Start counting from zero."""
         self.take()
         self.counts = dict.fromkeys(self.counts, Count())
-        self.heard.clear()
         self._began_cpu_s = time.process_time()
 
     @property
@@ -61,10 +55,6 @@ class Bench:
         topic = reader.topic
         for cdr in reader.take():
             self.counts[topic] = self.counts[topic].plus(_size(cdr, topic.kind))
-            if topic.kind == TopicKind.CONTEXT:
-                descriptor = open_descriptor(cdr)
-                if isinstance(descriptor, Opened):
-                    self.heard[descriptor.descriptor.agent_id] += 1
 
 
 def _size(cdr: bytes, kind: TopicKind) -> int:

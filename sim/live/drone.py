@@ -21,6 +21,7 @@ from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
 from sortie.sim.live.reports import Failed, Go, Home, Notice, Ready, Report
+from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.results.record import Recorder
 
 POLL_S = 0.02
@@ -39,10 +40,12 @@ class Orders:
     end_s: float
     loss: float
     domain: int
+    secrets: Secrets | None = None
+    """None: the fleet's messages come bare."""
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
-    """The plane's rules on the bus: samples go whole, descriptors in full, and trust is off, since a bus has no data rates."""
+    """The plane's rules on the bus: samples go whole, descriptors in full."""
     return PlaneRules(
         period_s=scenario.frame_s,
         frames=round((end_s - begin_s) / scenario.frame_s),
@@ -52,6 +55,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         hysteresis=scenario.policy.hysteresis,
         compute_delay_s=scenario.perception.compute_delay_s,
         publish_every=scenario.context.publish_every,
+        trust=scenario.context.trust,
     )
 
 
@@ -60,8 +64,9 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the bench handles Ctrl-C and stops every process
     try:
         node = LiveNode(
-            Bus(orders.domain), orders.drone, orders.scenario.fleet.drones, seed=orders.scenario.seed, loss=orders.loss
-        )
+            Bus(orders.domain), Seals(orders.secrets, orders.drone), orders.drone, orders.scenario.fleet.drones,
+            seed=orders.scenario.seed, loss=orders.loss,
+        )  # fmt: skip
         senses = ReplaySenses(orders.scenario, orders.drone, orders.trace, orders.begin_s)
         while not node.all_found(orders.scenario.fleet.drones):
             if pipe.poll(POLL_S):
@@ -98,7 +103,7 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
         modem=node,
         gate=node.gate,
         log=node,
-        sealer=None,
+        sealer=None,  # the node seals what it writes
         phase_s=orders.begin_s + phase_s,
         handshake_bytes=pilot.handshake_bytes,
     )

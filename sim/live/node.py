@@ -5,7 +5,8 @@
                                                      directive in force with every tick, as the paper's node does
     gate         /…/directive → /…/features, compact payloads of the size that `sortie.fleet.gate` gives them
 
-Policy node and gate speak through DDS alone, though they share a process.
+Policy node and gate speak through DDS alone, though they share a process. Every message is sealed where it is written and
+opened where it is read (`sortie.sim.live.seals`). What is refused is counted by its reason.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from sortie.fleet.gate import HEADER_BYTES, Gate, Payload
 from sortie.fleet.memory import PeerMemory
-from sortie.fleet.messages.auth import Dropped, DropReason, Opened, open_datagram
+from sortie.fleet.messages.auth import Dropped, DropReason, Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
 from sortie.fleet.plane import PlaneRules
@@ -29,14 +30,18 @@ from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
-from sortie.sim.live.reports import Count, HealthChange, NewDirective, Report, SinceLastReport
+from sortie.sim.live.reports import Count, HealthChange, NewDirective, Notice, Report, SinceLastReport
+from sortie.sim.live.seals import Seals
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
+DIRECTIVE_DEPTH, PAYLOAD_DEPTH = 16, 4
+"""Samples that a reader stores until they are read. With one, a stranger's sample would push a genuine one out."""
 
 
 class PeerTopics:
@@ -46,8 +51,8 @@ class PeerTopics:
         self.peer = peer
         self.directive = bus.writer(Topic(TopicKind.DIRECTIVE, me, peer))
         self.payload = {kind: bus.writer(Topic(kind, me, peer)) for kind in PAYLOADS}
-        self.ordered = bus.reader(Topic(TopicKind.DIRECTIVE, me, peer))
-        self.incoming = [bus.reader(Topic(kind, peer, me)) for kind in PAYLOADS]
+        self.ordered = bus.reader(Topic(TopicKind.DIRECTIVE, me, peer), DIRECTIVE_DEPTH)
+        self.incoming = [bus.reader(Topic(kind, peer, me), PAYLOAD_DEPTH) for kind in PAYLOADS]
 
     @property
     def writers(self) -> list[Writer]:
@@ -80,9 +85,10 @@ class BusGate(Gate):
 class LiveNode:
     """The nodes of one drone. It is the agent's modem and log."""
 
-    def __init__(self, bus: Bus, drone: int, drones: int, *, seed: int, loss: float) -> None:
+    def __init__(self, bus: Bus, seals: Seals, drone: int, drones: int, *, seed: int, loss: float) -> None:
         """Args: `loss` is the share of others' descriptors that is dropped on arrival, 0 … 1, drawn by link."""
         self.drone = drone
+        self._seals = seals
         self._bus, self._seed, self._loss = bus, seed, loss
         self._context = bus.writer(CONTEXT)
         self._fleet = bus.reader(CONTEXT, MAX_DEPTH)
@@ -134,7 +140,7 @@ class LiveNode:
         """Handle the samples that have arrived, directives first, because the gate may need them at once."""
         for link in list(self._links.values()):
             for cdr in link.ordered.take():
-                self._on_directive(cdr, link.peer)
+                self._on_directive(cdr, link.ordered.topic)
             for reader in link.incoming:
                 for cdr in reader.take():
                     self._on_payload(cdr, reader)
@@ -155,7 +161,7 @@ class LiveNode:
 
     def broadcast(self, datagram: bytes) -> None:
         self._published += 1
-        self._context.write(datagram)
+        self._context.write(self._seals.seal(CONTEXT, datagram))
 
     def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
         """Publish a payload of its exact size: header and directive as they are, zeros for the features."""
@@ -181,7 +187,8 @@ class LiveNode:
         self._new.orders.append(NewDirective(t_s, self.drone, enforced.destination, rung, enforced.rate_hz, reason))
 
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None:
-        """Trust is off here."""
+        why = f": {standing.reason}" if standing.trust < 1.0 else ""
+        self._new.notices.append(Notice(t_s, drone, f"trust in drone {peer} is now {standing.trust:g}{why}"))
 
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
         self.gate.republish()
@@ -189,10 +196,12 @@ class LiveNode:
     # --- what comes in ---------------------------------------------------------------------------
 
     def _on_descriptor(self, cdr: bytes) -> None:
-        heard = open_descriptor(cdr)
+        heard = self._seals.open_descriptor(cdr)
         if isinstance(heard, Opened):
             sender = heard.descriptor.agent_id
             if sender == self.drone:
+                if self._seals.is_forged_self(heard):
+                    self._refuse("descriptor", "in this drone's name", f"counter {heard.counter}")
                 return
             if self._loss and self._loss_stream(sender).random() < self._loss:
                 self._lost += 1
@@ -201,33 +210,72 @@ class LiveNode:
                 self._add_peer(sender)
         refused = self._memory.hear(heard, self._clock.now)
         if isinstance(refused, DropReason):
-            self._refused[f"descriptor {refused}"] += 1
+            self._refuse("descriptor", refused, heard.detail if isinstance(heard, Dropped) else "its counter was used")
         else:
             self._heard += 1
 
-    def _on_directive(self, cdr: bytes, peer: int) -> None:
-        try:
-            directive = decode_directive(cdr)
-        except MalformedDatagram:
-            self._refused["directive malformed"] += 1
+    def _on_directive(self, cdr: bytes, topic: Topic) -> None:
+        opened = self._seals.open(topic, cdr)
+        if isinstance(opened, Dropped):
+            self._refuse("directive", opened.reason, f"for drone {topic.destination}, {opened.detail}")
             return
-        if (directive.source, directive.destination) != (self.drone, peer):
-            self._refused["directive of another link"] += 1
+        try:
+            directive = decode_directive(opened)
+        except MalformedDatagram as error:
+            self._refuse("directive", DropReason.MALFORMED, error.reason)
+            return
+        if (directive.source, directive.destination) != (topic.source, topic.destination):
+            self._refuse("directive", "of another link", f"{directive.source}→{directive.destination}")
             return
         self.gate.apply(directive)
 
     def _on_payload(self, cdr: bytes, reader: Reader) -> None:
-        kind = reader.topic.kind
+        topic = reader.topic
         try:
-            content = unpack_bytes(cdr)
-            self._received[kind] = self._received[kind].plus(len(content))
-            if len(content) < HEADER_BYTES + DIRECTIVE_BYTES or not any(content[:HEADER_BYTES]):
-                return  # a handshake
-            decode_directive(content[HEADER_BYTES : HEADER_BYTES + DIRECTIVE_BYTES])
-        except MalformedDatagram:
-            self._refused["payload malformed"] += 1
+            opened = self._seals.open(topic, unpack_bytes(cdr))
+            if isinstance(opened, Dropped):
+                self._refuse("payload", opened.reason, f"from drone {topic.source}, {opened.detail}")
+                return
+            if any(opened[:HEADER_BYTES]):
+                fault = self._find_fault(opened, topic)
+                if fault is not None:
+                    self._refuse("payload", *fault)
+                    return
+        except (MalformedDatagram, struct.error) as error:
+            self._refuse("payload", DropReason.MALFORMED, str(error))
             return
-        self._new.data_age_s.append(time.time() - _HEADER.unpack_from(content)[0] * 1e-9)
+        self._received[topic.kind] = self._received[topic.kind].plus(len(opened))
+
+    def _find_fault(self, content: bytes, topic: Topic) -> tuple[str, str] | None:
+        """Why a payload is dropped, and the detail; None if it is accepted.
+
+        Its deadline counts from when its features can be ready: its capture, the fleet's compute delay, and the moment
+        within a frame at which drones act.
+        """
+        stamp_ns, sender, *_ = _HEADER.unpack_from(content)
+        directive = decode_directive(content[HEADER_BYTES : HEADER_BYTES + DIRECTIVE_BYTES])
+        if (sender, directive.source, directive.destination) != (topic.source, topic.source, topic.destination):
+            return "of another link", f"{directive.source}→{directive.destination} on {topic.name}"
+        age_s = self._clock_s() - stamp_ns * 1e-9
+        ready_s = self._rules.compute_delay_s + PHASE_SHARE * self._rules.period_s
+        if age_s > ready_s + directive.deadline_s:
+            late_s = age_s - ready_s
+            return "late", f"from drone {sender}, {late_s:.2f} s after it was ready, must be {directive.deadline_s:g} s"
+        if self._memory.trust_in(sender) == 0.0:
+            return "not trusted", f"from drone {sender}"
+        self._new.data_age_s.append(age_s)
+        return None
+
+    def _refuse(self, what: str, reason: str, detail: str) -> None:
+        """Count a refused message; the first of its kind is an event."""
+        kind = f"{what} {reason}".replace("_", " ")
+        if kind not in self._refused:
+            self._new.notices.append(Notice(self._clock.now, self.drone, f"refused a {kind}: {detail}"))
+        self._refused[kind] += 1
+
+    def _clock_s(self) -> float:
+        """The drone's clock, s since 1970."""
+        return self._clock.now + self._memory.status.clock_skew_s
 
     # --- helpers ---------------------------------------------------------------------------------
 
@@ -235,12 +283,16 @@ class LiveNode:
         self._links[peer] = PeerTopics(self._bus, self.drone, peer)
 
     def _publish_directive(self, directive: Directive) -> None:
-        self._sent[TopicKind.DIRECTIVE] = self._sent[TopicKind.DIRECTIVE].plus(DIRECTIVE_BYTES)
-        self._links[directive.destination].directive.write(encode_directive(directive))
+        writer = self._links[directive.destination].directive
+        sealed = self._seals.seal(writer.topic, encode_directive(directive))
+        self._sent[TopicKind.DIRECTIVE] = self._sent[TopicKind.DIRECTIVE].plus(len(sealed))
+        writer.write(sealed)
 
     def _write(self, peer: int, kind: TopicKind, content: bytes) -> None:
-        self._sent[kind] = self._sent[kind].plus(len(content))
-        self._links[peer].payload[kind].write(pack_bytes(content))
+        writer = self._links[peer].payload[kind]
+        sealed = self._seals.seal(writer.topic, content)
+        self._sent[kind] = self._sent[kind].plus(len(sealed))
+        writer.write(pack_bytes(sealed))
 
     def _loss_stream(self, sender: int) -> np.random.Generator:
         if sender not in self._draws:
@@ -255,12 +307,3 @@ class LiveNode:
             if found != self._health.get(peer, LinkHealth.DETACHED):
                 self._health[peer] = found
                 self._new.health.append(HealthChange(now_s, self.drone, peer, found, age_s))
-
-
-def open_descriptor(cdr: bytes) -> Opened | Dropped:
-    """Check a descriptor. DDS fills samples to a multiple of 4 B, and a descriptor may end on 2 B."""
-    whole = open_datagram(cdr, None)
-    if isinstance(whole, Dropped) and cdr[-2:] == b"\0\0":
-        shorter = open_datagram(cdr[:-2], None)
-        return shorter if isinstance(shorter, Opened) else whole
-    return whole

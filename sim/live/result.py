@@ -39,6 +39,8 @@ class DroneResult(NamedTuple):
     heard: int
     dropped_by_loss: int
     refused: dict[str, int]
+    payloads_arrived: int
+    """Accepted payloads, of all kinds."""
     publishes_within_s: float
     """From a frame's begin to its descriptor, at most."""
 
@@ -135,7 +137,8 @@ def summarise(
     context_bytes = context.bytes + directives.bytes
     each = [
         DroneResult(
-            r.drone, 100 * r.cpu_s / max(r.t_s - begin_s, 1e-9), r.published, r.heard, r.lost, r.refused, r.late_s
+            r.drone, 100 * r.cpu_s / max(r.t_s - begin_s, 1e-9), r.published, r.heard, r.lost, r.refused,
+            sum(r.received[kind].samples for kind in PAYLOADS), r.late_s,
         )
         for r in fleet.last.values()
     ]  # fmt: skip

@@ -21,6 +21,7 @@ from sortie.sim.live.context import traces
 from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
 from sortie.sim.live.result import LiveResult, Lost, summarise
+from sortie.sim.live.seals import secrets_of
 
 MAX_DRONES = 20
 """The most processes that this starts on one host."""
@@ -48,6 +49,7 @@ def fly_live(
     loss: float = 0.0,
     kill: tuple[int, float] | None = None,
     domain: int = 0,
+    key: bytes | None = None,
     progress: Progress | None = None,
     begun: Callable[[dict[int, int]], None] | None = None,
 ) -> LiveResult:
@@ -60,6 +62,8 @@ def fly_live(
         loss: share of descriptors that each drone drops on arrival, 0 … 1.
         kill: a drone whose process is killed (SIGKILL), and the scenario's time when.
         domain: DDS domain, as `ROS_DOMAIN_ID`.
+        key: the master key of 32 B, from which every drone gets its secrets; None: a new random one. Unused where the
+            scenario's `context.authentication` is off.
         progress: called with (what is done, how much of it, of how much).
         begun: called with the process ids by drone when the fleet begins to fly.
 
@@ -77,14 +81,16 @@ def fly_live(
         scenario.model_copy(update={"duration_s": end_s}),
         lambda t_s: report_progress("flying for the context", t_s, end_s),
     )
-    drones = scenario.fleet.drones
+    drones, master = scenario.fleet.drones, key or os.urandom(32)
+    authentic = scenario.context.authentication
     bench, fleet = Bench(domain, drones), FleetReports()
     flown: list[_Drone] = []
     lost: list[Lost] = []
     t_s = begin_s
     try:
         for i, trace in enumerate(found):
-            flown.append(_start(Orders(scenario, i, trace, begin_s, end_s, loss, domain)))
+            held = secrets_of(master, i) if authentic else None
+            flown.append(_start(Orders(scenario, i, trace, begin_s, end_s, loss, domain, held)))
         _wait_until_connected(flown, report_progress)
         go = Go(time.monotonic() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9))
         for drone in flown:

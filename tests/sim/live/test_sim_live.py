@@ -29,8 +29,8 @@ from sortie.sim.live import messages
 from sortie.sim.live.bus import LOOPBACK, Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import dds_name, dds_type, pack_bytes, unpack_bytes
-from sortie.sim.live.node import open_descriptor
 from sortie.sim.live.result import LiveResult, overhead_rows
+from sortie.sim.live.seals import Seals
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import MAX_DRONES, fly_live
 
@@ -109,6 +109,7 @@ def test_a_line_that_is_no_field_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_descriptor_that_dds_filled_up_is_the_descriptor() -> None:
+    open_descriptor = Seals(None).open_descriptor
     cdr = encode_descriptor(said_by_hand())
     assert len(cdr) % 4 == 2
     for sample in (cdr, cdr + b"\0\0"):
@@ -194,7 +195,9 @@ def flown() -> Flown:
             assert peer.stdout is not None
             assert peer.stdout.readline() == "listening\n"
             scenario = example(
-                "fleet.drones=3", "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
+                "fleet.drones=3",
+                "context.authentication=false",
+                "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}",
             )
             result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
             told, _ = peer.communicate(timeout=60)

@@ -1,0 +1,153 @@
+"""Seals on the bus: which key a message is sealed with, who can make it, and which messages are refused.
+
+    secret of the fleet     HMAC(master key, "fleet")      every member has it: descriptors and payloads
+    secret of drone 0       HMAC(master key, "drone 0")    only drone 0 has it: directives to its own gate
+    key of a topic          HMAC(secret, topic's name)
+
+The threat model in three sentences. A stranger may read, record, repeat and write messages; without a key nothing that
+he writes is accepted, and nothing that he repeats is accepted twice. A member of the fleet that was captured has the
+fleet's secret, so it can publish false descriptors and payloads; trust judges them, and no member can command the gate
+of another drone. Who has the master key, or may read the memory of a drone's processes, can do all that this drone can.
+
+A sealed message is the message as it is, then 28 B as `sortie.fleet.messages.auth` writes them. The counter is the time in
+nanoseconds since 1970, and rises with every message of a sender. A node that was restarted therefore goes on above its
+old counters, and a node that starts late refuses what was recorded before it started.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import stat
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from sortie.fleet.messages.auth import Dropped, DropReason, Opened, Sealer, open_datagram, unseal
+from sortie.sim.export.telemetry import read_key
+from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
+from sortie.sim.folders import RunError
+
+KEY_VARIABLE = "SORTIE_KEY"
+"""The environment variable with the master key as 64 hexadecimal digits."""
+KEY_ID = 1
+CLOCKS_AGREE_S = 2.0
+"""A node accepts messages that were sealed this long before it started: clocks of drones differ."""
+_MOST_PADDING = 3
+"""DDS fills a sample to a multiple of 4 B."""
+_OWN_COUNTERS = 64
+
+
+class Secrets(NamedTuple):
+    """What one drone has of the master key."""
+
+    fleet: bytes
+    own: bytes
+
+
+def secrets_of(master: bytes, drone: int) -> Secrets:
+    """The secrets of a drone; the master key cannot be computed from them."""
+    return Secrets(_derive(master, "fleet"), _derive(master, f"drone {drone}"))
+
+
+def find_key(path: Path | None) -> bytes:
+    """The master key: from a file that only its owner may read, else from `SORTIE_KEY`, else a new random one.
+
+    Raises:
+        RunError: a file that others may read, or a key that is none.
+    """
+    if path is not None:
+        try:
+            mode = path.stat().st_mode
+        except OSError as error:
+            raise RunError(f"{path}: {error.strerror}") from error
+        if stat.S_IMODE(mode) & 0o077:
+            raise RunError(f"{path}: its mode is {stat.S_IMODE(mode):o}, must be 600: others may read or write the key")
+        return read_key(path)
+    text = os.environ.get(KEY_VARIABLE)
+    if text is None:
+        return secrets.token_bytes(32)
+    try:
+        key = bytes.fromhex(text)
+    except ValueError:
+        key = b""
+    if len(key) != 32:
+        raise RunError(f"{KEY_VARIABLE} has {len(text)} characters, must be 64 hexadecimal digits")
+    return key
+
+
+class Seals:
+    """One node's seals: it seals what it sends, and opens what it receives. Without secrets, messages come bare."""
+
+    def __init__(
+        self, own: Secrets | None, drone: int | None = None, *, clock_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        """
+        Args:
+            own: the drone's secrets; None where authentication is off.
+            drone: its number; None for a node that belongs to no drone, as the bench.
+            clock_ns: nanoseconds since 1970.
+        """
+        self._own, self._drone, self._clock_ns = own, drone, clock_ns
+        self._floor = clock_ns() - round(CLOCKS_AGREE_S * 1e9)
+        self._keys: dict[Topic, bytes] = {}
+        self._sealers: dict[Topic, Sealer] = {}
+        self._highest: dict[Topic, int] = {}
+        self._sent: deque[int] = deque(maxlen=_OWN_COUNTERS)
+
+    def seal(self, topic: Topic, content: bytes) -> bytes:
+        """The content as it goes to a topic."""
+        if self._own is None:
+            return content
+        sealer = self._sealers.get(topic)
+        if sealer is None:
+            sealer = self._sealers[topic] = Sealer(self._key(topic), KEY_ID)
+        sealer.counter = max(sealer.counter, self._clock_ns())
+        sealed = sealer.seal(content)
+        if topic == CONTEXT:
+            self._sent.append(sealer.counter)
+        return sealed
+
+    def open(self, topic: Topic, data: bytes) -> bytes | Dropped:
+        """The content of a directive or payload; `Dropped` says why it is refused."""
+        if self._own is None:
+            return data
+        opened = unseal(data, {KEY_ID: self._key(topic)})
+        if isinstance(opened, Dropped):
+            return opened
+        highest = self._highest.get(topic, self._floor)
+        if opened.counter <= highest:
+            return Dropped(DropReason.REPLAYED, f"counter {opened.counter}, must be above {highest}")
+        self._highest[topic] = opened.counter
+        return opened.content
+
+    def open_descriptor(self, cdr: bytes) -> Opened | Dropped:
+        """Check a descriptor as it came over the bus. Its counter is left to the inbox, which knows its sender."""
+        keys = None if self._own is None else {KEY_ID: self._key(CONTEXT)}
+        whole = open_datagram(cdr, keys)
+        if isinstance(whole, Dropped):
+            for padding in range(1, _MOST_PADDING + 1):
+                if any(cdr[-padding:]):
+                    break
+                shorter = open_datagram(cdr[:-padding], keys)
+                if isinstance(shorter, Opened):
+                    return shorter
+        return whole
+
+    def is_forged_self(self, opened: Opened) -> bool:
+        """Whether a sealed descriptor in this drone's own name was made by somebody else."""
+        return opened.key_id is not None and opened.counter not in self._sent
+
+    def _key(self, topic: Topic) -> bytes:
+        if topic not in self._keys:
+            assert self._own is not None  # noqa: S101 - callers have checked
+            own = topic.kind == TopicKind.DIRECTIVE and topic.source == self._drone
+            self._keys[topic] = _derive(self._own.own if own else self._own.fleet, topic.name)
+        return self._keys[topic]
+
+
+def _derive(key: bytes, name: str) -> bytes:
+    return hmac.digest(key, name.encode(), "sha256")

@@ -1,0 +1,219 @@
+"""Strangers, repeated and late messages, and members that lie: refused, counted and shown, while the drones fly on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import dds_attacker
+import pytest
+from policies_examples import fleet_of
+from sim_examples import example
+from typer.testing import CliRunner
+
+from sortie.fleet.gate import HEADER_BYTES
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.messages.auth import TRAILER_BYTES, Dropped, DropReason, Opened, Sealer
+from sortie.fleet.messages.wire import encode_descriptor, encode_directive
+from sortie.fleet.plane import DroneStatus
+from sortie.policies.contract import Directive, Representation
+from sortie.sim.cli.app import app
+from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
+from sortie.sim.folders import RunError
+from sortie.sim.live.bus import LOOPBACK, Bus
+from sortie.sim.live.drone import rules_of
+from sortie.sim.live.messages import pack_bytes
+from sortie.sim.live.node import _HEADER, LiveNode
+from sortie.sim.live.result import LiveResult
+from sortie.sim.live.seals import KEY_ID, KEY_VARIABLE, Seals, find_key, secrets_of
+from sortie.sim.live.sentences import describe_changes
+from sortie.sim.live.session import fly_live
+
+DOMAIN = os.getpid() % 200 + 21
+MASTER = bytes(range(32))
+ORDER = Topic(TopicKind.DIRECTIVE, 0, 1)
+PAYLOAD = Topic(TopicKind.FEATURES, 0, 1)
+
+
+def seals(drone: int, at_s: float = 1000.0, master: bytes = MASTER) -> Seals:
+    """A drone's seals; its clock stands."""
+    return Seals(secrets_of(master, drone), drone, clock_ns=lambda: round(at_s * 1e9))
+
+
+def test_each_message_is_accepted_once() -> None:
+    sender, receiver = seals(0), seals(1)
+    sealed = sender.seal(PAYLOAD, b"content")
+    assert len(sealed) == len(b"content") + TRAILER_BYTES
+    assert receiver.open(PAYLOAD, sealed) == b"content"
+    again = receiver.open(PAYLOAD, sealed)
+    assert isinstance(again, Dropped)
+    assert again.reason == DropReason.REPLAYED
+    assert receiver.open(PAYLOAD, sender.seal(PAYLOAD, b"more")) == b"more"
+
+
+@pytest.mark.parametrize(
+    ("sealed", "reason"),
+    [
+        (b"bare", DropReason.TRUNCATED),
+        (encode_directive(Directive(0, 1)), DropReason.UNKNOWN_KEY),
+        (seals(0, master=bytes(32)).seal(PAYLOAD, b"x"), DropReason.FORGED),
+        (seals(0).seal(PAYLOAD, b"x")[:-1] + b"?", DropReason.FORGED),
+        (seals(0).seal(Topic(TopicKind.FEATURES, 2, 1), b"x"), DropReason.FORGED),  # moved to another topic
+        (seals(0, 990.0).seal(PAYLOAD, b"x"), DropReason.REPLAYED),  # recorded before the receiver started
+    ],
+)
+def test_what_is_no_message_of_the_topic_is_refused_by_reason(sealed: bytes, reason: DropReason) -> None:
+    found = seals(1).open(PAYLOAD, sealed)
+    assert isinstance(found, Dropped)
+    assert found.reason == reason
+
+
+def test_no_member_commands_the_gate_of_another() -> None:
+    for member in (1, 2):
+        found = seals(0).open(ORDER, seals(member).seal(ORDER, encode_directive(Directive(0, 1))))
+        assert isinstance(found, Dropped)
+        assert found.reason == DropReason.FORGED
+    assert isinstance(seals(0).open(ORDER, seals(0).seal(ORDER, b"")), bytes)
+
+
+def test_a_node_that_restarts_goes_on_above_its_old_counters() -> None:
+    receiver = seals(1, 1000.0)
+    assert receiver.open(PAYLOAD, seals(0, 1000.0).seal(PAYLOAD, b"before")) == b"before"
+    assert receiver.open(PAYLOAD, seals(0, 1001.0).seal(PAYLOAD, b"after")) == b"after"
+
+
+# --- the key -----------------------------------------------------------------------------------------
+
+
+def test_the_key_comes_from_a_file_of_its_owner_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "fleet.key"
+    path.write_text(MASTER.hex())
+    path.chmod(0o640)
+    with pytest.raises(RunError, match=r"its mode is 640, must be 600: others may read or write the key$"):
+        find_key(path)
+    path.chmod(0o600)
+    assert find_key(path) == MASTER
+    monkeypatch.setenv(KEY_VARIABLE, MASTER.hex())
+    assert find_key(None) == MASTER
+    monkeypatch.setenv(KEY_VARIABLE, "secret")
+    with pytest.raises(RunError) as error:
+        find_key(None)
+    assert str(error.value) == "SORTIE_KEY has 6 characters, must be 64 hexadecimal digits"
+    monkeypatch.delenv(KEY_VARIABLE)
+    assert find_key(None) != find_key(None)
+    done = CliRunner().invoke(app, ["live", "--key", str(tmp_path / "none")])
+    assert str(done.exception) == f"{tmp_path / 'none'}: No such file or directory"
+
+
+# --- a flight among strangers --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def attacked() -> LiveResult:
+    """Two drones for three seconds, and a stranger who writes in drone 0's name."""
+    command = [sys.executable, str(Path(dds_attacker.__file__)), str(DOMAIN)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "CYCLONEDDS_URI": LOOPBACK}) as stranger:  # fmt: skip
+        try:
+            assert stranger.stdout is not None
+            assert stranger.stdout.readline() == "listening\n"
+            policy = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
+            return fly_live(example("fleet.drones=2", policy), duration_s=3.0, domain=DOMAIN)
+        finally:
+            stranger.kill()
+
+
+def test_a_stranger_does_not_silence_a_drone(attacked: LiveResult) -> None:
+    gate, receiver = attacked.each
+    assert gate.refused["directive unknown key"] > 50  # one every 20 ms
+    assert gate.refused["directive replayed"] > 5
+    assert receiver.refused["payload forged"] > 5
+    assert receiver.refused["payload replayed"] > 5
+    assert receiver.refused["descriptor replayed"] > 5
+    assert gate.payloads_arrived > 15  # of about 25 each way
+    assert abs(gate.payloads_arrived - receiver.payloads_arrived) < 10  # it was not thinned out either
+    text = "\n".join(describe_changes(attacked))
+    assert "drone 0: refused a directive unknown key: for drone 1, key id" in text
+
+
+# --- deadlines and trust, at one node --------------------------------------------------------------------
+
+
+class FixedClock:
+    """A clock that the test moves."""
+
+    now = 10.0
+
+
+def node_of(drone: int) -> tuple[LiveNode, FixedClock, PeerMemory]:
+    """A drone's node, alone on its bus, in the scenario's flight."""
+    scenario = example("fleet.drones=2")
+    node = LiveNode(Bus(DOMAIN + 1), seals(drone), drone, 2, seed=0, loss=0.0)
+    clock, rules = FixedClock(), rules_of(scenario, 0.0, 6.0)
+    memory = PeerMemory(drone, rules, DroneStatus())
+    node.fly(clock, memory, rules, lambda: (1.0,))  # type: ignore[arg-type]
+    return node, clock, memory
+
+
+def payload(sender: Seals, stamp_s: float, deadline_s: float = 0.1, source: int = 0) -> bytes:
+    """A payload from drone 0 to drone 1 as its gate writes it."""
+    header = _HEADER.pack(round(stamp_s * 1e9), source, 0, 0, 60, 0, 0, 0, 1)
+    order = Directive(0, 1, Representation.FEATURES, 0.1, None, 10.0, deadline_s)
+    return sender.seal(PAYLOAD, header + encode_directive(order) + bytes(500))
+
+
+def test_a_payload_after_its_deadline_is_dropped_and_counted() -> None:
+    node, clock, _ = node_of(1)
+    sender = seals(0)
+    reader = node._links[0].incoming[0]
+    ready_s = 0.03 + 0.01  # compute delay, and the moment within the frame
+    for age_s, deadline_s, refused in (
+        (0.05, 0.1, 0),
+        (ready_s + 0.099, 0.1, 0),
+        (ready_s + 0.101, 0.1, 1),
+        (1.0, 2.0, 1),
+    ):
+        node._on_payload(pack_bytes(payload(sender, clock.now - age_s, deadline_s)), reader)
+        assert node._refused["payload late"] == refused
+    assert node.report(clock.now).received[TopicKind.FEATURES].samples == 3
+    node._on_payload(pack_bytes(payload(sender, clock.now, source=3)), reader)
+    assert node._refused["payload of another link"] == 1
+    assert len(bytes(HEADER_BYTES)) == _HEADER.size
+
+
+def test_a_descriptor_in_the_drone_s_own_name_is_refused() -> None:
+
+    node, _, _ = node_of(1)
+    datagram = encode_descriptor(fleet_of(2).descriptors[1])
+    node._on_descriptor(node._seals.seal(CONTEXT, datagram))
+    assert not node._refused
+    node._on_descriptor(seals(0, 1001.0).seal(CONTEXT, datagram))  # a member that poses as drone 1
+    assert node._refused == {"descriptor in this drone's name": 1}
+    bare = seals(0).open_descriptor(datagram)
+    assert isinstance(bare, Dropped)
+    for padding in range(4):
+        found = seals(0).open_descriptor(seals(1).seal(CONTEXT, datagram) + bytes(padding))
+        assert isinstance(found, Opened)
+    wrong = Sealer(bytes(32), KEY_ID)
+    assert isinstance(seals(0).open_descriptor(wrong.seal(datagram)), Dropped)
+
+
+def test_a_member_that_lies_loses_trust_and_its_payloads_are_dropped() -> None:
+    """It sees nothing from 60 m, and its charge comes back."""
+    node, clock, memory = node_of(1)
+    liar, reader = seals(0), node._links[0].incoming[0]
+    told = []
+    for second in range(9):
+        clock.now = 10.0 + second
+        stamp = {"stamp_ns": round(clock.now * 1e9)}
+        memory.hold(fleet_of(2).descriptors[1]._replace(battery_soc=0.9 - 0.01 * second, **stamp), clock.now)
+        claim = fleet_of(2).descriptors[0]._replace(battery_soc=0.5 + 0.05 * second, **stamp)
+        node._on_descriptor(liar.seal(CONTEXT, encode_descriptor(claim)))
+        for peer, standing in memory.judge(clock.now):
+            node.trust(clock.now, 1, peer, standing)
+        told += node.report(clock.now).new.notices
+        node._on_payload(pack_bytes(payload(liar, clock.now)), reader)
+    assert memory.trust_in(0) == 0.0
+    assert node._refused["payload not trusted"] >= 1
+    assert any(n.text.startswith("trust in drone 0 is now 0.5: ") for n in told)
