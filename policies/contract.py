@@ -91,6 +91,10 @@ class Descriptor(NamedTuple):
     region: Disc | None
     """Region of responsibility; on the wire f32[4] x, y, radius, 1 (all zero: none)."""
     priority_target_ids: tuple[int, ...] = ()
+    feature_space: str = ""
+    """The network that makes this drone's feature maps; only maps of one space can be fused. Empty: the fleet's common one.
+
+    An optional field: it is on the wire where it is not empty (`sortie.fleet.messages.extensions`)."""
 
     @property
     def coverage_corner(self) -> tuple[int, int]:
@@ -158,6 +162,14 @@ class FleetView(NamedTuple):
         """
         me = self.me
         return max(len(self.peers), 0 if me is None else len(me.peer_goodput_mbps))
+
+    def shares_features_with(self, peer: int) -> bool:
+        """Whether the ego and a peer can fuse each other's feature maps.
+
+        Drones with different networks can exchange detections, tracks, raw images and context, but no maps.
+        """
+        me, other = self.me, self.descriptors.get(peer)
+        return me is None or other is None or me.feature_space == other.feature_space
 
 
 class Directive(NamedTuple):

@@ -56,6 +56,7 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
     # unpacked and built again for speed: every drone reads every other one in every frame
     (
         stamp, agent, at, turn, velocity, footprint, heard_soc, heard_cpu, heard_gpu, heard_links, grid, flags, phase, region, targets,
+        *optional,
     ) = heard  # fmt: skip
     soc, cpu, gpu, links, last = heard_soc, heard_cpu, heard_gpu, heard_links, before.peer_goodput_mbps
     if links != last and len(links) == len(last):  # else the roster is another
@@ -69,8 +70,9 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
     if soc == heard_soc and cpu == heard_cpu and gpu == heard_gpu and links == heard_links:
         return heard
     return Descriptor(
-        stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets
-    )
+        stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets,
+        *optional,
+    )  # fmt: skip
 
 
 class DampedLink(NamedTuple):

@@ -27,7 +27,8 @@ from typing import NamedTuple
 
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.compact import MARK, MIN_COMPACT_BYTES
-from sortie.fleet.messages.wire import MAX_DESCRIPTOR_BYTES, MIN_DESCRIPTOR_BYTES, decode_descriptor
+from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
+from sortie.fleet.messages.wire import MIN_DESCRIPTOR_BYTES, decode_descriptor
 from sortie.policies.contract import Descriptor
 
 TAG_BYTES = 16

@@ -2,6 +2,7 @@
 
     header 4 B (0xC0, cells a side, bits a cell, bits a number) · stamp 8 B · agent, phase, flags, peers, targets 1 B each
     · numbers, cells and target ids, bit by bit, the last byte filled with zeros
+    · optional fields (`sortie.fleet.messages.extensions`)
 
 Numbers are fixed point over their field's range, saturating (`_RANGES`); 32 bits are IEEE floats. A goodput's lowest
 number is a link never measured, the next one a silent link (`sortie.scenarios.link_state`). A coarse cell stands
@@ -20,6 +21,7 @@ import numpy as np
 
 from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.extensions import append_extensions, read_extensions, read_phase
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
 from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
 
@@ -78,6 +80,7 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
     """Serialise a descriptor in a form; numbers beyond their range are written as its end.
 
     Raises:
+        DescriptorTooLarge: more than 1,024 B, naming the part that is too long.
         ValueError: more than 255 peers or targets.
     """
     goodput, targets, region = d.peer_goodput_mbps, d.priority_target_ids, d.region
@@ -100,14 +103,14 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
         bits.put(state, form.grid_bits)
     for target in targets:
         bits.put(target, 16)
-    return head + bits.done()
+    return append_extensions(head + bits.done(), d)
 
 
 def decode_compact(data: bytes) -> Descriptor:
     """Parse and check what `encode_compact` wrote.
 
     Raises:
-        MalformedDatagram: for anything that is not exactly one valid descriptor.
+        MalformedDatagram: for anything that is not one valid descriptor.
     """
     if len(data) < _HEAD.size:
         raise MalformedDatagram(f"{len(data)} B, must be at least {_HEAD.size}")
@@ -116,15 +119,13 @@ def decode_compact(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"form ({magic:#x}, {cells}, {cell_bits}, {number_bits}) is none")
     ranges = _ranges(peers, bool(flags & _REGION_FLAG))
     size = _HEAD.size + math.ceil((len(ranges) * number_bits + cells * cells * cell_bits + 16 * targets) / 8)
-    if len(data) != size:
-        raise MalformedDatagram(f"{len(data)} B, must be {size}")
+    if len(data) < size:
+        raise MalformedDatagram(f"{len(data)} B, must be at least {size} with {peers} peers and {targets} targets")
     if nanosecond >= 1_000_000_000:
         raise MalformedDatagram(f"stamp.nanosec is {nanosecond}, must be below 10⁹")
     if agent_id > 254:
         raise MalformedDatagram(f"agent_id is {agent_id}, must be at most 254")
-    if phase >= len(TaskPhase):
-        raise MalformedDatagram(f"task_phase is {phase}, must be at most {len(TaskPhase) - 1}")
-    bits = _BitReader(data[_HEAD.size :])
+    bits = _BitReader(data[_HEAD.size : size])
     values = [_to_float(bits.take(number_bits), bounds, number_bits) for bounds in ranges]
     if not all(map(math.isfinite, values)):
         raise MalformedDatagram("a float is not finite")
@@ -132,7 +133,8 @@ def decode_compact(data: bytes) -> Descriptor:
     ids = tuple(bits.take(16) for _ in range(targets))
     if bits.rest():
         raise MalformedDatagram("the last byte is not filled with zeros")
-    return _checked(second * 1_000_000_000 + nanosecond, agent_id, values, peers, grid, flags, TaskPhase(phase), ids)
+    said = _checked(second * 1_000_000_000 + nanosecond, agent_id, values, peers, grid, flags, read_phase(phase), ids)
+    return said._replace(**read_extensions(data[size:]))
 
 
 def _checked(

@@ -1,8 +1,9 @@
 """Descriptors and directives as bytes: encode what is ours, trust nothing that comes in.
 
 A descriptor is 180 B at five drones and grows by 4 B a peer and 2 B a priority target; past 1 KB it is refused
-where it is made. A directive is 36 B. Floats are rounded to 32 bits on the way, and a directive's `reason` stays
-at home. Decoding holds every length, count, enumeration and range to its bound before anything is believed.
+where it is made. Optional fields follow it (`sortie.fleet.messages.extensions`). A directive is 36 B. Floats are rounded
+to 32 bits on the way, and a directive's `reason` stays at home. Decoding holds every length, count, enumeration and
+range to its bound before anything is believed. A task phase that this version does not know is read as transit.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from math import isfinite
 
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
 from sortie.fleet.messages.compact import MARK, decode_compact
+from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES, append_extensions, read_extensions, read_phase
 from sortie.policies.contract import (
     COVERAGE_BYTES,
     DIRECTIVE_BOUNDS,
@@ -21,11 +23,8 @@ from sortie.policies.contract import (
     Directive,
     Disc,
     Representation,
-    TaskPhase,
 )
-from sortie.scenarios.errors import SortieError
 
-MAX_DESCRIPTOR_BYTES = 1024
 MAX_AGENT_ID = 254
 
 _MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"
@@ -41,7 +40,6 @@ _COUNT = struct.Struct("<I")
 _GOODPUT_COUNT_AT = layout(*_FRONT, ("I", 1))[1][-1]
 _TARGET_COUNT_AT = layout(*_FRONT, ("I", 1), *_BACK)[1][-1]  # without peers; each moves it by 4 B
 _DIRECTIVE = layout(("B", 4), ("f", 3), ("f", 4))[0]
-_PHASES = {int(phase): phase for phase in TaskPhase}
 
 
 @lru_cache(maxsize=1024)
@@ -54,12 +52,8 @@ MIN_DESCRIPTOR_BYTES = _descriptor_layout(0, 0).size
 DIRECTIVE_BYTES = _DIRECTIVE.size
 
 
-class DescriptorTooLarge(SortieError):
-    """A descriptor that would pass 1 KB; the message names the field."""
-
-
 def descriptor_bytes(drones: int, targets: int = 0) -> int:
-    """Size of a descriptor in a fleet of `drones` with `targets` priority ids, authentication not included."""
+    """Size of a descriptor in a fleet of `drones` with `targets` priority ids, without optional fields and authentication."""
     return _descriptor_layout(drones - 1, targets).size
 
 
@@ -67,23 +61,17 @@ def encode_descriptor(d: Descriptor) -> bytes:
     """Serialise a descriptor.
 
     Raises:
-        DescriptorTooLarge: more than 1,024 B, naming the sequence that is too long.
+        DescriptorTooLarge: more than 1,024 B, naming the part that is too long.
         ValueError: a field that its wire type cannot hold.
     """
     goodput, targets = d.peer_goodput_mbps, d.priority_target_ids
     compiled = _descriptor_layout(len(goodput), len(targets))
-    if compiled.size > MAX_DESCRIPTOR_BYTES:
-        long = ("peer_goodput", goodput) if 4 * len(goodput) >= 2 * len(targets) else ("priority_target_ids", targets)
-        raise DescriptorTooLarge(
-            f"{long[0]} has {len(long[1])} entries: the descriptor would be {compiled.size} B, "
-            f"must be at most {MAX_DESCRIPTOR_BYTES} B"
-        )
     if len(d.coverage_grid) != COVERAGE_BYTES:
         raise ValueError(f"coverage_grid has {len(d.coverage_grid)} bytes, must have {COVERAGE_BYTES}")
     second, nanosecond = divmod(d.stamp_ns, 1_000_000_000)
     region = (0.0, 0.0, 0.0, 0.0) if d.region is None else (d.region.x_m, d.region.y_m, d.region.radius_m, 1.0)
     try:
-        return compiled.pack(
+        body = compiled.pack(
             ENCAPSULATION,
             second,
             nanosecond,
@@ -106,6 +94,7 @@ def encode_descriptor(d: Descriptor) -> bytes:
         )
     except (struct.error, OverflowError) as error:
         raise ValueError(f"descriptor of agent {d.agent_id} does not fit its wire types: {error}") from None
+    return append_extensions(body, d)
 
 
 @lru_cache(maxsize=256)  # a broadcast is the same bytes for its sender and everyone who hears it
@@ -113,7 +102,7 @@ def decode_descriptor(data: bytes) -> Descriptor:
     """Parse and check a descriptor, in CDR or in a compact form (`sortie.fleet.messages.compact`).
 
     Raises:
-        MalformedDatagram: for anything that is not exactly one valid descriptor.
+        MalformedDatagram: for anything that is not one valid descriptor.
     """
     size = len(data)
     if size > MAX_DESCRIPTOR_BYTES:
@@ -127,10 +116,11 @@ def decode_descriptor(data: bytes) -> Descriptor:
     if 4 * peers > size - MIN_DESCRIPTOR_BYTES:
         raise MalformedDatagram(f"peer_goodput claims {peers} entries in {size} B")
     (targets,) = _COUNT.unpack_from(data, _TARGET_COUNT_AT + 4 * peers)
-    if MIN_DESCRIPTOR_BYTES + 4 * peers + 2 * targets != size:
-        raise MalformedDatagram(f"priority_target_ids claims {targets} entries, which does not fill {size} B exactly")
+    end = MIN_DESCRIPTOR_BYTES + 4 * peers + 2 * targets
+    if end > size:
+        raise MalformedDatagram(f"priority_target_ids claims {targets} entries in {size} B")
 
-    values = _descriptor_layout(peers, targets).unpack(data)
+    values = _descriptor_layout(peers, targets).unpack_from(data)
     _, second, nanosecond, agent_id = values[:4]
     orientation, (footprint, soc, cpu, gpu) = values[7:11], values[14:18]
     after = 19 + peers
@@ -153,8 +143,6 @@ def decode_descriptor(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"battery, cpu, gpu are {soc:g}, {cpu:g}, {gpu:g}, must be in [0, 1]")
     if goodput and min(goodput) < 0:
         raise MalformedDatagram(f"peer_goodput holds {min(goodput):g}, must be ≥ 0")
-    if phase not in _PHASES:
-        raise MalformedDatagram(f"task_phase is {phase}, must be at most {len(_PHASES) - 1}")
     if flag == 1 and radius > 0:
         disc = Disc(x, y, radius)
     elif x == y == radius == flag == 0:
@@ -174,9 +162,10 @@ def decode_descriptor(data: bytes) -> Descriptor:
         goodput,
         grid,
         novelty,
-        _PHASES[phase],
+        read_phase(phase),
         disc,
         values[after + 8 :],
+        **read_extensions(data[end:]),
     )
 
 

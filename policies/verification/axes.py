@@ -44,6 +44,7 @@ FIELDS: dict[str, Axis | None] = {
     "task_phase": Axis.MISSION,
     "region": Axis.MISSION,
     "priority_target_ids": Axis.MISSION,
+    "feature_space": None,
 }
 """Which axis each field of a descriptor belongs to."""
 

@@ -82,6 +82,7 @@ class FleetOfRanges:
                 task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
                 priority_target_ids=tuple(range(int(targets))),
+                feature_space="" if path.picks.get(_space_of(i), True) else "other",
             )
         return FleetView(self.ego, self.period_s, descriptors, self._example_ages())
 
@@ -143,6 +144,10 @@ class DescriptorOfRanges:
     @property
     def task_phase(self) -> TaskPhase:
         return self._system.path.pick(f"task_phase of drone {self.agent_id}", tuple(TaskPhase))
+
+    @property
+    def feature_space(self) -> Any:
+        return _Space(self._system, self.agent_id)
 
     @property
     def novelty_flags(self) -> Any:
@@ -265,6 +270,31 @@ class _TargetIds:
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return tuple
+
+
+class _Space:
+    """A drone's feature space, known only by whether it is the ego's."""
+
+    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
+        self._system, self._id = system, agent_id
+
+    def __eq__(self, other: object) -> bool:
+        path, ego = self._system.path, self._system.ego
+        if not isinstance(other, _Space) or ego not in (self._id, other._id):
+            path.refuse("compares feature_space with anything but the ego's")
+        peer = other._id if self._id == ego else self._id
+        return peer == ego or path.pick(_space_of(peer), (True, False))
+
+    def _cannot(self, *_: object) -> NoReturn:
+        self._system.path.refuse("reads the name of a feature_space")
+
+    __bool__ = __iter__ = __len__ = __contains__ = __getitem__ = __hash__ = __lt__ = __str__ = __format__ = (
+        __getattr__
+    ) = _cannot
+
+
+def _space_of(peer: int) -> str:
+    return f"drone {peer} has the ego's feature_space"
 
 
 def _orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:

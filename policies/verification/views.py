@@ -54,6 +54,8 @@ def draw_view(seed: int, number: int) -> FleetView:
     spread_m = float(rng.choice([0.0, 30.0, 100.0, 2000.0]))
     descriptors = {i: _draw_descriptor(rng, i, n, spread_m) for i in heard}
     age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
+    if rng.random() < 0.25:  # two makes of drone in one fleet
+        descriptors = {i: d._replace(feature_space=str(rng.choice(["", "other"]))) for i, d in descriptors.items()}
     return FleetView(ego, period_s, descriptors, age_s)
 
 
@@ -103,6 +105,7 @@ _PLAIN: dict[str, Any] = {
     "novelty_flags": 0,
     "region": None,
     "priority_target_ids": (),
+    "feature_space": "",
     "task_phase": TaskPhase.SEARCH,
     "battery_soc": 1.0,
     "footprint_radius_m": 42.0,
@@ -225,6 +228,7 @@ def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
         task_phase=phase,
         region=None if region is None else Disc(*_numbers(entry, "region", where, 3)),
         priority_target_ids=tuple(int(t) for t in _numbers(entry, "priority_target_ids", where)),
+        feature_space=_text(entry, "feature_space", where),
     )
 
 
@@ -234,6 +238,13 @@ def _number(entry: Mapping[str, Any], name: str, where: str, low: float = -math.
         raise ViewError(f"{where}.{name} is {value!r}, must be a number")
     if not low <= value <= high:
         raise ViewError(f"{where}.{name} is {value!r}, must be in [{low:g}, {high:g}]")
+    return value
+
+
+def _text(entry: Mapping[str, Any], name: str, where: str) -> str:
+    value = entry.get(name, "")
+    if not isinstance(value, str):
+        raise ViewError(f"{where}.{name} is {value!r}, must be text")
     return value
 
 

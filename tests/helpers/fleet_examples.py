@@ -69,7 +69,14 @@ descriptors = st.builds(
     task_phase=st.sampled_from(TaskPhase),
     region=st.none() | discs,
     priority_target_ids=st.lists(st.integers(0, 65535), max_size=20).map(tuple),
+    feature_space=st.just(""),
 )
+extended_descriptors = st.builds(
+    lambda d, space: d._replace(feature_space=space),
+    descriptors,
+    st.just("") | st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9_.+-]{0,31}\Z"),
+)
+"""With optional fields, or without."""
 directives = (
     st.tuples(ids, ids)
     .filter(lambda link: link[0] != link[1])

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, layout
+from sortie.fleet.messages.extensions import DescriptorTooLarge
 from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
     DIRECTIVE_BYTES,
     DIRECTIVE_MSG,
     DIRECTIVE_NAME,
-    DescriptorTooLarge,
     decode_descriptor,
     decode_directive,
     descriptor_bytes,
@@ -181,9 +181,8 @@ def patch(data: bytes, at: int, new: bytes) -> bytes:
         (patch(GOOD, 68, struct.pack("<I", 5)), "peer_goodput claims 5 entries in 180 B"),
         (
             patch(GOOD, 172, struct.pack("<I", 1)),
-            "priority_target_ids claims 1 entries, which does not fill 180 B exactly",
+            "priority_target_ids claims 1 entries in 180 B",
         ),
-        (GOOD + b"\0", "priority_target_ids claims 0 entries, which does not fill 181 B exactly"),
         (GOOD[:-1], "peer_goodput claims 4 entries in 179 B"),
         (patch(GOOD, 4, struct.pack("<I", 10**9)), "stamp.nanosec is 1000000000, must be below 10⁹"),
         (patch(GOOD, 8, b"\xff"), "agent_id is 255, must be at most 254"),
@@ -196,7 +195,6 @@ def patch(data: bytes, at: int, new: bytes) -> bytes:
         (patch(GOOD, 56, struct.pack("<f", 1.5)), "battery, cpu, gpu are 1.5, 0.5, 0.25, must be in [0, 1]"),
         (patch(GOOD, 64, struct.pack("<f", -0.5)), "battery, cpu, gpu are 0.75, 0.5, -0.5, must be in [0, 1]"),
         (patch(GOOD, 76, struct.pack("<f", -2)), "peer_goodput holds -2, must be ≥ 0"),
-        (patch(GOOD, 153, b"\x05"), "task_phase is 5, must be at most 4"),
         (patch(GOOD, 168, struct.pack("<f", 2)), "region is (10, -20, 32, 2), neither a disc nor none"),
         (patch(GOOD, 164, struct.pack("<f", 0)), "region is (10, -20, 0, 1), neither a disc nor none"),
         (patch(NONE, 156, struct.pack("<f", 1)), "region is (1, 0, 0, 0), neither a disc nor none"),

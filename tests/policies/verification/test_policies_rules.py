@@ -22,7 +22,8 @@ from policies_examples import fleet_of
 import sortie
 from sortie.fleet.gate import Gate
 from sortie.fleet.messages.auth import Dropped, Inbox, Sealer, open_datagram
-from sortie.fleet.messages.wire import MAX_DESCRIPTOR_BYTES, decode_directive, encode_descriptor, encode_directive
+from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
+from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.contract import (
     Descriptor,

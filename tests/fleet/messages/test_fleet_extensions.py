@@ -1,0 +1,204 @@
+"""Descriptors that can grow: older readers pass over newer fields, and no lying length gets in."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+from fleet_examples import DESCRIPTOR, descriptors, extended_descriptors
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sortie.fleet.messages.auth import Dropped, Opened, Sealer, open_datagram
+from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.compact import FULL, Form, encode_compact
+from sortie.fleet.messages.extensions import (
+    FIELDS,
+    MAX_DESCRIPTOR_BYTES,
+    VERSION,
+    DescriptorTooLarge,
+    read_extensions,
+)
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.policies.contract import Descriptor, TaskPhase
+from sortie.policies.damping import apply_hysteresis
+
+Encode = Callable[[Descriptor], bytes]
+SMALL = Form(8, 1, 16)
+ENCODERS: list[Encode] = [encode_descriptor, partial(encode_compact, form=FULL), partial(encode_compact, form=SMALL)]
+each_form = pytest.mark.parametrize("encode", ENCODERS, ids=["cdr", "compact", "small"])
+KEY = bytes(range(32))
+
+
+def field(number: int, value: bytes = b"", claims: int | None = None) -> bytes:
+    return struct.pack("<BH", number, len(value) if claims is None else claims) + value
+
+
+def block(*fields: bytes, version: int = VERSION) -> bytes:
+    return bytes([version]) + b"".join(fields)
+
+
+unknown_fields = st.dictionaries(
+    st.integers(FIELDS[-1].number + 1, 255), st.binary(max_size=60), max_size=6
+).map(lambda found: b"".join(field(number, value) for number, value in sorted(found.items())))  # fmt: skip
+
+
+# --- what is left out, and what is not -----------------------------------------------------------
+
+
+@given(descriptors)
+def test_without_optional_fields_the_bytes_are_the_papers(d: Descriptor) -> None:
+    """`test_fleet_wire` holds them to an independent CDR; here: no block follows."""
+    assert len(encode_descriptor(d)) == 164 + 4 * len(d.peer_goodput_mbps) + 2 * len(d.priority_target_ids)
+
+
+def test_the_block_by_hand() -> None:
+    named = DESCRIPTOR._replace(feature_space="net-b")
+    expected = bytes([2, 1, 5, 0]) + b"net-b"
+    for encode in ENCODERS:
+        assert encode(named) == encode(DESCRIPTOR) + expected
+    assert len(encode_descriptor(named)) == 189
+
+
+@given(extended_descriptors)
+def test_optional_fields_survive_the_wire(d: Descriptor) -> None:
+    assert decode_descriptor(encode_descriptor(d)) == d
+
+
+@given(extended_descriptors.filter(lambda d: d.novelty_flags < 128), st.sampled_from([FULL, SMALL]))
+def test_optional_fields_survive_the_compact_forms(d: Descriptor, form: Form) -> None:
+    back = decode_descriptor(encode_compact(d, form))
+    assert [getattr(back, f.name) for f in FIELDS] == [getattr(d, f.name) for f in FIELDS]
+
+
+def test_types_ascend_and_every_optional_field_has_a_default() -> None:
+    numbers = [f.number for f in FIELDS]
+    assert numbers == sorted(set(numbers))
+    assert all(0 < n <= 255 for n in numbers)
+    assert {f.name for f in FIELDS} | {"priority_target_ids"} == set(Descriptor._field_defaults)
+
+
+def test_optional_fields_pass_the_hysteresis() -> None:
+    """Its result is a descriptor of its own when a quantity rose."""
+    before = DESCRIPTOR._replace(battery_soc=0.2, feature_space="a")
+    assert apply_hysteresis(before, DESCRIPTOR._replace(battery_soc=0.9, feature_space="b"), 0.2).feature_space == "b"
+
+
+# --- mixed versions ------------------------------------------------------------------------------
+
+
+@each_form
+def test_one_appended_byte_is_a_version_and_no_fields(encode: Encode) -> None:
+    """Of whatever version: what follows from it is only which fields may come."""
+    expected = decode_descriptor(encode(DESCRIPTOR))
+    for byte in range(256):
+        assert decode_descriptor(encode(DESCRIPTOR) + bytes([byte])) == expected
+
+
+@each_form
+@given(extended_descriptors, unknown_fields, st.integers(0, 255))
+def test_a_reader_passes_over_what_it_does_not_know(encode: Encode, d: Descriptor, more: bytes, version: int) -> None:
+    """The same value as without it, and authentication covers it."""
+    plain = encode(d)
+    grown = plain + more if d.feature_space else plain + block(more, version=version)
+    if len(grown) > MAX_DESCRIPTOR_BYTES:
+        return
+    assert decode_descriptor(grown) == decode_descriptor(plain)
+    sealed = Sealer(KEY, 7).seal(grown)
+    opened = open_datagram(sealed, {7: KEY})
+    assert isinstance(opened, Opened)
+    assert opened.descriptor == decode_descriptor(plain)
+    flipped = bytearray(sealed)
+    flipped[len(grown) - 1] ^= 1
+    refused = open_datagram(bytes(flipped), {7: KEY})
+    assert isinstance(refused, Dropped)
+    assert refused.reason == "forged"
+
+
+@each_form
+@pytest.mark.parametrize("phase", [5, 77, 255])
+def test_an_unknown_phase_is_transit(encode: Encode, phase: int) -> None:
+    newer = encode(DESCRIPTOR._replace(task_phase=phase))  # type: ignore[arg-type]
+    assert decode_descriptor(newer) == decode_descriptor(encode(DESCRIPTOR))._replace(task_phase=TaskPhase.TRANSIT)
+
+
+def test_a_known_field_in_an_unknown_form_is_the_newer_senders_right() -> None:
+    strange = block(field(1, b"two words"), version=VERSION + 1)
+    assert read_extensions(strange) == {}
+    with pytest.raises(MalformedDatagram, match="feature_space is 'two words', must be 1 to 32 letters"):
+        read_extensions(block(field(1, b"two words")))
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+@each_form
+@pytest.mark.parametrize(
+    ("behind", "reason"),
+    [
+        (block(b"\x09"), "extensions end in 1 B, a field has at least 3"),
+        (block(b"\x09\x00"), "extensions end in 2 B, a field has at least 3"),
+        (block(field(9, b"abc", claims=4)), "extension 9 claims 4 B, 3 B are left"),
+        (block(field(9, claims=65535)), "extension 9 claims 65535 B, 0 B are left"),
+        (block(field(9, b"abc", claims=2)), "extensions end in 1 B, a field has at least 3"),
+        (block(field(9), field(9)), "extension 9 follows 9, must be above it"),
+        (block(field(9), field(8)), "extension 8 follows 9, must be above it"),
+        (block(field(0)), "extension 0 follows 0, must be above it"),
+        (block(field(1)), "feature_space is '', must be 1 to 32 letters, digits or any of _ . + -"),
+        (block(field(1, b"x" * 33)), f"feature_space is '{'x' * 33}', must be 1 to 32 letters, digits or any of _ . + -"),
+    ],
+)  # fmt: skip
+def test_malformed_blocks(encode: Encode, behind: bytes, reason: str) -> None:
+    with pytest.raises(MalformedDatagram) as caught:
+        decode_descriptor(encode(DESCRIPTOR) + behind)
+    assert caught.value.reason == reason
+    opened = open_datagram(Sealer(KEY, 7).seal(encode(DESCRIPTOR) + behind), {7: KEY})
+    assert opened == Dropped(opened.reason, reason)  # type: ignore[union-attr]
+    assert opened.reason == "malformed"  # type: ignore[union-attr]
+
+
+@each_form
+def test_a_cut_descriptor_is_refused_but_at_the_edge_of_a_field(encode: Encode) -> None:
+    """Those edges are valid by themselves; the tag refuses them all."""
+    d = DESCRIPTOR._replace(feature_space="net-b")
+    whole, plain = encode(d) + field(9, b"abc"), len(encode(DESCRIPTOR))
+    edges = {plain, plain + 1, plain + 9}
+    sealed = Sealer(KEY, 7).seal(whole)
+    for end in range(len(whole)):
+        assert isinstance(open_datagram(whole[:end] + sealed[len(whole) :], {7: KEY}), Dropped)
+        if end in edges:
+            decode_descriptor(whole[:end])
+        else:
+            with pytest.raises(MalformedDatagram):
+                decode_descriptor(whole[:end])
+
+
+@given(extended_descriptors, st.sampled_from(ENCODERS), st.binary(max_size=40), st.data())
+def test_whatever_follows_is_a_descriptor_or_malformed(
+    d: Descriptor, encode: Encode, behind: bytes, draw: st.DataObject
+) -> None:
+    data = bytearray(encode(d) + behind)
+    for at in draw.draw(st.lists(st.integers(0, len(data) - 1), max_size=4)):
+        data[at] ^= draw.draw(st.integers(0, 255))
+    try:
+        value = decode_descriptor(bytes(data))
+    except MalformedDatagram:
+        return
+    assert decode_descriptor(encode_descriptor(value)).feature_space == value.feature_space
+
+
+def test_a_block_counts_towards_the_kilobyte() -> None:
+    full = DESCRIPTOR._replace(peer_goodput_mbps=(1.0,) * 215)
+    assert len(encode_descriptor(full)) == MAX_DESCRIPTOR_BYTES
+    with pytest.raises(DescriptorTooLarge, match="peer_goodput has 215 entries: the descriptor would be 1029 B"):
+        encode_descriptor(full._replace(feature_space="b"))
+    with pytest.raises(DescriptorTooLarge, match="priority_target_ids has 255 entries: the descriptor would be 1"):
+        encode_compact(full._replace(priority_target_ids=(1,) * 255, peer_goodput_mbps=(1.0,) * 120), FULL)
+
+
+@pytest.mark.parametrize("name", ["two words", "x" * 33, "é", "-a", "a\n"])
+def test_a_feature_space_that_the_wire_cannot_hold_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"feature_space is .*, must be 1 to 32 letters, digits"):
+        encode_descriptor(DESCRIPTOR._replace(feature_space=name))
