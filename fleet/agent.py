@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, cast
 
 import simpy
 
-from sortie.fleet.coverage import NOVEL_FLAG, TARGET_FLAG
+from sortie.fleet.coverage import LOOK_STANDS_S, NOTHING_SEEN, NOVEL_FLAG, TARGET_FLAG, Chart, View, marked, placed
 from sortie.fleet.gate import Gate, Payload, make_payload
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
@@ -25,6 +25,7 @@ from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Capture
+from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import (
     Descriptor,
     Directive,
@@ -146,6 +147,9 @@ class Agent:
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
+        self._chart = Chart()
+        self._look: Sensed | None = None
+        """What it sensed at its latest look."""
         self._judged_every = max(1, round(JUDGED_EVERY_S / rules.period_s))
 
     def start(self) -> None:
@@ -165,7 +169,10 @@ class Agent:
         self.here = sensed.capture
         own = self._publish(sensed, due=frame % self._rules.publish_every == 0)
         self.memory.hold(own, self._env.now)
-        if self._rules.trust and frame % self._judged_every == 0:
+        each_second = frame % self._judged_every == 0
+        if each_second:
+            self._chart.fold(self.memory.believed())
+        if self._rules.trust and each_second:
             for peer, standing in self.memory.judge(self._env.now):
                 self._log.trust(self._env.now, self.drone, peer, standing)
         self._decide()
@@ -173,13 +180,15 @@ class Agent:
         self.status.perceiving = (frame + 1) * duty // 100 > frame * duty // 100
         self.status.work.looks += self.status.perceiving
         if self.status.perceiving:
+            self._look = sensed
             self._env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 
     def _publish(self, sensed: Sensed, due: bool) -> Descriptor:
         """Publish this frame's descriptor if one is due, and return it as rounded by the wire."""
-        capture, velocity_mps, footprint_m, grid, novel = sensed
+        capture, velocity_mps, footprint_m, here = sensed
+        grid, novel = self._covered(capture.t_s, here, due)
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids = self._senses.task()
         descriptor = Descriptor(
@@ -211,6 +220,15 @@ class Agent:
         self._log.descriptor(self._env.now, claimed, len(datagram))
         # a drone that lies decides by its true state
         return decode_descriptor(payload if claimed is descriptor else self._encode(descriptor))
+
+    def _covered(self, now_s: float, here: View, told: bool) -> tuple[bytes, bool]:
+        """The coverage grid, by the latest look, and whether it shows what the fleet had not seen; nothing without a look."""
+        look = self._look
+        if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
+            return NOTHING_SEEN, False
+        grid = placed(look.view, here.row, here.column)
+        new = self._chart.new(well_cells(grid, here.row, here.column), self.memory.believed, told)
+        return (marked(grid, here.row, here.column, new), True) if new else (grid, False)
 
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s

@@ -1,32 +1,51 @@
-"""Footprint and coverage grid of a drone, from geometry alone.
+"""The coverage grid: which ground a drone's cameras saw, how well, and what of it nobody had seen before.
 
 The grid is 16 × 16 cells of 12.8 m, north-aligned and snapped to the world's 12.8 m lattice, so that two drones'
 grids can be compared cell by cell. It covers the ±102.4 m that the perception covers.
+
+A cell is seen where a camera's picture shows its middle, and at least half of its open ground has a free line of sight.
+It is seen well where the picture is as fine there as the network's map. Roofs hold no cars, so they are no open ground.
 """
 
 from __future__ import annotations
 
 import math
-from typing import overload
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from typing import NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from sortie.perception.geometry import FULL
+from sortie.perception.geometry import FOCAL_PX, FULL, camera_depth_m
+from sortie.perception.scene.height_field import HeightField
+from sortie.policies.catalogue.coverage_cells import Cells, seen_well
+from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS, Coverage, Descriptor
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
-from sortie.policies.contract import COVERAGE_CELLS, Coverage
 
 Array = npt.NDArray[np.float64]
+States = npt.NDArray[np.uint8]
 
 HALF_FIELD_OF_VIEW_DEG = 35.0
 """Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
 RANGE_M = FULL.half_extent_m
 """From the drone to each edge of the square that perception covers."""
+WELL_PIXEL_M2 = FULL.image_m**2
+"""A cell is seen well where a camera pixel covers at most this much ground: a pixel of the map that the network reads."""
+LOOK_STANDS_S = 1.0
+"""A look older than this says nothing of what a drone sees."""
 NOVEL_FLAG, TARGET_FLAG = 1, 2
+NOTHING_SEEN = bytes(COVERAGE_BYTES)
+SAMPLES = 2
+"""Lines of sight to a cell: so many a side."""
+SIGHT_MOVES_M = CELL_M / 4
+"""Lines of sight are followed again when the drone has flown so far. Over this way a roof 10 m high moves its shadow,
+seen from 60 m, by half a metre."""
 _HALF_FIELD_OF_VIEW_TAN = math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
 _HALF = COVERAGE_CELLS // 2
-_CELLS = np.arange(COVERAGE_CELLS)
-_PLACES = np.array([1, 4, 16, 64], np.uint8)
+_MIDDLES_M = ((np.arange(COVERAGE_CELLS) - _HALF + 0.5) * CELL_M).astype(np.float32)
+_BYTE_PLACES = np.array([1, 4, 16, 64], np.uint8)
 
 
 @overload
@@ -39,39 +58,166 @@ def footprint_radius_m(height_m: float | Array) -> float | Array:
     return radius_m
 
 
-def pack_grid(states: npt.NDArray[np.uint8]) -> bytes:
+def pack_grid(states: States) -> bytes:
     """16 × 16 coverage states (rows from south, columns from west) to 64 B, lowest bits first."""
-    return (states.astype(np.uint8).reshape(-1, 4) @ _PLACES).tobytes()
+    return (states.astype(np.uint8).reshape(-1, 4) @ _BYTE_PLACES).tobytes()
 
 
-def unpack_grid(grid: bytes) -> npt.NDArray[np.uint8]:
+def unpack_grid(grid: bytes) -> States:
     """The inverse of `pack_grid`: uint8 [16, 16]."""
     packed = np.frombuffer(grid, np.uint8)[:, None]
-    states: npt.NDArray[np.uint8] = (packed >> np.array([0, 2, 4, 6], np.uint8)) & np.uint8(3)
+    states: States = (packed >> np.array([0, 2, 4, 6], np.uint8)) & np.uint8(3)
     return states.reshape(COVERAGE_CELLS, COVERAGE_CELLS)
 
 
-def survey(x_m: npt.ArrayLike, y_m: npt.ArrayLike, radius_m: npt.ArrayLike) -> list[tuple[bytes, bool]]:
-    """One drone's coverage statements along its way, all at once.
+class View(NamedTuple):
+    """What a drone's cameras see at one moment: states unseen, poor and well, placed where it believes to be."""
+
+    row: int
+    """Row and column, in the world's lattice, of the grid's south-west cell."""
+    column: int
+    grid: bytes
+
+
+class Poses(NamedTuple):
+    """Where drones are, and where they believe they are; arrays [frames, drones, ...]."""
+
+    position_m: Array
+    orientation_xyzw: Array
+    yaw_rad: Array
+    est_position_m: Array
+    est_yaw_rad: Array
+
+
+def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array) -> States:
+    """How well cameras see the cells around them where nothing stands in between: uint8 [..., 16, 16].
+
+    The ground that a pixel covers is depth³ ÷ (focal length² · height), with the depth along the camera's axis: the
+    projection of a pinhole camera onto level ground, at any attitude.
 
     Args:
-        x_m, y_m: [K] where it believes it is at each look, ENU, in the order of time.
-        radius_m: [K] its footprint radius.
-
-    Returns:
-        At each look the grid, and whether any cell is seen well for the first time.
+        x_m, y_m: [...] from the corner between the grid's four middle cells to the drone, east and north.
+        height_m: [...] above the ground.
+        body: [..., 3, 3] the attitude, body (FLU) to ENU.
     """
-    x, y, radius = (np.asarray(v, dtype=float)[:, None] for v in (x_m, y_m, radius_m))
-    columns = np.floor(x / CELL_M).astype(np.int64) - _HALF + _CELLS  # [K, 16] of the world's lattice
-    rows = np.floor(y / CELL_M).astype(np.int64) - _HALF + _CELLS
-    distance_m = np.hypot(((columns + 0.5) * CELL_M - x)[:, None, :], ((rows + 0.5) * CELL_M - y)[:, :, None])
-    well = distance_m <= radius[:, None]
-    states = (distance_m <= RANGE_M).astype(np.uint8)  # UNSEEN or POOR
-    states[well] = Coverage.WELL
-    look, row, column = np.nonzero(well)  # in the order of looks, so that a cell's first entry is its first sight
-    north, east = rows[look, row] - rows.min(initial=0), columns[look, column] - columns.min(initial=0)
-    _, first = np.unique(north * (columns.max(initial=0) - columns.min(initial=0) + 1) + east, return_index=True)
-    states[look[first], row[first], column[first]] = Coverage.NOVEL
-    novel = np.zeros(len(states), bool)
-    novel[look[first]] = True
-    return list(zip(map(pack_grid, states), novel.tolist(), strict=True))
+    east, north = ((_MIDDLES_M - np.asarray(v, np.float32)[..., None]) for v in (x_m, y_m))
+    east, north, up = east[..., None, :], north[..., :, None], np.asarray(height_m, np.float32)[..., None, None]
+    turn = body.astype(np.float32)[..., None, None]
+    x, y, z = (
+        turn[..., 0, k, :, :] * east + turn[..., 1, k, :, :] * north - turn[..., 2, k, :, :] * up for k in range(3)
+    )
+    depth = camera_depth_m(x, y, z)
+    near = east * east + north * north <= np.float32(RANGE_M**2)
+    well = depth * depth * depth <= np.float32(WELL_PIXEL_M2 * FOCAL_PX**2) * up
+    states: States = (near & np.isfinite(depth)).astype(np.uint8) + (near & well).astype(np.uint8)
+    return states
+
+
+def attitude(orientation_xyzw: Array, turn_rad: Array | float = 0.0) -> Array:
+    """The matrices [..., 3, 3] that take the body's axes (FLU) to ENU, turned about the vertical."""
+    flat = Rotation.from_quat(orientation_xyzw.reshape(-1, 4)).as_matrix().reshape(*orientation_xyzw.shape[:-1], 3, 3)
+    c, s = np.cos(turn_rad)[..., None], np.sin(turn_rad)[..., None]
+    east, north, up = flat[..., 0, :], flat[..., 1, :], flat[..., 2, :]
+    return np.stack([c * east - s * north, s * east + c * north, up], axis=-2)
+
+
+def views(poses: Poses, field: HeightField) -> list[list[View]]:
+    """What every drone's cameras see in every frame: views [frames][drones].
+
+    What is hidden follows from where the drone is. The cells are those of where it believes to be.
+    """
+    believed = poses.est_position_m[..., :2].astype(np.float32).astype(np.float64)  # as the wire rounds it
+    middle = np.floor(believed / CELL_M)  # the cell below the drone: its south-west corner is the grid's middle
+    corner = (middle - _HALF).astype(np.int64)
+    away = believed - middle * CELL_M
+    turn = poses.est_yaw_rad - poses.yaw_rad
+    states = camera_states(
+        away[..., 0], away[..., 1], poses.position_m[..., 2], attitude(poses.orientation_xyzw, turn)
+    )  # fmt: skip
+    states *= _in_sight(poses, corner, -turn, field)
+    packed = states.reshape(*states.shape[:2], COVERAGE_BYTES, 4) @ _BYTE_PLACES
+    return [
+        [View(row, column, grid.tobytes()) for (column, row), grid in zip(at, grids, strict=True)]
+        for at, grids in zip(corner.tolist(), packed, strict=True)
+    ]
+
+
+def _in_sight(poses: Poses, corner: npt.NDArray[np.int64], turn: Array, field: HeightField) -> npt.NDArray[np.bool_]:
+    """Whether half of each cell's open ground has a line of sight: [frames, drones, 16, 16].
+
+    Lines are followed where a drone has flown `SIGHT_MOVES_M` or its grid has moved; the frames in between keep them.
+    """
+    moved = np.zeros(turn.shape)
+    moved[1:] = np.cumsum(np.linalg.norm(np.diff(poses.position_m, axis=0), axis=-1), axis=0)
+    key = np.concatenate([corner, (moved // SIGHT_MOVES_M).astype(np.int64)[..., None]], axis=-1)
+    renewed = np.ones(turn.shape, bool)
+    renewed[1:] = (key[1:] != key[:-1]).any(axis=-1)
+    frame, drone = np.nonzero(renewed)
+    at = np.maximum.accumulate(np.where(renewed, np.cumsum(renewed.ravel()).reshape(renewed.shape) - 1, 0), axis=0)
+    eye, believed = poses.position_m[frame, drone], poses.est_position_m[frame, drone, :2]
+    steps = (np.arange(COVERAGE_CELLS * SAMPLES) + 0.5) * (CELL_M / SAMPLES)
+    east = (corner[frame, drone, 0] * CELL_M - believed[:, 0])[:, None, None] + steps
+    north = (corner[frame, drone, 1] * CELL_M - believed[:, 1])[:, None, None] + steps[:, None]
+    c, s = np.cos(turn[frame, drone])[:, None, None], np.sin(turn[frame, drone])[:, None, None]
+    x = eye[:, 0, None, None] + c * east - s * north
+    y = eye[:, 1, None, None] + s * east + c * north
+    ground = field.open(x.ravel(), y.ravel())
+    ground &= np.broadcast_to(east * east + north * north <= (RANGE_M + CELL_M) ** 2, x.shape).ravel()
+    which = np.flatnonzero(ground)
+    free = np.zeros(len(ground), bool)
+    free[which] = field.seen(x.ravel()[which], y.ravel()[which], eye[which // steps.size**2])
+    cells = (len(frame), COVERAGE_CELLS, SAMPLES, COVERAGE_CELLS, SAMPLES)
+    seen, there = (v.reshape(cells).sum(axis=(2, 4), dtype=np.int8) for v in (free, ground))
+    enough: npt.NDArray[np.bool_] = (2 * seen >= there) & (there > 0)
+    return enough[at]
+
+
+class Chart:
+    """The ground that the fleet has seen well, as far as one drone knows: from its own looks and its peers' grids."""
+
+    def __init__(self) -> None:
+        self._known: set[tuple[int, int]] = set()
+
+    def fold(self, claims: Iterable[Descriptor]) -> None:
+        """Take note of all that peers see well. Once a second is enough, for cells stay in sight for longer."""
+        for claim in claims:
+            self._known |= seen_well(claim)
+
+    def new(self, cells: Cells, claims: Callable[[], Iterable[Descriptor]], told: bool) -> Cells:
+        """Those of the cells that a drone sees well that are newly seen by the fleet.
+
+        Args:
+            cells: what it sees well.
+            claims: gives the latest descriptors of the peers that it believes; called where they matter.
+            told: whether the answer goes on the air. From then on the cells are known.
+        """
+        new = cells - self._known
+        if new:
+            for claim in claims():
+                new -= seen_well(claim)
+                if not new:
+                    break
+            if told:
+                self._known |= cells
+        return new
+
+
+@lru_cache(maxsize=256)
+def placed(view: View, row: int, column: int) -> bytes:
+    """The grid of a view, on the cells of a grid whose south-west cell is (row, column)."""
+    north, east = row - view.row, column - view.column
+    if not (north or east):
+        return view.grid
+    states = np.zeros((3 * COVERAGE_CELLS,) * 2, np.uint8)
+    states[COVERAGE_CELLS:-COVERAGE_CELLS, COVERAGE_CELLS:-COVERAGE_CELLS] = unpack_grid(view.grid)
+    north, east = (COVERAGE_CELLS + min(max(by, -COVERAGE_CELLS), COVERAGE_CELLS) for by in (north, east))
+    return pack_grid(states[north : north + COVERAGE_CELLS, east : east + COVERAGE_CELLS])
+
+
+def marked(grid: bytes, row: int, column: int, new: Cells) -> bytes:
+    """The grid with some of its cells marked as newly seen."""
+    out = bytearray(grid)
+    for at_row, at_column in new:
+        cell = (at_row - row) * COVERAGE_CELLS + at_column - column
+        out[cell // 4] |= Coverage.NOVEL << 2 * (cell % 4)
+    return bytes(out)

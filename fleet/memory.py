@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
 from sortie.fleet.plane import DroneStatus, PlaneRules
@@ -99,6 +100,10 @@ class PeerMemory:
             known[doubted] = discounted(known[doubted])
         return FleetView(self.drone, self._period_s, known, self.ages_s(now_s), self._rules.detached_after_periods)
 
+    def believed(self) -> list[Descriptor]:
+        """The latest descriptors of the peers that it does not doubt."""
+        return [d for i, d in self._claims.items() if i != self.drone and i not in self._doubted]
+
     def trust_in(self, peer: int) -> float:
         """Trust in a peer, 0 … 1. The fusion weight of its payloads is multiplied by it."""
         return self._standings.get(peer, UNJUDGED).trust
@@ -111,12 +116,15 @@ class PeerMemory:
         """
         before = self._standings
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
+        looking: set[int] = set()
         heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             claimed_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
             arrivals[i], later = split_arrivals(came, claimed_s)
+            if any(claimed_s - a.sent_s < LOOK_STANDS_S / 2 for a in arrivals[i]):
+                looking.add(i)
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
-        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form)
+        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form, looking)
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
         return [(peer, after[peer]) for peer in heard if after[peer].trust != before.get(peer, UNJUDGED).trust]

@@ -5,16 +5,16 @@ It follows from the motion alone, so it is computed for many frames and all dron
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from sortie.fleet.coverage import footprint_radius_m, survey
+from sortie.fleet.coverage import Poses, View, footprint_radius_m, views
 from sortie.fleet.flight.motion import Trajectories
+from sortie.perception.scene.height_field import HeightField
 from sortie.perception.types import Capture
 
-COVERAGE_PERIOD_S = 1.0
-"""The coverage grid is renewed this often: at 5 m/s a drone crosses a 12.8 m cell in 2.6 s."""
-_BLOCK = 256
-"""Frames worked out at once: a long flight of a large fleet need not be held as Python objects."""
+_BLOCK = 32
+"""Frames worked out at once: a long flight need not be held as Python objects, and a new way loses few of them."""
 
 Vector = tuple[float, float, float]
 
@@ -25,21 +25,18 @@ class Sensed(NamedTuple):
     capture: Capture
     velocity_mps: Vector
     footprint_radius_m: float
-    coverage_grid: bytes
-    novel: bool
-    """Whether the grid shows a cell well for the first time."""
+    view: View
+    """What its cameras see, if it looks."""
 
 
 class FlightSenses:
     """What all drones sense; `at(frame)[drone]`. Sensors trigger with the frame."""
 
-    def __init__(self, motion: Trajectories, frame_s: float) -> None:
-        self._motion, self._frame_s = motion, frame_s
+    def __init__(self, motion: Trajectories, frame_s: float, field: HeightField) -> None:
+        """Args: `field`: what hides the ground from the drones' cameras."""
+        self._motion, self._frame_s, self._field = motion, frame_s, field
         self._first = -_BLOCK
         self._block: list[tuple[Sensed, ...]] = []
-        self._frames_a_look = max(1, round(COVERAGE_PERIOD_S / frame_s))
-        x_m, y_m, z_m = motion.est_position_m[:: self._frames_a_look].transpose(2, 1, 0)  # [N, looks]
-        self._looks = [survey(*track) for track in zip(x_m, y_m, footprint_radius_m(z_m), strict=True)]
 
     def at(self, frame: int) -> tuple[Sensed, ...]:
         """Every drone in this frame."""
@@ -51,11 +48,13 @@ class FlightSenses:
         self._first = frame // _BLOCK * _BLOCK
         frames = slice(self._first, self._first + _BLOCK)
         m = self._motion
-        self._block = list(zip(*(self._of(drone, frames) for drone in range(m.position_m.shape[1])), strict=True))
+        states = m.position_m, m.orientation_xyzw, m.yaw_rad, m.est_position_m, m.est_yaw_rad
+        seen = zip(*views(Poses(*(v[frames] for v in states)), self._field), strict=True)
+        self._block = list(zip(*(self._of(drone, frames, view) for drone, view in enumerate(seen)), strict=True))
 
-    def _of(self, drone: int, frames: slice) -> list[Sensed]:
+    def _of(self, drone: int, frames: slice, views: Sequence[View]) -> list[Sensed]:
         """One drone in some frames."""
-        m, looks, each = self._motion, self._looks[drone], self._frames_a_look
+        m = self._motion
         position, orientation, velocity, believed = (
             map(tuple, states[frames, drone].tolist())
             for states in (m.position_m, m.orientation_xyzw, m.velocity_mps, m.est_position_m)
@@ -63,9 +62,9 @@ class FlightSenses:
         yaw = m.est_yaw_rad[frames, drone].tolist()
         radius = footprint_radius_m(m.est_position_m[frames, drone, 2]).tolist()
         return [
-            Sensed(Capture(drone, frame * self._frame_s, *pose), v, r, *looks[frame // each])
-            for frame, v, r, *pose in zip(
-                range(frames.start, frames.start + len(yaw)), velocity, radius, position, orientation, believed, yaw,
-                strict=True,
+            Sensed(Capture(drone, frame * self._frame_s, *pose), v, r, view)
+            for frame, v, r, view, *pose in zip(
+                range(frames.start, frames.start + len(yaw)), velocity, radius, views, position, orientation, believed,
+                yaw, strict=True,
             )
         ]  # fmt: skip

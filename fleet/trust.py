@@ -1,7 +1,7 @@
 """Trust in what peers claim: each claim is held against what the listener can check for itself.
 
-Coverage is held against the pose beside it (how far can it see from there, given how far others see from their
-heights), goodput against the payloads that arrived, and battery against the fleet's: in flight no charge comes back,
+Coverage is held against the pose beside it (what its cameras can show from there) and against the payloads of its
+looks (who looks sees something), goodput against the payloads that arrived, and battery against the fleet's: in flight no charge comes back,
 and no drone flies for nothing. Doubts have to last: a judgement is made once a second, and only the second in a row
 that finds something lowers trust. Without a doubt trust is exactly 1.
 
@@ -11,25 +11,24 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
-from sortie.fleet.coverage import RANGE_M, unpack_grid
+from sortie.fleet.coverage import LOOK_STANDS_S, attitude, camera_states, unpack_grid
 from sortie.fleet.messages.compact import FULL, Form
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
 JUDGED_EVERY_S = 1.0
 
 # --- coverage
-MISPLACED_M = COVERAGE_CELL_M * 2**0.5 + 1.0
-"""A grid stands for a second while its pose moves on, so that it may be read a cell off along both axes."""
 FALSE_CELLS = 4
-"""So many cells that cannot be so are a doubt."""
+"""So many cells that cannot be so are a doubt, and so few cells of a drone that looks."""
 
 # --- goodput
 LARGE_BYTES = 10_000
@@ -117,6 +116,7 @@ def judge(
     known: Mapping[int, Descriptor],
     arrivals: Mapping[int, Sequence[Arrival]],
     form: Form = FULL,
+    looking: Container[int] = (),
 ) -> dict[int, Standing]:
     """What `ego` thinks of everyone after one more second.
 
@@ -125,12 +125,12 @@ def judge(
         known: the latest descriptor of every drone that it heard since it last judged, and its own.
         arrivals: payloads that reached it in this second, by sender.
         form: how finely descriptors are written; what rounding can do is no doubt.
+        looking: who looked shortly before its claim, as payloads of that look show.
 
     Returns:
         Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
-    seen_per_metre = _metres_seen_per_metre_up(known)
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
     # who was not heard drained on: its fall, once it is heard again, is over this second too
@@ -143,7 +143,7 @@ def judge(
         if peer != ego:
             others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
             doubt = (
-                (coverage_doubt(claim, seen_per_metre, form.blur_m) if math.isfinite(form.blur_m) else "")
+                (coverage_doubt(claim, form.blur_m, peer in looking) if math.isfinite(form.blur_m) else "")
                 or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
@@ -180,30 +180,30 @@ def discounted(d: Descriptor) -> Descriptor:
 
 
 @lru_cache(maxsize=1024)  # a claim is judged by everyone who heard it
-def coverage_doubt(d: Descriptor, seen_per_metre: float, blur_m: float = 0.0) -> str:
-    """What a coverage grid says that its pose forbids; empty where it may be so.
+def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False) -> str:
+    """What a coverage grid says that its pose or its payloads forbid; empty where it may be so.
+
+    How much is hidden from a drone, others cannot know. A drone that looks sees some of the ground.
 
     Args:
         d: the claim.
-        seen_per_metre: footprint radius over height, as the fleet's cameras have it.
         blur_m: how far a cell may be off by the descriptor's form.
+        looks: whether the drone is known to look.
     """
-    x_m, y_m, z_m = d.position_m
-    radius_m = min(d.footprint_radius_m, max(0.0, z_m) * seen_per_metre * 1.1)
-    margin_m = MISPLACED_M + blur_m + float(np.hypot(*d.velocity_mps[:2])) * 0.1
-    row, column = d.coverage_corner
-    along = np.arange(COVERAGE_CELLS) + 0.5
-    away_m = np.hypot((column + along) * COVERAGE_CELL_M - x_m, ((row + along) * COVERAGE_CELL_M - y_m)[:, None])
     states = unpack_grid(d.coverage_grid)
-    well = states >= Coverage.WELL
-    too_far = int(np.count_nonzero(well & (away_m > radius_m + margin_m)))
-    if too_far >= FALSE_CELLS:
-        return f"coverage: {too_far} cells seen well beyond {radius_m + margin_m:.0f} m"
-    kept_back = (~well & (away_m < radius_m - margin_m)) | (
-        (states == Coverage.UNSEEN) & (away_m < RANGE_M - margin_m)
-    )  # fmt: skip
-    missing = int(np.count_nonzero(kept_back))
-    return f"coverage: {missing} cells unseen that it must see" if missing >= FALSE_CELLS else ""
+    row, column = d.coverage_corner
+    half, (x_m, y_m, z_m) = COVERAGE_CELLS // 2, d.position_m
+    away_x, away_y = x_m - (column + half) * COVERAGE_CELL_M, y_m - (row + half) * COVERAGE_CELL_M
+    could = camera_states(np.array(away_x), np.array(away_y), np.array(z_m), attitude(np.array(d.orientation_xyzw)))
+    flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
+    reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # and a cell, since the drone may have turned since it looked
+    possible = binary_dilation(could >= Coverage.WELL, np.ones((3, 3)), iterations=reach)
+    false = int(np.count_nonzero((states >= Coverage.WELL) & ~possible))
+    if false >= FALSE_CELLS:
+        return f"coverage: {false} cells seen well that its cameras cannot show so"
+    if looks and np.count_nonzero(states) < FALSE_CELLS:
+        return f"coverage: {np.count_nonzero(states)} cells seen by a drone that looks"
+    return ""
 
 
 def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival], step_mbps: float = 0.0) -> str:
@@ -255,8 +255,3 @@ def split_arrivals(arrivals: Sequence[Arrival], claimed_s: float) -> tuple[list[
     if claimed_s - max(sent_s, default=claimed_s) > apart_s + ROUNDING_S:
         before = [a._replace(size_bytes=0) for a in before]
     return before, [a for a in arrivals if a.t_done_s > claimed_s]
-
-
-def _metres_seen_per_metre_up(known: Mapping[int, Descriptor]) -> float:
-    """Footprint radius over height, the median over the fleet, to a percent."""
-    return round(median([d.footprint_radius_m / max(d.position_m[2], 1.0) for d in known.values()]), 2)

@@ -24,6 +24,8 @@ WIDTH_PX, HEIGHT_PX = 160, 90
 HALF_H = float(np.tan(np.radians(35.0)))
 """Tangent of half the cameras' horizontal field of view."""
 HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
+FOCAL_PX = 0.5 * WIDTH_PX / HALF_H
+"""The cameras' focal length in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,17 @@ def camera_margins(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
     forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
     u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
     return down, 1.0 - np.maximum(u, v)
+
+
+def camera_depth_m(x: Any, y: Any, z: Any) -> Any:
+    """How far points lie in front of the camera that shows them largest, along its axis; infinite where none shows them.
+
+    Args:
+        x, y, z: the points in the body frame (FLU), metres, arrays.
+    """
+    down, side = camera_margins(x, y, z)
+    ahead = (np.maximum(np.abs(x), np.abs(y)) - z) / np.sqrt(2.0, dtype=np.float32)
+    return np.minimum(np.where(down > 0.0, -z, np.inf), np.where(side > 0.0, ahead, np.inf))
 
 
 def in_square(

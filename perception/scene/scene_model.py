@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
+from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.town import Town
 from sortie.perception.scene.traffic import (
     TARGET_COLOUR,
@@ -56,6 +58,11 @@ class SceneModel:
         self._parked_ids = np.arange(first, n + first)
         self._moving_ids = np.arange(n + first, n + m + first)
         self._xy_at: tuple[float, np.ndarray] | None = None
+
+    @cached_property
+    def height_field(self) -> HeightField:
+        """Roofs and crowns inside `rect`: what stands between a drone and the ground."""
+        return HeightField(self.town, self.rect)
 
     @property
     def parked_cars(self) -> Cars:

@@ -16,7 +16,7 @@ from sortie.perception.geometry import FULL, camera_margins
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
-from sortie.perception.surrogate.line_of_sight import HeightField, Kerbs, next_of
+from sortie.perception.surrogate.kerbs import Kerbs, next_of
 from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]
@@ -154,7 +154,7 @@ class Eyes:
 
     def __init__(self, scene: SceneModel) -> None:
         self.traffic = Traffic(scene)
-        self._field, self._kerbs = HeightField(scene), Kerbs(scene)
+        self._field, self._kerbs = scene.height_field, Kerbs(scene)
         config = scene.config
         self._light = np.array([config.overcast, config.brightness, 1.0 / np.tan(np.radians(config.sun_elevation_deg))])
         parked = self.traffic.parked_xy

@@ -10,17 +10,22 @@ from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, 
 Cells = frozenset[tuple[int, int]]
 """(row, column) in the world's lattice of 12.8 m."""
 
+_PLACES = {
+    least: tuple(tuple(k for k in range(4) if (byte >> 2 * k) & 3 >= least) for byte in range(256))
+    for least in (Coverage.POOR, Coverage.WELL)
+}
+"""Which of a byte's four cells are seen at least so well."""
 _HALF_DIAGONAL_M = COVERAGE_CELL_M * 2**0.5 / 2
 
 
 def seen_well(d: Descriptor) -> Cells:
     """Cells that a drone reports as seen well, new ones included."""
-    return _cells(d.coverage_grid, *d.coverage_corner)
+    return well_cells(d.coverage_grid, *d.coverage_corner)
 
 
 def seen_at_all(d: Descriptor) -> Cells:
     """Cells that a drone reports as seen, well or poorly: its map has them."""
-    return _cells(d.coverage_grid, *d.coverage_corner, Coverage.POOR)
+    return well_cells(d.coverage_grid, *d.coverage_corner, Coverage.POOR)
 
 
 def centre_cell(d: Descriptor) -> Cells:
@@ -29,15 +34,11 @@ def centre_cell(d: Descriptor) -> Cells:
     return frozenset(((row + COVERAGE_CELLS // 2, column + COVERAGE_CELLS // 2),))
 
 
-@lru_cache(maxsize=4096)  # a grid is valid for a second and every drone reads it
-def _cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) -> Cells:
-    seen = []
-    for i, byte in enumerate(grid):
-        for k in range(4):
-            if (byte >> (2 * k)) & 3 >= least:
-                cell = 4 * i + k
-                seen.append((row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS))
-    return frozenset(seen)
+@lru_cache(maxsize=4096)  # every drone reads a grid
+def well_cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) -> Cells:
+    """Cells of a grid that are seen at least so well; (row, column) is its south-west cell."""
+    cells = [4 * i + k for i, byte in enumerate(grid) if byte for k in _PLACES[least][byte]]
+    return frozenset([(row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS) for cell in cells])
 
 
 @lru_cache(maxsize=4096)

@@ -11,7 +11,6 @@ import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ import numpy as np
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TARGET_SIZE_M
-from sortie.perception.surrogate.line_of_sight import HeightField
 from sortie.perception.tracking.following import followed
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes, Capture
@@ -155,14 +153,10 @@ class TargetSeen:
         """The targets that each capture shows."""
         return [self._seen(capture) for capture in captures]
 
-    @cached_property
-    def _heights(self) -> HeightField:
-        return HeightField(self._scene)
-
     def _seen(self, capture: Capture) -> Boxes:
         pose = np.array([path.pose(capture.t_s) for path in self._scene.targets])
         position, attitude = np.array([capture.position_m]), np.array([capture.orientation_xyzw])
         seen = sees_ground(pose[None, :, :2], position, attitude)[0]
-        seen &= self._heights.seen(pose[:, 0], pose[:, 1], np.repeat(position, len(pose), axis=0))
+        seen &= self._scene.height_field.seen(pose[:, 0], pose[:, 1], np.repeat(position, len(pose), axis=0))
         size = np.tile(TARGET_SIZE_M[:2], (len(pose), 1))
         return Boxes(pose[:, :2], size, pose[:, 2], np.ones(len(pose))).take(seen)

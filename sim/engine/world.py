@@ -90,7 +90,7 @@ class World:
         self._scenario, self._recorder = scenario, recorder
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
-        self._flight = FlightSenses(motion, scenario.frame_s)
+        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field)
         recorder.unfold["states"] = self._unfold_states
         self.busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
         """Share of a frame in which a drone's computer runs perception, when it senses: its compute delay."""
@@ -147,7 +147,7 @@ class World:
         """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
-        self._flight = FlightSenses(motion, self._scenario.frame_s)
+        self._flight = FlightSenses(motion, self._scenario.frame_s, self.scene.height_field)
         self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
 
     def drain(self) -> None:

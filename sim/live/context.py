@@ -70,9 +70,9 @@ class ReplaySenses:
 
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
         motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
-        self._flight = FlightSenses(motion, scenario.frame_s)
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
+        self._flight = FlightSenses(motion, scenario.frame_s, self._scene.height_field)
         self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace

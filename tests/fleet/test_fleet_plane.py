@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.fleet import gate
-from sortie.fleet.coverage import CELL_M, RANGE_M, footprint_radius_m, pack_grid, survey, unpack_grid
+from sortie.fleet.coverage import footprint_radius_m, pack_grid, unpack_grid
 from sortie.fleet.gate import Gate, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
-from sortie.policies.contract import Coverage, Directive, Disc, Representation
+from sortie.policies.contract import Directive, Disc, Representation
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 ORIGIN = (0.0, 0.0, 0.0)
@@ -168,35 +166,3 @@ def test_grid_packs_into_64_bytes_and_back(states: list[int]) -> None:
     packed = pack_grid(grid)
     assert len(packed) == 64
     assert np.array_equal(unpack_grid(packed), grid)
-
-
-def test_what_was_seen_is_novel_once() -> None:
-    (first, novel), (again, seen), (moved, anew) = survey([0.0, 0.0, 60.0], [0.0, 0.0, 0.0], [42.0] * 3)
-    assert (novel, seen, anew) == (True, False, True)
-    grids = [unpack_grid(g) for g in (first, again)]
-    area = np.count_nonzero(grids[0] == Coverage.NOVEL) * CELL_M**2
-    assert area == pytest.approx(math.pi * 42.0**2, rel=0.15)
-    assert np.array_equal(grids[0] == Coverage.NOVEL, grids[1] == Coverage.WELL)
-    assert grids[0][0, 0] == Coverage.UNSEEN, "the square's corner is beyond the range"
-    assert np.count_nonzero(grids[1] == Coverage.POOR) > 100
-    assert {Coverage.WELL, Coverage.NOVEL} <= set(unpack_grid(moved).ravel().tolist())
-
-
-@given(st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(0, 60)), min_size=1, max_size=12))
-def test_a_survey_is_its_looks_one_after_the_other(looks: list[tuple[float, float, float]]) -> None:
-    """Against the plain way: a cell at a time, and a memory of what was seen."""
-    seen: set[tuple[int, int]] = set()
-    for (x_m, y_m, radius_m), (grid, novel) in zip(looks, survey(*zip(*looks, strict=True)), strict=True):
-        expected, fresh = np.zeros((16, 16), np.uint8), False
-        west, south = math.floor(x_m / CELL_M) - 8, math.floor(y_m / CELL_M) - 8
-        for row in range(16):
-            for column in range(16):
-                cell = (south + row, west + column)
-                away_m = np.hypot((cell[1] + 0.5) * CELL_M - x_m, (cell[0] + 0.5) * CELL_M - y_m)
-                if away_m <= radius_m:
-                    expected[row, column] = Coverage.WELL if cell in seen else Coverage.NOVEL
-                    fresh |= cell not in seen
-                    seen.add(cell)
-                elif away_m <= RANGE_M:
-                    expected[row, column] = Coverage.POOR
-        assert (unpack_grid(grid).tolist(), novel) == (expected.tolist(), fresh)

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from fleet_examples import grid_on_a_plain
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.coverage import survey
+from sortie.fleet.coverage import View, placed, unpack_grid
 from sortie.fleet.lies import falsified
 from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
 from sortie.fleet.trust import (
@@ -22,16 +23,14 @@ from sortie.fleet.trust import (
     judge,
     split_arrivals,
 )
-from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, TaskPhase
-
-SEEN_PER_METRE = 0.7
+from sortie.policies.contract import COVERAGE_CELL_M, Coverage, Descriptor, TaskPhase
 
 
 def honest(drone: int, x_m: float = 0.0, y_m: float = 0.0, soc: float = 0.9, goodput: float = 100.0) -> Descriptor:
     """A drone at 60 m that says what it sees."""
-    ((grid, novel),) = survey([x_m], [y_m], [42.0])
+    grid = grid_on_a_plain(x_m, y_m, 60.0)
     return Descriptor(
-        0, drone, (x_m, y_m, 60.0), (0, 0, 0, 1), (0, 0, 0), 42.0, soc, 1, 1, (goodput,) * 4, grid, int(novel),
+        0, drone, (x_m, y_m, 60.0), (0, 0, 0, 1), (0, 0, 0), 42.0, soc, 1, 1, (goodput,) * 4, grid, 0,
         TaskPhase.SEARCH, None,
     )  # fmt: skip
 
@@ -49,7 +48,7 @@ def after(seconds: int, lie: tuple[str, str] | None = None, since: int = 0) -> d
         known = fleet(second)
         if lie is not None and second >= since:
             known[1] = falsified(known[1], *lie)  # type: ignore[arg-type]
-        standings = judge(standings, 0, known, {1: [Arrival(160_000, 0.02, 600.0)]})
+        standings = judge(standings, 0, known, {1: [Arrival(160_000, 0.02, 600.0)]}, looking={1})
     return standings
 
 
@@ -98,31 +97,44 @@ def test_who_left_is_remembered_as_it_was() -> None:
 metres = st.floats(-2000, 2000)
 
 
-@given(metres, metres, st.floats(0, 2 * math.pi), st.floats(0, 12), st.floats(0, 1), st.floats(20, 120))
+@given(
+    metres, metres, st.floats(0, 2 * math.pi), st.floats(0, 12), st.floats(0, 1), st.floats(20, 120), st.floats(0, 28)
+)
 def test_an_honest_grid_is_never_doubted(
-    x_m: float, y_m: float, heading: float, speed_mps: float, since_s: float, height_m: float
+    x_m: float, y_m: float, heading: float, speed_mps: float, since_s: float, height_m: float, tilt_deg: float
 ) -> None:
-    """A grid of up to a second ago beside the pose of now, at any place, height and speed up to 12 m/s."""
-    radius_m = SEEN_PER_METRE * height_m
+    """A look of up to a second ago beside the pose of now, at any place, height, tilt and speed up to 12 m/s."""
     vx, vy = speed_mps * math.cos(heading), speed_mps * math.sin(heading)
-    ((grid, _),) = survey([x_m - since_s * vx], [y_m - since_s * vy], [radius_m])
-    d = honest(1)._replace(
-        position_m=(x_m, y_m, height_m), velocity_mps=(vx, vy, 0.0), footprint_radius_m=radius_m, coverage_grid=grid
-    )
-    assert coverage_doubt(d, SEEN_PER_METRE) == ""
+    half = math.radians(tilt_deg) / 2
+    tilted = (math.sin(half) * math.cos(heading), math.sin(half) * math.sin(heading), 0.0, math.cos(half))
+    then = x_m - since_s * vx, y_m - since_s * vy
+    row, column = (math.floor(v / COVERAGE_CELL_M) for v in reversed(then))
+    d = honest(1)._replace(position_m=(x_m, y_m, height_m), velocity_mps=(vx, vy, 0.0), orientation_xyzw=tilted)
+    here = d.coverage_corner
+    seen = View(row - 8, column - 8, grid_on_a_plain(*then, height_m, tilted))
+    assert coverage_doubt(d._replace(coverage_grid=placed(seen, *here)), looks=height_m < 100) == ""
 
 
-def test_a_footprint_that_no_camera_of_the_fleet_has_does_not_excuse_a_grid() -> None:
+def test_a_drone_that_does_not_look_may_see_nothing() -> None:
+    """One that sends payloads of its own looks sees something."""
+    blind = honest(1)._replace(coverage_grid=bytes(64))
+    assert coverage_doubt(blind) == ""
+    assert coverage_doubt(blind, looks=True) == "coverage: 0 cells seen by a drone that looks"
+
+
+def test_a_footprint_does_not_excuse_a_grid() -> None:
     d = falsified(honest(1), "coverage", "much")._replace(footprint_radius_m=500.0)
-    assert coverage_doubt(d, SEEN_PER_METRE).startswith("coverage: ")
+    assert coverage_doubt(d).startswith("coverage: ")
 
 
 def test_the_check_counts_cells_that_cannot_be() -> None:
-    away = np.hypot(*np.meshgrid(*[(np.arange(16) - 8 + 0.5) * COVERAGE_CELL_M] * 2))
-    limit_m = 42.0 + COVERAGE_CELL_M * 2**0.5 + 1.0
+    """All but those seen well on a plain, and two cells around them."""
+    seen = unpack_grid(honest(1).coverage_grid) >= Coverage.WELL
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    assert seen[np.ix_(rows, columns)].all(), "a rectangle"
+    expected = 256 - (len(rows) + 2) * (len(columns) + 2)
     lie = falsified(honest(1), "coverage", "much")
-    expected = f"coverage: {int((away > limit_m).sum())} cells seen well beyond {limit_m:.0f} m"
-    assert coverage_doubt(lie, SEEN_PER_METRE) == expected
+    assert coverage_doubt(lie) == f"coverage: {expected} cells seen well that its cameras cannot show so"
 
 
 # --- goodput and battery -------------------------------------------------------------------------

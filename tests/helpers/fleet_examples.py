@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.fleet.coverage import attitude, camera_states, pack_grid
+from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, Directive, Disc, Representation, TaskPhase
 
 DESCRIPTOR = Descriptor(
     stamp_ns=61_300_000_001,
@@ -95,3 +96,9 @@ directives = (
         )
     )
 )
+
+
+def grid_on_a_plain(x_m: float, y_m: float, z_m: float, xyzw: tuple[float, ...] = (0, 0, 0, 1)) -> bytes:
+    """The coverage grid of a drone that looks from here, with nothing in between and nothing new."""
+    at = [v - np.floor(v / COVERAGE_CELL_M) * COVERAGE_CELL_M for v in (x_m, y_m)]
+    return pack_grid(camera_states(*np.array([*at, z_m]), attitude(np.array(xyzw, float))))

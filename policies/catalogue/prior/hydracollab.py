@@ -13,7 +13,7 @@ from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import Directive, FleetView, Representation
 
 AGREEMENT = 0.3
-"""Cells of both over cells of either. Two footprints of 42 m reach this at a distance of about 40 m."""
+"""Cells of both over cells of either."""
 
 
 @among_attached

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from functools import partial
 
 import pytest
-from fleet_examples import DESCRIPTOR, descriptors
+from fleet_examples import DESCRIPTOR, descriptors, grid_on_a_plain
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sortie.fleet.coverage import pack_grid, survey, unpack_grid
+from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.auth import Dropped, DropReason, open_datagram
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.compact import (
@@ -91,7 +91,7 @@ def test_a_coarse_cell_is_as_most_of_its_fine_ones() -> None:
 
 
 def test_a_fine_grid_comes_back_as_it_was() -> None:
-    ((grid, _),) = survey([10.0], [20.0], [42.0])
+    grid = grid_on_a_plain(10.0, 20.0, 60.0)
     assert decode_compact(encode_compact(SANE._replace(coverage_grid=grid), Form())).coverage_grid == grid
 
 

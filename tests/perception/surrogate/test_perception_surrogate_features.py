@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sortie.perception.scene.height_field import RES_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, CaptureColumns, Eyes, axes
-from sortie.perception.surrogate.line_of_sight import NEAR_M, RES_M, Kerbs, next_of
+from sortie.perception.surrogate.kerbs import NEAR_M, Kerbs, next_of
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene, Target
 

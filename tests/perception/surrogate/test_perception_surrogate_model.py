@@ -15,13 +15,13 @@ from perception_examples import EMPTY, cross
 from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
+from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import FUSED_COVARIATES, FeatureShares, covariates, pair
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Eyes
 from sortie.perception.surrogate.fit import BANDS as QUANTILES
 from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
-from sortie.perception.surrogate.line_of_sight import CAR_TOP_M, HeightField
 from sortie.perception.surrogate.model import (
     BAND,
     FORMAT,
@@ -284,7 +284,7 @@ def test_sight_is_a_ray_against_boxes() -> None:
     """Houses alone, against rays that are stepped finely through the rectangles themselves."""
     scene = SceneModel(Scene(tree_density=0.0), None, (-50, -50, 50, 50))
     houses = np.concatenate([b.buildings for b in scene.town.blocks(-120, -120, 120, 120)])
-    field, n = HeightField(scene), 600
+    field, n = scene.height_field, 600
     x, y = RNG.uniform(-80, 80, n), np.round(RNG.uniform(-80, 80, n) / 80) * 80 + RNG.uniform(-5, 5, n)
     eye = np.stack([RNG.uniform(-50, 50, n), RNG.uniform(-50, 50, n), np.full(n, 60.0)], axis=1)
     z = np.arange(CAR_TOP_M, 30.0, 0.1)[:, None]
@@ -298,7 +298,7 @@ def test_sight_is_a_ray_against_boxes() -> None:
 
 
 def test_nothing_hides_on_an_empty_plain() -> None:
-    field = HeightField(SceneModel(EMPTY, None, (-50, -50, 50, 50)))
+    field = SceneModel(EMPTY, None, (-50, -50, 50, 50)).height_field
     eye = np.tile((0.0, 0.0, 60.0), (9, 1))
     assert field.seen(np.linspace(-90, 90, 9), np.zeros(9), eye).all()
     assert field.lit(np.zeros(3), np.zeros(3)).all()

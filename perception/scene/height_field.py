@@ -4,37 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.scene.town import Floats, shadow_m
+from sortie.perception.scene.town import Floats, Town, shadow_m
 
 RES_M = 0.8
 STEP_M = 1.0
 """Heights between which a ray is not looked at."""
 CAR_TOP_M = 1.2
 """What of a car has to be seen over a roof or a hedge."""
-NEAR_M = 8.0
 _RAYS = 16384
 
 
 class HeightField:
     """Roofs and crowns of the town inside a scene's rectangle, on a 0.8 m raster; beyond it the land is flat."""
 
-    def __init__(self, scene: SceneModel) -> None:
-        x0, y0, x1, y1 = scene.rect
+    def __init__(self, town: Town, rect: tuple[float, float, float, float]) -> None:
+        """Args: `rect`: x_min, y_min, x_max, y_max, ENU metres."""
+        x0, y0, x1, y1 = rect
         self.x0_m, self.y0_m = x0, y0
         self.columns, self.rows = int(np.ceil((x1 - x0) / RES_M)) + 2, int(np.ceil((y1 - y0) / RES_M)) + 2
         height = np.zeros((self.rows, self.columns), np.float32)
-        blocks = scene.town.blocks(x0, y0, x1, y1)
+        blocks = town.blocks(x0, y0, x1, y1)
         buildings = np.concatenate([b.buildings for b in blocks])
         at = np.rint((buildings[:, :4] - (x0, y0, x0, y0)) / RES_M).astype(int).clip(0)
         for (left, low, right, high), top in zip(at.tolist(), buildings[:, 4].tolist(), strict=True):
             height[low:high, left:right] = top
+        self._roofed = (height > 0.0).ravel()
         _plant(height, np.concatenate([b.trees for b in blocks]), x0, y0)
         self.top_m = float(height.max(initial=0.0))
         self._flat = height.ravel()
-        self._sun = shadow_m(scene.config)
+        self._sun = shadow_m(town.scene)
 
     def seen(self, x_m: Floats, y_m: Floats, eye_m: Floats) -> NDArray[np.bool_]:
         """Whether points [n] at a car's height are seen from `eye_m` [n, 3]."""
@@ -44,6 +43,11 @@ class HeightField:
     def lit(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         """Whether the sun reaches points [n] at a car's height."""
         return self._march(x_m, y_m, *(np.full(len(x_m), -along) for along in self._sun))
+
+    def open(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
+        """Whether points [n] lie on the ground, beneath no roof."""
+        pixel = ((y_m - self.y0_m) / RES_M).astype(np.intp) * self.columns + ((x_m - self.x0_m) / RES_M).astype(np.intp)
+        return np.asarray(~self._roofed.take(pixel, mode="clip"))
 
     def _march(self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats) -> NDArray[np.bool_]:
         """Follow rays upwards; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
@@ -65,41 +69,6 @@ class HeightField:
                 pixel += px.astype(np.intp)
                 clear[some] &= self._flat.take(pixel, mode="clip") < CAR_TOP_M + (k + 0.5) * STEP_M
         return clear
-
-
-class Kerbs:
-    """How near parked cars are, on a raster of its own: 1 at one's middle, 0 from 8 m on."""
-
-    def __init__(self, scene: SceneModel) -> None:
-        x0, y0, x1, y1 = scene.rect
-        self.x0_m, self.y0_m = x0, y0
-        self.columns, self.rows = int((x1 - x0) / RES_M) + 2, int((y1 - y0) / RES_M) + 2
-        cars = scene.parked_cars  # all inside
-        reach = int(NEAR_M / RES_M)
-        span = np.arange(-reach, reach + 1)
-        about = np.maximum(0.0, 1.0 - RES_M * np.hypot(span[:, None], span) / NEAR_M).astype(np.float32)
-        rim = 2 * reach  # for cars at the edge
-        near = np.zeros((self.rows + rim, self.columns + rim), np.float32)
-        low, left = ((cars.y_m - y0) / RES_M).astype(int), ((cars.x_m - x0) / RES_M).astype(int)
-        for k, j in zip(low.tolist(), left.tolist(), strict=True):
-            window = near[k : k + len(span), j : j + len(span)]
-            np.maximum(window, about, out=window)
-        self._flat = near[reach:-reach, reach:-reach].ravel()
-        gap_m = np.hypot(*next_of(np.stack([cars.x_m, cars.y_m], axis=1)).T)
-        self.parked = np.maximum(0.0, 1.0 - gap_m / NEAR_M).astype(np.float32)
-        """Each parked car's nearness to the next one."""
-
-    def near(self, x_m: Floats, y_m: Floats) -> NDArray[np.float32]:
-        """How near points [n] are to a parked car."""
-        row, column = ((y_m - self.y0_m) / RES_M).astype(np.intp), ((x_m - self.x0_m) / RES_M).astype(np.intp)
-        return self._flat.take(row * self.columns + column, mode="clip")
-
-
-def next_of(xy: Floats) -> Floats:
-    """From every point to the one next to it [n, 2]; inf where there is none."""
-    if len(xy) < 2:
-        return np.full(xy.shape, np.inf)
-    return np.asarray(xy[cKDTree(xy).query(xy, k=2)[1][:, 1]] - xy)
 
 
 def _plant(height: NDArray[np.float32], trees: Floats, x0_m: float, y0_m: float) -> None:

@@ -1,0 +1,169 @@
+"""Coverage: what cameras show, what the scene hides, and what is new to the fleet."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sortie.fleet.coverage import (
+    CELL_M,
+    RANGE_M,
+    Chart,
+    Poses,
+    View,
+    marked,
+    placed,
+    unpack_grid,
+    views,
+)
+from sortie.perception.benchmark.visibility import in_a_camera, past_houses, past_trees
+from sortie.perception.geometry import FOCAL_PX, FULL
+from sortie.perception.scene.height_field import CAR_TOP_M
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Capture
+from sortie.policies.catalogue.coverage_cells import seen_well, well_cells
+from sortie.policies.contract import Coverage, Descriptor, TaskPhase
+from sortie.scenarios.schema import Scene
+
+BOUNDS = (-100.0, -100.0, 100.0, 100.0)
+PLAIN = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, BOUNDS)
+DENSE = SceneModel(Scene(style="old_town", building_density=1.0, building_height_m=18.0), None, BOUNDS)
+RNG = np.random.default_rng(21)
+
+
+def poses(position_m: np.ndarray, tilt_deg: float = 0.0, heading_deg: float = 0.0) -> Poses:
+    """One drone that knows where it is, tilted forwards."""
+    turn = Rotation.from_euler("zy", [heading_deg, tilt_deg], degrees=True).as_quat()
+    at = np.atleast_2d(position_m).astype(float)[:, None]
+    heading = np.full(at.shape[:2], math.radians(heading_deg))
+    return Poses(at, np.broadcast_to(turn, (*at.shape[:2], 4)), heading, at, heading)
+
+
+def seen(scene: SceneModel, position_m: object, tilt_deg: float = 0.0) -> np.ndarray:
+    ((view,),) = views(poses(np.array(position_m), tilt_deg), scene.height_field)
+    return unpack_grid(view.grid)
+
+
+def test_houses_hide_ground() -> None:
+    """The old grids were a disc, whatever stood below."""
+    free, hidden = seen(PLAIN, (5.0, 3.0, 60.0)), seen(DENSE, (5.0, 3.0, 60.0))
+    assert (hidden <= free).all()
+    assert (hidden > 0).sum() < 0.6 * (free > 0).sum()
+
+
+def test_a_tilted_camera_looks_elsewhere() -> None:
+    level, tilted = seen(PLAIN, (5.0, 3.0, 60.0)), seen(PLAIN, (5.0, 3.0, 60.0), 28.0)
+    assert (level > 0).sum() == pytest.approx(math.pi * RANGE_M**2 / CELL_M**2, rel=0.05), (
+        "level, nearly all in range is in a picture"
+    )
+    ahead, behind = tilted[:, 8:] > 0, tilted[:, :8] > 0
+    assert ahead.sum() < 0.7 * behind.sum(), "nose down, the cameras that look ahead see the ground below"
+
+
+def test_pixels_on_the_ground_decide_how_well() -> None:
+    """Below 60 m a pixel of the camera that looks down is finer than the map's; from 120 m none is."""
+    finest_m = FULL.image_m * FOCAL_PX
+    assert (seen(PLAIN, (5.0, 3.0, 0.99 * finest_m)) == Coverage.WELL).any()
+    assert not (seen(PLAIN, (5.0, 3.0, 1.2 * finest_m)) == Coverage.WELL).any()
+    assert (seen(PLAIN, (5.0, 3.0, 1.2 * finest_m)) == Coverage.POOR).any()
+
+
+def test_against_single_rays() -> None:
+    """Each cell by closed forms: boxes and domes for the scene, axes for the cameras. No code is shared."""
+    scene = SceneModel(Scene(), None, BOUNDS)
+    blocks = scene.town.blocks(-260, -260, 260, 260)
+    houses, trees = (np.concatenate([getattr(b, of) for b in blocks]) for of in ("buildings", "trees"))
+    agree, cells = 0, 0
+    for _ in range(4):
+        x, y, tilt = *RNG.uniform(-80, 80, 2), RNG.uniform(0, 20)
+        eye = np.array([x, y, 60.0])
+        where = poses(eye, tilt, heading_deg=30.0)
+        ((view,),) = views(where, scene.height_field)
+        capture = Capture(0, 0.0, tuple(eye), tuple(where.orientation_xyzw[0, 0]), tuple(eye), math.radians(30.0))
+        expected = np.zeros((16, 16), bool)
+        for row in range(16):
+            for column in range(16):
+                east, north = (view.column + column) * CELL_M, (view.row + row) * CELL_M
+                middle = np.array([[east + CELL_M / 2, north + CELL_M / 2, 0.0]])
+                if np.hypot(*(middle[0, :2] - eye[:2])) > RANGE_M or not in_a_camera(capture, middle)[0]:
+                    continue
+                at = np.array(
+                    [(east + a * CELL_M, north + b * CELL_M, CAR_TOP_M) for a in (0.25, 0.75) for b in (0.25, 0.75)]
+                )
+                px, py = at[:, :1], at[:, 1:2]
+                roofed = ((px > houses[:, 0]) & (px < houses[:, 2]) & (py > houses[:, 1]) & (py < houses[:, 3])).any(
+                    axis=1
+                )
+                free = ~roofed & ~past_houses(at, eye, houses) & ~past_trees(at, eye, trees)
+                expected[row, column] = (~roofed).any() and 2 * free.sum() >= (~roofed).sum()
+        agree += int(((unpack_grid(view.grid) > 0) == expected).sum())
+        cells += 256
+        assert 60 < expected.sum() < 230
+    assert agree / cells > 0.96  # the field is a raster of 0.8 m
+
+
+def test_cells_are_those_of_the_believed_place_and_the_scene_is_that_of_the_true_one() -> None:
+    true = poses(np.array([5.0, 3.0, 60.0]))
+    off = true._replace(est_position_m=true.est_position_m + np.array([2 * CELL_M, 0.0, 0.0]))
+    ((view,),), ((shifted,),) = (views(p, DENSE.height_field) for p in (true, off))
+    assert shifted.grid == view.grid
+    assert (shifted.row, shifted.column) == (view.row, view.column + 2)
+
+
+def test_frames_between_rays_keep_their_lines_of_sight() -> None:
+    """Within the way after which rays are followed again, the grid is nearly the one of its own frame."""
+    way = np.stack([np.linspace(-20, 20, 60), np.full(60, 3.0), np.full(60, 60.0)], axis=1)
+    together = [view for (view,) in views(poses(way), DENSE.height_field)]
+    alone = [views(poses(at), DENSE.height_field)[0][0] for at in way]
+    assert [v[:2] for v in together] == [v[:2] for v in alone]
+    differ = [np.mean(unpack_grid(a.grid) != unpack_grid(b.grid)) for a, b in zip(together, alone, strict=True)]
+    assert np.mean(differ) < 0.02
+
+
+@given(st.integers(-20, 20), st.integers(-20, 20))
+def test_a_moved_grid_keeps_its_cells(north: int, east: int) -> None:
+    view = View(3, -7, seen_grid := views(poses(np.array([5.0, 3.0, 60.0])), DENSE.height_field)[0][0].grid)
+    row, column = 3 + north, -7 + east
+    kept = well_cells(placed(view, row, column), row, column)
+    assert kept == {c for c in well_cells(seen_grid, 3, -7) if 0 <= c[0] - row < 16 and 0 <= c[1] - column < 16}
+
+
+# --- what is new -----------------------------------------------------------------------------------
+
+
+def claim(grid: bytes, x_m: float, y_m: float) -> Descriptor:
+    return Descriptor(
+        0, 1, (x_m, y_m, 60.0), (0, 0, 0, 1), (0, 0, 0), 42.0, 0.9, 1, 1, (), grid, 0, TaskPhase.SEARCH, None
+    )  # fmt: skip
+
+
+def test_new_is_what_neither_the_drone_nor_a_peer_saw() -> None:
+    ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
+    cells = well_cells(view.grid, view.row, view.column)
+    chart, nobody = Chart(), list
+    assert chart.new(cells, nobody, told=False) == cells, "not told, so that it stays new"
+    assert chart.new(cells, nobody, told=True) == cells
+    assert chart.new(cells, nobody, told=True) == set()
+    moved = frozenset((row, column + 3) for row, column in cells)
+    assert chart.new(moved, nobody, told=False) == moved - cells
+    assert chart.new(moved, lambda: [claim(view.grid, 5.0 + 3 * CELL_M, 3.0)], told=False) == set()
+
+
+def test_what_a_peer_saw_once_stays_known() -> None:
+    ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
+    heard, chart = claim(view.grid, 5.0, 3.0), Chart()
+    chart.fold([heard])
+    assert chart.new(seen_well(heard), list, told=True) == set()
+
+
+def test_marks_are_on_the_new_cells_alone() -> None:
+    ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
+    cells = sorted(well_cells(view.grid, view.row, view.column))[:7]
+    new = unpack_grid(marked(view.grid, view.row, view.column, frozenset(cells))) == Coverage.NOVEL
+    rows, columns = np.nonzero(new)
+    assert list(zip((rows + view.row).tolist(), (columns + view.column).tolist(), strict=True)) == cells
