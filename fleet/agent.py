@@ -160,9 +160,8 @@ class Agent:
         env, rules = self._env, self._rules
         for frame in range(rules.frames):
             yield env.timeout(max(0.0, frame * rules.period_s + self._phase_s - env.now))
-            if not self.status.airborne:
-                return
-            self._tick(frame)
+            if self.status.airborne:  # it may come back
+                self._tick(frame)
 
     def _tick(self, frame: int) -> None:
         sensed = self._senses.sense(frame)

@@ -49,7 +49,7 @@ class DroneStatus:
     """
 
     airborne: bool = True
-    """False from the moment when the drone lands or is lost."""
+    """False while the drone is on the ground or lost."""
     perceiving: bool = False
     """Whether perception runs in the current frame."""
     clock_skew_s: float = 0.0
@@ -60,5 +60,5 @@ class DroneStatus:
     """Falsifications of the drone's descriptors, by the index of the scenario event that causes them."""
 
     def leave(self) -> None:
-        """The drone leaves the plane for good."""
-        self.airborne = False
+        """The drone leaves the plane."""
+        self.airborne = self.perceiving = False

@@ -273,6 +273,11 @@ class Air:
                 self._close(s, _LOST, "sender_gone")
         self.medium.retune()
 
+    def wake(self, drone: int) -> None:
+        """A silenced drone is back: it sends and hears again."""
+        self._gone.discard(drone)
+        self.medium.retune()
+
     def _refuse(self, event: simpy.Event) -> None:
         s = cast(Sample, event.value)
         if s.number in self._in_flight:

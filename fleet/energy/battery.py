@@ -205,12 +205,17 @@ class FleetBatteries:
         self._read_off(drone)
 
     def land(self, drone: int, reason: str = "") -> None:
-        """Take a drone out of the air, for good; its pack is at rest. `reason` is left out where its charge is the reason."""
+        """Take a drone out of the air; its pack is at rest. `reason` is left out where its charge is the reason."""
         self.landed[drone] = True
         self.landing_reason[drone] = reason or self._charge(drone)
         self.current_a[drone] = 0.0
         self._polarised_v[drone] = 0.0
         self._read_off(drone)
+
+    def take_off(self, drone: int) -> None:
+        """Put a drone into the air, unless its charge would land it at once."""
+        self.landed[drone] = self.soc[drone] <= self._config.landing_soc
+        self.landing_reason[drone] = self._charge(drone) if self.landed[drone] else ""
 
     def _charge(self, drone: int) -> str:
         return f"charge {self.soc[drone]:.1%}"

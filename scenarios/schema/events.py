@@ -33,6 +33,16 @@ class DroneLost(BaseEvent):
     drone: DroneId = Field(description="Who falls silent and leaves.")
 
 
+class DroneJoins(BaseEvent):
+    kind: Literal["drone_joins"]
+    drone: DroneId = Field(description="Who joins the fleet; before its first such event it is on the ground.")
+
+
+class DroneLeaves(BaseEvent):
+    kind: Literal["drone_leaves"]
+    drone: DroneId = Field(description="Who goes home: it publishes landing, descends and leaves.")
+
+
 class BatteryFault(BaseEvent):
     kind: Literal["battery_fault"]
     drone: DroneId = Field(description="Whose battery fails.")
@@ -74,5 +84,6 @@ class Lie(BaseEvent):
 
 
 Event = Annotated[
-    LinkDrop | Jam | DroneLost | BatteryFault | CellFailure | ClockSkew | Spoof | Lie, Field(discriminator="kind")
+    LinkDrop | Jam | DroneLost | DroneJoins | DroneLeaves | BatteryFault | CellFailure | ClockSkew | Spoof | Lie,
+    Field(discriminator="kind"),
 ]

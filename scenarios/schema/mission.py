@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, inconsistent
+from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, Soc, inconsistent
 
 
 class Target(Section):
@@ -38,6 +38,9 @@ class Group(Section):
     phases: tuple[Phase, ...] = Field(
         min_length=1, max_length=100, description="The group's phases, in place of mission.phases."
     )
+    reserve: tuple[DroneId, ...] = Field(
+        (), max_length=200, description="Drones of the group that wait on the ground and take over, in this order."
+    )
 
 
 class Mission(Section):
@@ -49,6 +52,11 @@ class Mission(Section):
     groups: tuple[Group, ...] = Field(
         (), max_length=100, description="Drones with phases of their own; all others fly mission.phases."
     )
+
+    handover_soc: Soc | None = Field(
+        None, description="At this charge a drone of a group with a reserve goes home; left out, none does."
+    )
+    descent_mps: float = Field(3.0, gt=0, le=10, description="How fast a drone that goes home descends.")
 
     @property
     def targets(self) -> tuple[Target, ...]:
@@ -78,6 +86,10 @@ class Mission(Section):
                 if drone in seen:
                     raise inconsistent(("groups", k, "drones", i), f"{drone}", "in one group, it is named above")
                 seen.add(drone)
+            for i, drone in enumerate(group.reserve):
+                if drone not in group.drones or drone in group.reserve[:i]:
+                    bound = f"one of the group's drones {sorted(group.drones)}, named once"
+                    raise inconsistent(("groups", k, "reserve", i), f"{drone}", bound)
         return self
 
 

@@ -18,6 +18,8 @@ from sortie.scenarios.schema import (
     BatteryFault,
     CellFailure,
     ClockSkew,
+    DroneJoins,
+    DroneLeaves,
     DroneLost,
     Event,
     Jam,
@@ -27,6 +29,7 @@ from sortie.scenarios.schema import (
     Spoof,
 )
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import World, at, with_frame
 
@@ -38,13 +41,16 @@ def group_key(seed: int) -> bytes:
     return hashlib.sha256(b"sortie group key" + struct.pack("<Q", seed)).digest()
 
 
-def schedule(scenario: Scenario, world: World, transport: Transport, *, seed: int, replication: int) -> None:
+def schedule(
+    scenario: Scenario, world: World, transport: Transport, membership: Membership, *, seed: int, replication: int
+) -> None:
     """Put every event of the scenario on the clock; call once, before anything else is scheduled.
 
     Events and their ends come before the frame that begins at the same instant.
     """
     begins = [
-        _Begin(scenario, world, transport, e, index, seed, replication) for index, e in enumerate(scenario.events)
+        _Begin(scenario, world, transport, membership, e, index, seed, replication)
+        for index, e in enumerate(scenario.events)
     ]
     for begin in begins:
         at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
@@ -62,12 +68,14 @@ class _Begin:
         scenario: Scenario,
         world: World,
         transport: Transport,
+        membership: Membership,
         event: Event,
         index: int,
         seed: int,
         replication: int,
     ) -> None:
         self.scenario, self.world, self.transport, self.event = scenario, world, transport, event
+        self.membership = membership
         self.index, self.seed, self.replication = index, seed, replication
 
     def __call__(self) -> None:
@@ -84,6 +92,12 @@ class _Begin:
                 world.drain()  # what it has spent up to now
                 if world.drones[event.drone].airborne:
                     world.remove(event.drone, "drone_lost", "fell silent")
+            case DroneJoins():
+                world.drain()
+                self.membership.join(event.drone)
+            case DroneLeaves():
+                world.drain()
+                self.membership.go_home(event.drone)
             case BatteryFault():
                 world.drain()
                 if world.drones[event.drone].airborne:  # who left the air spends nothing any more

@@ -31,6 +31,7 @@ from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
+from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
@@ -108,6 +109,7 @@ class Parts:
     air: Air
     world: World
     transport: Transport
+    membership: Membership
     choreography: Choreography | None
     """None where no policy chooses viewpoints."""
     pilots: Sequence[Pilot]
@@ -192,10 +194,11 @@ def build(
     scorer = None
     if detector is not None:
         scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks)
-    schedule(scenario, world, transport, seed=seed, replication=replication)
+    membership = Membership(scenario, world)
+    schedule(scenario, world, transport, membership, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
-        scenario, env, recorder, scene, batteries, air, world, transport, choreography, pilots, agents, detector, scorer,
+        scenario, env, recorder, scene, batteries, air, world, transport, membership, choreography, pilots, agents, detector, scorer,
         audit, notes, journal,
     )  # fmt: skip
 
@@ -214,7 +217,8 @@ def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Obser
 
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
-    world.start(each_second, None if parts.choreography is None else parts.choreography.renew)
+    moves = [] if parts.choreography is None else [parts.choreography.renew]
+    world.start(each_second, [parts.membership.renew, *moves])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

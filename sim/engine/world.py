@@ -28,7 +28,7 @@ from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.tracking.wire import content
 from sortie.perception.types import Capture
-from sortie.policies.contract import Disc
+from sortie.policies.contract import Disc, TaskPhase
 from sortie.radio import Air
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
@@ -100,21 +100,26 @@ class World:
         self._frame = 0
         self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
         self._headrooms = [(1.0, 1.0)] * n
-        self._down_since: dict[int, int] = {}  # the frame in which a drone left the air, where it stays
+        self._down: dict[
+            int, list[tuple[int, int]]
+        ] = {}  # the frames in which a drone is on the ground, where it stays
+        self.homebound: set[int] = set()
+        """Drones that descend."""
         self.now = plan.at(0.0)
         """Each group's mission in this frame: the ground station's cue comes with the frame."""
 
-    def start(self, on_second: Callable[[float], None], before_frame: Callable[[int], None] | None = None) -> None:
+    def start(self, on_second: Callable[[float], None], before_frame: Sequence[Callable[[int], None]] = ()) -> None:
         """Begin the world's process; call once, before the agents start.
 
         Args:
             on_second: called once a simulated second; must not change anything.
-            before_frame: called at the begin of each frame, before the links are computed. It may reroute the fleet.
+            before_frame: called in turn at the begin of each frame, before the links are computed. They may reroute the
+                fleet.
         """
         self.env.process(self._run(on_second, before_frame))
 
     def _run(
-        self, on_second: Callable[[float], None], before_frame: Callable[[int], None] | None
+        self, on_second: Callable[[float], None], before_frame: Sequence[Callable[[int], None]]
     ) -> Generator[simpy.Event, Any, None]:
         env, scenario = self.env, self._scenario
         frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
@@ -125,8 +130,8 @@ class World:
                 self._measure_headrooms()
             self._frame = frame
             self.now = self.plan.at(env.now)
-            if before_frame is not None:
-                before_frame(frame)
+            for prepare in before_frame:
+                prepare(frame)
             self.air.advance(self.extra_loss_db, list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
@@ -173,13 +178,38 @@ class World:
             if landed and status.airborne:
                 self.remove(drone, "landed", self.batteries.landing_reason[drone])
 
+    @property
+    def next_frame(self) -> int:
+        """The frame that begins now, or else the next one."""
+        return math.ceil(self.env.now / self._scenario.frame_s - 1e-6)
+
     def remove(self, drone: int, kind: str, text: str) -> None:
-        """A drone leaves the sortie: it is silent from now on, draws nothing, and stays where it is."""
-        self._down_since.setdefault(drone, int(self.env.now / self._scenario.frame_s + 1e-6))
-        self.drones[drone].leave()
+        """A drone leaves the fleet: it is silent from now on, draws nothing, and stays where it is."""
+        self.ground(drone)
+        self.note(drone, kind, text)
+
+    def ground(self, drone: int) -> None:
+        """As `remove`, without an event: before take-off."""
+        status = self.drones[drone]
+        if status.airborne:
+            since = int(self.env.now / self._scenario.frame_s + 1e-6)
+            self._down.setdefault(drone, []).append((since, self._scenario.frames))
+        status.leave()
+        self.homebound.discard(drone)
         self.air.silence(drone)
         self.batteries.land(drone)
-        self.note(drone, kind, text)
+
+    def join(self, drone: int, text: str) -> None:
+        """A drone on the ground appears in its slot, unless its charge would land it at once."""
+        self.batteries.take_off(drone)
+        if self.batteries.landed[drone]:
+            self.note(drone, "stays_down", self.batteries.landing_reason[drone])
+            return
+        since, _ = self._down[drone].pop()
+        self._down[drone].append((since, self.next_frame))
+        self.drones[drone].airborne = True
+        self.air.wake(drone)
+        self.note(drone, "drone_joins", text)
 
     def add_loss(self, drone: int, peer: int | None, loss_db: float) -> None:
         """Add loss to both directions of a link, or of every link of a drone."""
@@ -238,8 +268,10 @@ class World:
         now_s, frames, *changing = zip(*rows, strict=True)
         n, m = len(self.drones), self.motion
         at = np.tile(np.array(frames)[:, None], n)
-        for drone, since in self._down_since.items():
-            at[:, drone] = np.minimum(at[:, drone], since)
+        for drone, several in self._down.items():
+            for since, until in several:
+                down = (at[:, drone] >= since) & (at[:, drone] < until)
+                at[down, drone] = since
         of, still = np.arange(n), (at < np.array(frames)[:, None])[..., None]
         pose = (m.position_m[at, of], m.orientation_xyzw[at, of])
         moving = [np.where(still, 0.0, states[at, of]) for states in (m.velocity_mps, m.body_rates_radps)]
@@ -285,6 +317,8 @@ class OwnSenses:
 
     def task(self) -> Task:
         now_s, world = self._sensed.capture.t_s, self._world
+        if self._drone in world.homebound:
+            return Task(TaskPhase.LANDING, None)
         now = world.now[world.plan.group_of[self._drone]]
         return now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
 

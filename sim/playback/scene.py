@@ -9,6 +9,7 @@ the cells that peers sent in `sortie.sim.playback.received`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -138,18 +139,28 @@ class Drawing:
         self._seen(list(seen))
 
     def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
-        """Put drones that are down on the ground where they came down (the record lets them fly on), in place."""
-        for i in np.flatnonzero(~airborne.all(axis=0)).tolist():
-            first = int(np.argmin(airborne[:, i]))
-            if i not in self._resting:
-                before = position[first - 1, i] if first else self._last_position(i, position)
-                self._resting[i] = np.array([before[0], before[1], 0.3])
-                nothing = Boxes.empty()
-                self._sighting_rows(i, t_s[first : first + 1], [nothing], [nothing], [nothing])
-                grey = rr.Boxes3D.columns(colors=[c.FALLEN] * 4).partition([4])
-                self._canvas.columns(f"world/drones/{i}/body", t_s[first : first + 1], grey)
-            position[first:, i] = self._resting[i]
-            attitude[first:, i] = (0.0, 0.0, 0.0, 1.0)
+        """Put drones that are down on the ground where they came down (the record keeps their height), in place."""
+        for i in range(self._n):
+            turns = np.flatnonzero(np.diff(airborne[:, i])) + 1
+            for begin, end in pairwise([0, *turns.tolist(), len(t_s)]):
+                up = bool(airborne[begin, i]) if begin < end else True
+                if up == (i in self._resting):
+                    self._turn(i, t_s[begin], position[begin - 1, i] if begin else self._last_position(i, position), up)
+                if not up:
+                    position[begin:end, i] = self._resting[i]
+                    attitude[begin:end, i] = (0.0, 0.0, 0.0, 1.0)
+
+    def _turn(self, drone: int, t_s: float, last: Floats, up: bool) -> None:
+        """A drone comes down, or takes off again."""
+        if up:
+            del self._resting[drone]
+        else:
+            self._resting[drone] = np.array([last[0], last[1], 0.3])
+            nothing = Boxes.empty()
+            self._sighting_rows(drone, np.array([t_s]), [nothing], [nothing], [nothing])
+        paint = _body_colours(c.drone_colour(drone)) if up else [c.FALLEN] * 4
+        columns = rr.Boxes3D.columns(colors=paint).partition([4])
+        self._canvas.columns(f"world/drones/{drone}/body", np.array([t_s]), columns)
 
     def _last_position(self, drone: int, position: Floats) -> Floats:
         return np.asarray(self._history[-1, drone] if len(self._history) else position[0, drone])
@@ -259,6 +270,10 @@ def ground_image(rect: tuple[float, float, float, float], block_m: float) -> NDA
     return image
 
 
+def _body_colours(colour: c.Rgba) -> list[c.Rgba]:
+    return [(230, 230, 235, 255), (230, 230, 235, 255), colour, (255, 255, 255, 255)]
+
+
 def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
     """A quadrotor: nose, body and two crossed arms, four rotors."""
     arm = SPAN_M / 2 * np.sqrt(0.5)
@@ -274,8 +289,7 @@ def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
         ),
     )
     # Not static, because a drone that comes down goes grey; a static colour would win over that.
-    colours = [(230, 230, 235, 255)] * 2 + [colour, (255, 255, 255, 255)]
-    canvas.columns(f"{path}/body", np.zeros(1), rr.Boxes3D.columns(colors=colours).partition([4]))
+    canvas.columns(f"{path}/body", np.zeros(1), rr.Boxes3D.columns(colors=_body_colours(colour)).partition([4]))
     rotors = rr.Cylinders3D(
         lengths=[0.12] * 4, radii=[1.05] * 4, centers=[(x, y, 0.35) for x in (arm, -arm) for y in (arm, -arm)],
         colors=[(*colour[:3], 255)] * 4, fill_mode="solid",

@@ -29,6 +29,7 @@ DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"
 SPOOF = "events=[{kind: spoof, at_s: 1, drone: 1, until_s: 4}]"
 LIE = "events=[{kind: lie, at_s: 1, drone: 1, until_s: 4}]"
 LOST = "events=[{kind: drone_lost, at_s: 1, drone: 1}]"
+JOINS, LEAVES = (f"events=[{{kind: {kind}, at_s: 1, drone: 1}}]" for kind in ("drone_joins", "drone_leaves"))
 FAULT = "events=[{kind: battery_fault, at_s: 1, drone: 1, lost_fraction: 0.5}]"
 CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
@@ -155,6 +156,9 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "mission.more_targets.waypoints_m": ("[[0, 60], [90, 60]]", (OTHER, GROUP)),
     "mission.more_targets.speed_mps": ("8", (OTHER, GROUP)),
     "mission.groups.drones": ("[1]", (OTHER, GROUP)),
+    "mission.groups.reserve": ("[2]", (OTHER, GROUP)),
+    "mission.handover_soc": ("0.96", (OTHER, GROUP, "mission.groups.0.reserve=[2]")),
+    "mission.descent_mps": ("6", ("events=[{kind: drone_leaves, at_s: 1, drone: 1}]",)),
     "mission.groups.phases.at_s": ("2.5", (OTHER, GROUP)),
     "mission.groups.phases.phase": ("return", (OTHER, GROUP)),
     "mission.groups.phases.region.radius_m": ("20", (OTHER, GROUP)),
@@ -328,7 +332,7 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     assert after.fingerprint != before.fingerprint
 
 
-@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, FAULT, CELL, SKEW])
+@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW])
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
     assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
 
