@@ -53,7 +53,10 @@ class Perception(Section):
         description="What the torch detector's encoder and head reckon in; bfloat16 may be faster on processors with AMX, is as fast on those with AVX-512 BF16 alone, and far slower on others.",
     )
     sample_rate_hz: float = Field(
-        2.0, gt=0, le=10, description="How often accuracy is scored; traffic runs at context.rate_hz."
+        2.0,
+        gt=0,
+        le=10,
+        description="How often accuracy is scored, at times that keep time with no rate; traffic runs at context.rate_hz.",
     )
     tracking_rate_hz: float = Field(
         2.0,

@@ -20,6 +20,8 @@ from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySe
 from sortie.scenarios.schema.radio import Radio
 from sortie.scenarios.schema.record import RecordSection
 
+GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
+
 
 class Scenario(Section):
     """One sortie: who flies, why, over which air, seeing what, by which policy."""
@@ -105,11 +107,21 @@ class Scenario(Section):
         return math.ceil(round(self.duration_s * self.context.rate_hz, 9))
 
     @property
-    def scored_frames(self) -> list[int]:
-        """The frames in which accuracy is scored, `perception.sample_rate_hz` of them a second; the first one is."""
+    def scoring_periods(self) -> list[range]:
+        """The frames of each scoring period; there are `perception.sample_rate_hz` periods a second."""
         share = min(1.0, self.perception.sample_rate_hz / self.context.rate_hz)
         before = [math.floor((frame - 1) * share + 1e-9) for frame in range(self.frames + 1)]
-        return [frame for frame in range(self.frames) if before[frame + 1] > before[frame]]
+        begins = [frame for frame in range(self.frames) if before[frame + 1] > before[frame]]
+        return [range(begin, end) for begin, end in zip(begins, [*begins[1:], self.frames], strict=True)]
+
+    @property
+    def scored_frames(self) -> list[int]:
+        """The frames in which accuracy is scored: one of each scoring period, and the first frame of all.
+
+        A frame's place in its period follows the multiples of the golden ratio. They fill the period evenly and keep time
+        with no rate, so payloads of every rate are met at every age. All policies are scored in the same frames.
+        """
+        return [period[int(k * GOLDEN_RATIO % 1.0 * len(period))] for k, period in enumerate(self.scoring_periods)]
 
     @property
     def tracked_frames(self) -> list[int]:

@@ -144,12 +144,14 @@ def _disc_in_view(disc: Floats, pose: Floats, looking: Bools) -> Floats:
 
 
 def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) -> tuple[float | None, float | None]:
-    """Share of the scored instants at which a drone's boxes hold the target, and the longest time without."""
+    """Share of the scoring periods in which a drone's boxes hold the target, and the longest time without."""
     scenario, boxes = record.scenario, record.tables["detections"]
     if record.detector == "none" or not tracked:
         return None, None
     instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
-    instants = instants[instants < scenario.duration_s - _INSTANT_S]
+    periods_s = np.array([period.start for period in scenario.scoring_periods]) * scenario.frame_s
+    flown = instants < scenario.duration_s - _INSTANT_S
+    instants, lasts_s = instants[flown], np.diff(periods_s, append=scenario.duration_s)[flown]
     columns = ("x_m", "y_m", "length_m", "width_m", "yaw_rad")
     found = np.stack([boxes[c].to_numpy() for c in columns], axis=-1)
     of = np.searchsorted(instants, boxes["t_s"].to_numpy() - _INSTANT_S)
@@ -161,7 +163,7 @@ def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) 
         _, which, iou = overlapping(found, truth, of, np.arange(len(instants)))
         hit = np.zeros(len(instants), bool)
         hit[which[iou >= FOUND_IOU]] = True
-        seen.append((hit, now[frame], np.diff(instants, append=scenario.duration_s)))
+        seen.append((hit, now[frame], lasts_s))
     return _share_and_gap(seen)
 
 

@@ -83,6 +83,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "medium_busy_fraction": totals["medium_busy_fraction"],
         "age_s": _percentiles(tables["ages"]["age_s"]),
         "data_age_s": _percentiles(pc.list_flatten(tables["fusions"]["ages_s"])),
+        "data_age_mean_s": pc.mean(pc.list_flatten(tables["fusions"]["ages_s"])).as_py(),
         "descriptor_drops": _counts(tables["drops"]["reason"]),
         "battery": {d: v["soc"] for d, v in drones.items()},
         "drones": drones,

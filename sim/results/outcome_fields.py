@@ -84,7 +84,7 @@ class MissionOutcome(TypedDict):
     target_detected_share: Annotated[
         float | None,
         "Share of the time of phase `track`, 0 … 1, in which a box of at least one drone overlaps the target with an "
-        "IoU of at least 0.5. Each scored instant stands for the time until the next one.",
+        "IoU of at least 0.5. Each scored instant stands for its scoring period.",
         SHARE,
     ]
     target_longest_undetected_s: Annotated[
@@ -187,6 +187,7 @@ class Outcome(TypedDict):
     medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy.", SHARE]
     age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
     data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
+    data_age_mean_s: Annotated[float | None, "Its mean; it follows the mean over time, at any rate of sending."]
     descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
     battery: Annotated[dict[str, float], "State of charge as the last frame begins, by drone.", SHARE]
     drones: Annotated[dict[str, Drone], "Each as the last frame begins."]
