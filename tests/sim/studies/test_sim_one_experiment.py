@@ -25,11 +25,13 @@ FLIGHT = (
     "fleet.formation.spacing_m=18",
     "policy.dwell_s=0",
     "radio.shadowing_sigma_db=0",
-    "perception.sample_rate_hz=1",
+    "perception.sample_rate_hz=10",
 )
 SETTLED_S = 1.5
 """By then every descriptor was heard and every drone has sent."""
 CELL_BYTES = 160
+DELAY_S = 0.095
+"""From a frame's begin to its fusion."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,11 @@ def test_flown_and_evaluated_sharing_agree(recording: Path, name: str, budget: f
 
     sent = record.tables["transmissions"].to_pylist()
     assert {t["status"] for t in sent if t["captured_s"] < 5.5} == {"delivered"}, "the links are perfect"
-    at = {(round(t_s), ego): m for (t_s, ego), m in matched(record, mission=False).items() if t_s > SETTLED_S}
+    at = {
+        (round(t_s), ego): m
+        for (t_s, ego), m in matched(record, mission=False).items()
+        if t_s > SETTLED_S and round(t_s - DELAY_S, 6).is_integer()
+    }
     frames = sorted({t_s for t_s, _ in at})
     assert frames == [2, 3, 4, 5]
     for f in frames:
