@@ -188,7 +188,8 @@ class Directive(NamedTuple):
     rate_hz: float = 0.0
     deadline_s: float = 0.1
     fusion_weight: float = 1.0
-    """The weight that the receiver gives this link's payloads (trust × freshness), 0 … 1."""
+    """The weight of this link's payloads at the receiver, 0 … 1. The receiver multiplies it by its trust and by what each
+    payload's own age leaves, so a policy need not."""
     duty_percent: int = 100
     """Share of frames in which the source runs perception at all, 0 … 100."""
     reason: str = ""

@@ -11,8 +11,8 @@ AGEING = 0.5
 def freshness(age_s: float, period_s: float) -> float:
     """1 up to three periods of age, a half up to ten, then 0. It only compares, so that proofs can follow it.
 
-    It is one factor of a fusion weight. The other is the receiver's trust in the sender (`sortie.fleet.trust`), which
-    is applied where the payload is fused.
+    It says how far the sender can rely on what it knows of the receiver. It is one factor of a fusion weight. The receiver
+    adds its trust in the sender (`sortie.fleet.trust`) and what the payload's own age leaves (`sortie.perception.lateness`).
     """
     if age_s <= FRESH_PERIODS * period_s:
         return 1.0

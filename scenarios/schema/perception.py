@@ -70,7 +70,7 @@ class Perception(Section):
         0.5,
         gt=0,
         le=60,
-        description="Received payloads older than this are not fused; a drone that rested longer sees nothing.",
+        description="Received payloads older than this are not fused; a drone that rested longer has no look of its own.",
     )
     motion_compensation: bool = Field(
         True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
