@@ -84,6 +84,12 @@ def _fusion_age() -> Tables:
     }
 
 
+def _late_shares() -> Tables:
+    import late_shares
+
+    return {"late_shares": late_shares.table(towns=120)}
+
+
 def _fusion_methods() -> Tables:
     """Trains the methods that are not shipped for 120 steps from the study's `full-0`, then evaluates all of them."""
     import fusion_comparison
@@ -516,6 +522,7 @@ FIGURES: dict[str, Figure] = {
     "liars": Figure(4, _liars),
     "context_forms": Figure(4, _context_forms),
     "fusion_age": Figure(4, _fusion_age),
+    "late_shares": Figure(2, _late_shares),
     "link": Figure(5, _link),
     "transport": Figure(6, _transport),
     "paper": Figure(8, _paper),
