@@ -61,7 +61,7 @@ class Tracks:
 
     def take(self, which: NDArray[Any] | slice) -> Tracks:
         """The tracks at the given indices, under the given mask or in the given slice, in that order."""
-        return Tracks(*(getattr(self, f.name)[which] for f in fields(self)))
+        return Tracks(*[getattr(self, name)[which] for name in _FIELDS])
 
     @classmethod
     def empty(cls) -> Tracks:
@@ -73,7 +73,7 @@ class Tracks:
     @classmethod
     def join(cls, *several: Tracks) -> Tracks:
         """All tracks of several, in order."""
-        return cls(*(np.concatenate([getattr(t, f.name) for t in several]) for f in fields(cls)))
+        return cls(*[np.concatenate([getattr(t, name) for t in several]) for name in _FIELDS])
 
     @property
     def moves(self) -> Bools:
@@ -81,6 +81,9 @@ class Tracks:
         v = self.velocity_mps
         square: Floats = v[:, 0] * v[:, 0] + v[:, 1] * v[:, 1]
         return np.asarray(square > MOVES_AT**2 * self.covariance[:, 2])
+
+
+_FIELDS = tuple(f.name for f in fields(Tracks))
 
 
 def grown(covariance: Floats, dt_s: Floats) -> Floats:

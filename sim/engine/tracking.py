@@ -151,12 +151,18 @@ class TargetSeen:
 
     def __call__(self, captures: Sequence[Capture]) -> list[Boxes]:
         """The targets that each capture shows."""
-        return [self._seen(capture) for capture in captures]
-
-    def _seen(self, capture: Capture) -> Boxes:
-        pose = np.array([path.pose(capture.t_s) for path in self._scene.targets])
-        position, attitude = np.array([capture.position_m]), np.array([capture.orientation_xyzw])
-        seen = sees_ground(pose[None, :, :2], position, attitude)[0]
-        seen &= self._scene.height_field.seen(pose[:, 0], pose[:, 1], np.repeat(position, len(pose), axis=0))
-        size = np.tile(TARGET_SIZE_M[:2], (len(pose), 1))
-        return Boxes(pose[:, :2], size, pose[:, 2], np.ones(len(pose))).take(seen)
+        targets = self._scene.targets
+        pose = np.array([[path.pose(c.t_s) for path in targets] for c in captures]).reshape(len(captures), -1, 3)
+        position, attitude = (
+            np.array([c.position_m for c in captures]),
+            np.array([c.orientation_xyzw for c in captures]),
+        )
+        seen = sees_ground(pose[..., :2], position, attitude)
+        flat = pose.reshape(-1, 3)
+        eyes = np.repeat(position, len(targets), axis=0)
+        seen &= self._scene.height_field.seen(flat[:, 0], flat[:, 1], eyes).reshape(seen.shape)
+        size = np.tile(TARGET_SIZE_M[:2], (len(targets), 1))
+        return [
+            Boxes(each[:, :2], size, each[:, 2], np.ones(len(each))).take(here)
+            for each, here in zip(pose, seen, strict=True)
+        ]

@@ -12,6 +12,7 @@ from sortie.perception import budget
 from sortie.perception.lateness import SIGMA0_M
 from sortie.perception.metrics.assignment import least_cost
 from sortie.perception.motion import ACCELERATION_DENSITY, MOVES_AT, Tracks, predicted
+from sortie.perception.tracking import association
 from sortie.perception.tracking.following import followed, motion_of, motion_of_boxes
 from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S, SPEED_VARIANCE, step
 from sortie.perception.tracking.wire import TRACK, content, packed, unpacked
@@ -194,3 +195,14 @@ def test_a_target_is_followed_while_a_confirmed_track_agrees_with_its_cue() -> N
     assert followed(tracks, {3: cue, 7: bend}, {7: 0}, now_s) == {7: 0}
     assert predicted(tracks, 5.5).t_s.tolist() == [5.5, 5.5]
     assert followed(Tracks.empty(), {7: cue}, {7: 0}, now_s) == {}
+
+
+def test_pairs_of_many_tracks_are_those_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    xy, places = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (90, 2))
+    owner, whose = rng.integers(0, 3, 80), rng.integers(0, 3, 90)
+    few = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
+    monkeypatch.setattr(association, "FEW", 0)
+    many = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
+    assert len(few[0]) > 20
+    assert sorted(zip(*(v.tolist() for v in few), strict=True)) == sorted(zip(*(v.tolist() for v in many), strict=True))
