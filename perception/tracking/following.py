@@ -6,14 +6,12 @@ Free of torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sortie.perception.lateness import SIGMA0_M
-from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, predicted
-from sortie.perception.tracking.association import GATE, assigned
+from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, grown, predicted
+from sortie.perception.tracking.association import GATE
 from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S
 from sortie.perception.types import Boxes
 
@@ -38,29 +36,31 @@ def motion_of(tracks: Tracks, age_s: float) -> tuple[Floats, Floats]:
     A track whose speed is not significant stands: it moves by nothing, and its position gets no less certain. One that
     moves is as certain as a fresh box was when it was last seen.
     """
-    late_s = age_s + tracks.t_s - tracks.seen_s
-    spread = tracks.covariance[:, 2] * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3.0
-    moves = tracks.moves
-    return np.where(moves[:, None], tracks.velocity_mps, 0.0), SIGMA0_M**2 + np.where(moves, spread, 0.0)
+    return _going_on(tracks, age_s + tracks.t_s - tracks.seen_s)
 
 
 def motion_of_boxes(boxes: Boxes, t_s: float, age_s: float, tracks: Tracks) -> tuple[Floats, Floats]:
-    """The same of boxes detected at `t_s`, by the tracks of the drone that received them; NaN where it has none for a box."""
-    velocity: NDArray[np.float64] = np.full((len(boxes), 2), np.nan)
-    variance: NDArray[np.float64] = np.full(len(boxes), np.nan)
-    known = tracks.take(tracks.confirmed)
-    then = predicted(known, t_s)
-    one = np.zeros(len(boxes), np.int64)
-    i, j = assigned(
-        then.xy_m,
-        then.covariance[:, 0] + BOX_VARIANCE_M2,
-        np.zeros(len(then), np.int64),
-        boxes.xy_m.astype(np.float64),
-        one,
-    )
-    here = known.take(i)
-    velocity[j], variance[j] = motion_of(replace(here, seen_s=here.t_s), age_s)  # it is the box that is so old
-    return velocity, variance
+    """The same of boxes detected at `t_s`, by the nearest confirmed track of the drone that received them.
+
+    Near is by Mahalanobis distance, within `GATE`, at the time of the box. NaN where there is no track.
+    """
+    dt = t_s - tracks.t_s
+    spread = grown(tracks.covariance, dt)[:, 0] + BOX_VARIANCE_M2
+    off_x, off_y = (boxes.xy_m[:, k, None] - (tracks.xy_m[:, k] + dt * tracks.velocity_mps[:, k]) for k in (0, 1))
+    cost = np.where(tracks.confirmed, (off_x * off_x + off_y * off_y) / spread, np.inf)
+    if not cost.size:
+        return np.full((len(boxes), 2), np.nan), np.full(len(boxes), np.nan)
+    best = cost.argmin(axis=1)
+    near = cost[np.arange(len(boxes)), best] < GATE
+    velocity, variance = _going_on(tracks, np.full(len(tracks), age_s))
+    return np.where(near[:, None], velocity[best], np.nan), np.where(near, variance[best], np.nan)
+
+
+def _going_on(tracks: Tracks, late_s: Floats) -> tuple[Floats, Floats]:
+    """Velocity [n, 2], and the variance of position [n] of what was certain for the last time `late_s` ago."""
+    moves = tracks.moves
+    spread = tracks.covariance[:, 2] * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3.0
+    return np.where(moves[:, None], tracks.velocity_mps, 0.0), SIGMA0_M**2 + np.where(moves, spread, 0.0)
 
 
 def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int], t_s: float) -> dict[int, int]:
