@@ -110,6 +110,12 @@ def _fusion_methods() -> Tables:
     return {"fusion_methods": fusion_comparison.table(rows, "30 frames of the test split; intervals over scenes.")}
 
 
+def _track_prediction() -> Tables:
+    import track_prediction
+
+    return track_prediction.tables()
+
+
 def _handshakes() -> Tables:
     import handshakes
 
@@ -523,6 +529,7 @@ FIGURES: dict[str, Figure] = {
     "context_forms": Figure(4, _context_forms),
     "fusion_age": Figure(4, _fusion_age),
     "late_shares": Figure(2, _late_shares),
+    "track_prediction": Figure(4, _track_prediction),
     "link": Figure(5, _link),
     "transport": Figure(6, _transport),
     "paper": Figure(8, _paper),
