@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sortie.fleet.coverage import TARGET_FLAG
-from sortie.perception import budget
+from sortie.perception import budget, joining
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView, Representation
@@ -16,6 +16,7 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scene, Target
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.tracking import CUE_S, FleetTracking, TargetSeen
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 TRACKING = ["duration_s=12", "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]"]
@@ -142,3 +143,25 @@ def test_a_payload_of_tracks_has_twenty_bytes_for_each_confirmed_track() -> None
     ).tables["transmissions"].to_pylist()  # fmt: skip
     assert {row["payload_bytes"] - 76 - budget.TRACK_BYTES * row["boxes"] for row in rows} == {0}
     assert max(row["boxes"] for row in rows) == budget.MAX_TRACKS
+
+
+def detections_each_second(view: FleetView) -> list[Directive]:
+    return [
+        Directive(view.ego, peer, Representation.DETECTIONS, 0.0, None, 1.0, reason="boxes to all")
+        for peer in view.peers
+    ]
+
+
+@pytest.mark.parametrize("policy", [detections_each_second, tracks_to_all])
+def test_what_arrives_late_is_moved_to_the_receivers_time(policy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boxes that are a second old find more of the cars that drive when they are moved."""
+    late = ["perception.detector=surrogate", "duration_s=16", "perception.max_age_s=2", "perception.join=average"]
+    scenario = load("track_target", [*late, "perception.scene.moving_cars_per_km=30", "perception.compute_delay_s=0.8"])
+
+    def found() -> float:
+        return outcome(run_sortie(scenario, policy))["ap50"]["full_scene"]
+
+    moved = found()
+    monkeypatch.setattr(joining, "motion_of", lambda tracks, age_s: (None, None))
+    monkeypatch.setattr(joining, "motion_of_boxes", lambda boxes, t_s, age_s, tracks: (None, None))
+    assert moved > found() + 0.03
