@@ -69,7 +69,7 @@ class FleetTracking:
         if due < len(self._looks_s) and t_s >= self._looks_s[due] - _INSTANT_S:
             self._taken[drone] = bisect_right(self._looks_s, t_s + _INSTANT_S)
             self._waiting.append(capture)
-            while self._waiting[0].t_s < t_s - WARM_UP_S:
+            while self._waiting[0].t_s < t_s - WARM_UP_S - _INSTANT_S:
                 self._waiting.popleft()
 
     def tracks(self, drone: int) -> Tracks:
