@@ -59,6 +59,14 @@ class DetectsMany(Protocol):
         """As `truth`, ego by ego."""
 
 
+@runtime_checkable
+class LooksByAnother(Protocol):
+    """A detector that leaves to another what drones' trackers take in, so that decisions in flight follow that one."""
+
+    looks: Detector
+    """Detects for the trackers."""
+
+
 Constructor = Callable[[SceneModel, Perception, int, int], Detector]
 """From the scene, the scenario's `perception` section, the sortie's seed and its replication."""
 

@@ -20,7 +20,7 @@ from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.traces import flown_motion
-from sortie.perception.detectors import Detector, DetectsMany, make_detector
+from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
@@ -173,7 +173,8 @@ def build(
         return world.sensed(drone, frame).capture
 
     ahead = captures_ahead(scenario, capture_of)
-    own_boxes: OwnBoxesOf = TargetSeen(scene) if detector is None else OwnBoxes(detector, ahead)
+    looking = detector.looks if isinstance(detector, LooksByAnother) else detector
+    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead)
     tracking = FleetTracking(scenario, own_boxes)
     agents = [
         Agent(

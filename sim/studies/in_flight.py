@@ -30,13 +30,14 @@ REGIONS = {"full_scene": "everywhere", "mission": "in the mission's disc"}
 
 
 class BothDetectors:
-    """The torch detector's boxes and the surrogate's guess of how many a drone would send, so that traffic is the surrogate's."""
+    """The torch detector's boxes, and the traffic of the surrogate: its guess of how many a drone would send, and its tracks."""
 
     name = "torch, with the traffic of the surrogate"
 
     def __init__(self, torch: Detector, surrogate: Detector) -> None:
         self.detect, self.truth = torch.detect, torch.truth
         self.count_boxes, self.camera_views = surrogate.count_boxes, torch.camera_views
+        self.looks = surrogate
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import pytest
 
 from sortie.fleet.coverage import TARGET_FLAG
 from sortie.perception import budget, joining
+from sortie.perception.detectors import make_detector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView, Representation
@@ -166,3 +167,40 @@ def test_what_arrives_late_is_moved_to_the_receivers_time(policy: Any, monkeypat
     monkeypatch.setattr(joining, "motion_of", lambda tracks, age_s: (None, None))
     monkeypatch.setattr(joining, "motion_of_boxes", lambda boxes, t_s, age_s, tracks: (None, None))
     assert moved > found() + 0.03
+
+
+class Blind:
+    """A detector that finds nothing, and leaves what trackers take in to another."""
+
+    name = "blind"
+
+    def __init__(self, looks: Any) -> None:
+        self.looks, self.truth, self.count_boxes = looks, looks.truth, looks.count_boxes
+
+    def detect(self, jobs: list[Any]) -> list[Boxes]:
+        return [Boxes.empty() for _ in jobs]
+
+    def camera_views(self, capture: Capture) -> Any:
+        raise NotImplementedError
+
+
+def test_a_detector_may_leave_the_trackers_to_another() -> None:
+    """So a flight scored by another detector decides as the first one's."""
+    scenario = load("track_target", [*TRACKING, "duration_s=5", "perception.detector=surrogate"])
+
+    def made(*arguments: Any) -> Any:
+        return Blind(make_detector(*arguments))
+
+    one, other = run_sortie(scenario), run_sortie(scenario, detector_of=made)
+    assert other.tables["detections"].num_rows == 0
+    assert one.tables["descriptors"].equals(other.tables["descriptors"])
+    assert any(is_ for _, is_ in naming(other))
+
+
+def test_groups_name_their_own_targets() -> None:
+    second = "mission.more_targets=[{waypoints_m: [[-240, 1.75], [200, 1.75]], speed_mps: 4}]"
+    groups = "mission.groups=[{drones: [1, 2], phases: [{phase: track, target: 1, region: {radius_m: 32}}]}]"
+    scenario = load("track_target", [*TRACKING, second, groups, "perception.detector=none", "record.views=true"])
+    rows = run_sortie(scenario).tables["view_descriptors"].to_pylist()
+    named = {(row["agent_id"], target) for row in rows for target in row["priority_target_ids"]}
+    assert named == {(0, 0), (3, 0), (4, 0), (1, 1), (2, 1)}
