@@ -83,16 +83,19 @@ class AgentLog(Protocol):
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None: ...
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None: ...
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
+    def event(self, t_s: float, drone: int, kind: str, text: str) -> None: ...
 
 
 class _OutgoingLink:
     """An outgoing link: what its gate enforces, and what was last asked of it while its peer was fresh."""
 
-    __slots__ = ("asked", "state")
+    __slots__ = ("asked", "by_clock", "state")
 
     def __init__(self, me: int, peer: int) -> None:
         self.state = DampedLink(nothing(me, peer, ""))
         self.asked: Directive | None = None
+        self.by_clock = False
+        """Whether it is reduced for a descriptor that has just come and looks old by its stamp."""
 
 
 class Agent:
@@ -148,6 +151,7 @@ class Agent:
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
         self._chart = Chart()
+        self._clock_off_s = 0.0
         self._look: Sensed | None = None
         """What it sensed at its latest look."""
         self._judged_every = max(1, round(JUDGED_EVERY_S / rules.period_s))
@@ -171,6 +175,7 @@ class Agent:
         each_second = frame % self._judged_every == 0
         if each_second:
             self._chart.fold(self.memory.believed())
+            self._check_clock()
         if self._rules.trust and each_second:
             for peer, standing in self.memory.judge(self._env.now):
                 self._log.trust(self._env.now, self.drone, peer, standing)
@@ -229,6 +234,20 @@ class Agent:
         new = self._chart.new(well_cells(grid, here.row, here.column), self.memory.believed, told)
         return (marked(grid, here.row, here.column, new), True) if new else (grid, False)
 
+    def _check_clock(self) -> None:
+        """Report where the own clock is off the fleet's, and where it no longer is."""
+        clocks = self.memory.clocks
+        off_s = clocks.own_offset_s(self.memory.peers)
+        if abs(off_s - self._clock_off_s) > clocks.delay_s / 2:
+            self._clock_off_s = off_s
+            way = "ahead of" if off_s > 0 else "behind"
+            text = (
+                f"clock {abs(off_s):.2f} s {way} the fleet's, ± {clocks.delay_s / 2:.2f} s: ages are corrected for it"
+            )
+            self._log.event(
+                self._env.now, self.drone, "clock", text if off_s else "clock agrees with the fleet's again"
+            )
+
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
         view = self.memory.view(now_s)
@@ -260,11 +279,23 @@ class Agent:
         if age_s > self._fresh_s:
             fidelity = health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
             link.asked, capped = None, cap_by_age(asked, fidelity, age_s)
+        self._blame_clock(link, asked.destination, fidelity, age_s, now_s)
         link.state = after = damp(before, capped, now_s, rules.dwell_s)
         if after.enforced is not before.enforced and after.enforced != before.enforced:
             enforced = decode_directive(encode_directive(after.enforced))
             self._gate.enforce(enforced)
             self._log.directive(now_s, asked, enforced, fidelity, after.enforced.reason)
+
+    def _blame_clock(self, link: _OutgoingLink, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
+        """Report a link that begins to be reduced because a descriptor was too old when it came."""
+        heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), link.by_clock
+        link.by_clock = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
+        if link.by_clock and not before:
+            text = (
+                f"link to {peer} {fidelity.name.lower()}: its descriptor came {heard_ago_s:.2f} s ago and is {age_s:.2f} s "
+                "old by its stamp, so a clock is wrong"
+            )
+            self._log.event(now_s, self.drone, "clock", text)
 
     # --- the data plane ------------------------------------------------------------------------
 

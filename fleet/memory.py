@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from sortie.fleet.clock import PeerClocks
 from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
@@ -22,6 +23,8 @@ class Received(NamedTuple):
     capture: Capture
     payload: Payload
     t_done_s: float
+    stamp_s: float
+    """When it was captured, by its sender's clock."""
     missing: tuple[int, ...] = ()
     """Ranks of its feature cells that did not arrive, ascending; rank 0 is the best cell."""
     phy_mbps: float = math.inf
@@ -37,6 +40,7 @@ class PeerMemory:
         """The newest payload of each peer."""
         self._rules = rules
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
+        self.clocks = PeerClocks(rules.period_s)
         self._inbox = Inbox()
         self._claims: dict[int, Descriptor] = {}
         self._known: dict[int, Descriptor] = {}  # the claims as policies read them, by ascending id
@@ -56,6 +60,7 @@ class PeerMemory:
         if isinstance(heard, DropReason):
             return heard
         if heard.agent_id != self.drone:
+            self.clocks.heard(heard.agent_id, now_s + self.status.clock_skew_s - heard.stamp_ns * 1e-9)
             self.hold(heard, now_s)
         return None
 
@@ -76,7 +81,7 @@ class PeerMemory:
         self.status.work.payload_bytes += received.payload.size_bytes
         self.status.work.maps += received.payload.representation in MAPS
         if self._rules.trust:
-            took_s = received.t_done_s - received.capture.t_s - self._rules.compute_delay_s
+            took_s = self.payload_age_s(received, received.t_done_s) - self._rules.compute_delay_s
             self._arrivals.setdefault(peer, []).append(
                 Arrival(
                     0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
@@ -85,9 +90,31 @@ class PeerMemory:
         if self.status.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
             self.held[peer] = received
 
+    def _in_own_time(self, peer: int, stamp_s: float) -> float:
+        """A moment of a peer's clock in this drone's time, which the air's times are in."""
+        return stamp_s - self.status.clock_skew_s + self.clocks.offset_s.get(peer, 0.0)
+
+    def payload_age_s(self, received: Received, now_s: float) -> float:
+        """A payload's age as this drone knows it: by its stamp and the two clocks, and at least the time since it arrived."""
+        return max(now_s - self._in_own_time(received.capture.drone, received.stamp_s), now_s - received.t_done_s)
+
+    @property
+    def peers(self) -> list[int]:
+        """Every drone heard so far."""
+        return [i for i in self._known if i != self.drone]
+
+    def heard_ago_s(self, peer: int, now_s: float) -> float:
+        """Time since the last descriptor of a peer arrived, whatever its stamp."""
+        return now_s - self._heard_at_s[peer]
+
     def ages_s(self, now_s: float) -> dict[int, float]:
-        """Age of every descriptor by this drone's clock, and at least the time since it arrived."""
-        clock_s, heard_at_s = now_s + self.status.clock_skew_s, self._heard_at_s
+        """Age of every descriptor by this drone's clock and the peers' offsets from it, and at least the time since it arrived."""
+        clock_s, heard_at_s, ahead_s = now_s + self.status.clock_skew_s, self._heard_at_s, self.clocks.offset_s
+        if ahead_s:
+            return {
+                i: max(clock_s - d.stamp_ns * 1e-9 - ahead_s.get(i, 0.0), now_s - heard_at_s[i])
+                for i, d in self._known.items()
+            }
         return {
             i: stamped_s if (stamped_s := clock_s - d.stamp_ns * 1e-9) > (heard_s := now_s - heard_at_s[i]) else heard_s
             for i, d in self._known.items()
@@ -120,7 +147,9 @@ class PeerMemory:
         heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
-            claimed_s = min(self._heard_at_s[i], heard[i].stamp_ns * 1e-9) if i in heard else too_old_s
+            claimed_s = (
+                min(self._heard_at_s[i], self._in_own_time(i, heard[i].stamp_ns * 1e-9)) if i in heard else too_old_s
+            )
             arrivals[i], later = split_arrivals(came, claimed_s)
             if any(claimed_s - a.sent_s < LOOK_STANDS_S / 2 for a in arrivals[i]):
                 looking.add(i)

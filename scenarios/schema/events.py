@@ -62,6 +62,18 @@ class ClockSkew(BaseEvent):
     )
 
 
+class ClockDrift(BaseEvent):
+    kind: Literal["clock_drift"]
+    drone: DroneId = Field(description="Whose clock drifts, and follows GNSS no more.")
+    drift_ppm: float = Field(ge=-100000, le=100000, description="How much too fast it runs from then on.")
+
+
+class GnssLoss(BaseEvent):
+    kind: Literal["gnss_loss"]
+    drone: DroneId | None = Field(None, description="Who loses it; left out, all drones.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+
+
 class Spoof(BaseEvent):
     kind: Literal["spoof"]
     drone: DroneId = Field(description="Whose descriptors are imitated.")
@@ -84,6 +96,17 @@ class Lie(BaseEvent):
 
 
 Event = Annotated[
-    LinkDrop | Jam | DroneLost | DroneJoins | DroneLeaves | BatteryFault | CellFailure | ClockSkew | Spoof | Lie,
+    LinkDrop
+    | Jam
+    | DroneLost
+    | DroneJoins
+    | DroneLeaves
+    | BatteryFault
+    | CellFailure
+    | ClockSkew
+    | ClockDrift
+    | GnssLoss
+    | Spoof
+    | Lie,
     Field(discriminator="kind"),
 ]

@@ -179,6 +179,27 @@ class Computer(Section):
     )
 
 
+class Clocks(Section):
+    """The drones' clocks (fleet/clock.py). With GNSS and no offset they are perfect."""
+
+    gnss: bool = Field(True, description="Clocks follow GNSS at take-off; false lets them run freely.")
+    offset_s: float = Field(
+        0.0, ge=0, le=60, description="Standard deviation of each clock's constant error; 0 is perfect."
+    )
+    drift_ppm: float = Field(
+        20.0,
+        ge=0,
+        le=100000,
+        description="Standard deviation of a clock's rate error without GNSS; 20 is a plain crystal.",
+    )
+    drift_growth_ppm_per_min: float = Field(
+        1.0,
+        ge=0,
+        le=100000,
+        description="Standard deviation of the growth of that rate, as the crystal's heat changes.",
+    )
+
+
 class DroneOverride(Section):
     drone: DroneId = Field(description="Whose battery or load differs.")
     initial_soc: Soc | None = Field(None, description="As fleet.battery.initial_soc.")
@@ -201,6 +222,7 @@ class Fleet(Section):
     )
     battery: Battery = Battery()
     computer: Computer = Computer()
+    clock: Clocks = Clocks()
     overrides: tuple[DroneOverride, ...] = Field(
         (), description="Drones whose battery or payload differs from the fleet's."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,11 +17,13 @@ from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.scenarios.schema import (
     BatteryFault,
     CellFailure,
+    ClockDrift,
     ClockSkew,
     DroneJoins,
     DroneLeaves,
     DroneLost,
     Event,
+    GnssLoss,
     Jam,
     Lie,
     LinkDrop,
@@ -56,7 +58,7 @@ def schedule(
         at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
     for begin in begins:
         event = begin.event
-        if isinstance(event, LinkDrop | Jam | Lie) and event.until_s is not None:
+        if isinstance(event, LinkDrop | Jam | Lie | GnssLoss) and event.until_s is not None:
             at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
 
 
@@ -113,7 +115,15 @@ class _Begin:
                     world.ground_landed()
             case ClockSkew():
                 world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
-                world.drones[event.drone].clock_skew_s = event.skew_s
+                world.set_clock(event.drone, offset_s=event.skew_s)
+            case ClockDrift():
+                world.note(event.drone, "clock_drift", f"clock drifts by {event.drift_ppm:g} ppm")
+                world.set_clock(event.drone, rate_ppm=event.drift_ppm, growth_ppm_per_min=0.0)
+            case GnssLoss():
+                for drone in self._of(event):
+                    own = world.oscillators[drone]
+                    world.note(drone, "gnss_loss", f"no GNSS: the clock drifts by {own.rate_ppm:.3g} ppm")
+                    world.set_clock(drone, rate_ppm=own.rate_ppm, growth_ppm_per_min=own.growth_ppm_per_min)
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
@@ -132,9 +142,17 @@ class _Begin:
             case Jam():
                 del world.jammers[self.index]
                 world.note(-1, "jam_over", "the jammer is off")
+            case GnssLoss():
+                for drone in self._of(event):
+                    world.note(drone, "gnss_back", "the clock follows GNSS again")
+                    own = world.oscillators[drone]
+                    world.set_clock(drone, offset_s=own.offset_s, rate_ppm=0.0, growth_ppm_per_min=0.0)
             case Lie():
                 del world.drones[event.drone].lies[self.index]
                 world.note(event.drone, "lie_over", "tells the truth again")
+
+    def _of(self, event: GnssLoss) -> Sequence[int]:
+        return range(self.scenario.fleet.drones) if event.drone is None else [event.drone]
 
     def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
         """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""

@@ -152,12 +152,14 @@ class Scorer:
         config = self._scenario.perception
         limit_s = config.max_age_s + 1e-9
         memory = agent.memory
-        held = [received for _, received in sorted(memory.held.items()) if now_s - received.capture.t_s <= limit_s]
+        held = [
+            received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
+        ]
         if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
             if not held:
                 return None
             look = here._replace(looked=False)
-        shares = [as_share(r, memory.trust_in(r.capture.drone), now_s - r.capture.t_s) for r in held]
+        shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
         if any(s.representation == "detections" for s in shares):
             own = self._own_tracks(agent.drone)
             shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]

@@ -12,6 +12,7 @@ import pyarrow as pa
 import simpy
 
 from sortie.fleet.agent import Agent
+from sortie.fleet.clock import oscillators
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.gate import Gate
@@ -152,7 +153,8 @@ def build(
     mission = scenario.mission
     scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
     plan = MissionPlan(mission, len(drones))
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder)
+    clocks = oscillators(scenario.fleet.clock, len(drones), seed, replication)
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)

@@ -55,7 +55,7 @@ class Transport:
         """The latest genuine datagram of each drone, for whoever listens."""
         self._recorder = recorder
         self._keys = keys
-        self._pending: dict[int, tuple[Payload, Capture]] = {}
+        self._pending: dict[int, tuple[Payload, Capture, float]] = {}
         recorder.unfold["transmissions"] = _unfold_transmissions
 
     def modem(self, drone: int) -> _Modem:
@@ -93,22 +93,30 @@ class Transport:
             on_done=self._done,
             piece_bytes=payload.tile_bytes,
         )
-        self._pending[number] = (payload, capture)
+        self._pending[number] = (payload, capture, self._stamp_s(drone, capture))
+
+    def _stamp_s(self, drone: int, capture: Capture) -> float:
+        """When the capture was taken, by the drone's own clock."""
+        return capture.t_s + self._receivers[drone].status.clock_skew_s
 
     def handshake(self, drone: int, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
         """Hand a method's request or answer to the radio; it takes airtime, and nothing waits for it."""
         number = self.air.send(
             drone, peer, size_bytes, kind=HANDSHAKE, reliable=False, deadline_s=deadline_s, on_done=self._done
         )  # fmt: skip
-        self._pending[number] = (Payload(Representation.NONE, 0.0, None, 0.0, 0, 0, 0, size_bytes), capture)
+        self._pending[number] = (
+            Payload(Representation.NONE, 0.0, None, 0.0, 0, 0, 0, size_bytes),
+            capture,
+            capture.t_s,
+        )
 
     def finish(self) -> None:
         """Write down what is still in flight."""
         for transmission in self.air.finish():
-            self._write(transmission, *self._pending.pop(transmission.number))
+            self._write(transmission, *self._pending.pop(transmission.number)[:2])
 
     def _done(self, transmission: Transmission) -> None:
-        payload, capture = self._pending.pop(transmission.number)
+        payload, capture, stamp_s = self._pending.pop(transmission.number)
         self._write(transmission, payload, capture)
         if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
             missing, mcs, rates_mbps = transmission.missing, transmission.mcs, self._rates_mbps
@@ -116,7 +124,7 @@ class Transport:
                 missing = cells_of(missing, payload.cells, payload.tile_cells)
             phy_mbps = rates_mbps[mcs] if 0 <= mcs < len(rates_mbps) else math.inf
             self._receivers[transmission.receiver].receive(
-                Received(capture, payload, transmission.t_done_s, missing, phy_mbps)
+                Received(capture, payload, transmission.t_done_s, stamp_s, missing, phy_mbps)
             )
 
     def _write(self, transmission: Transmission, payload: Payload, capture: Capture) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Platform, Task
+from sortie.fleet.clock import Oscillator
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.energy.battery import FleetBatteries
@@ -78,6 +79,7 @@ class World:
         scene: SceneModel,
         plan: MissionPlan,
         recorder: Recorder,
+        oscillators: Sequence[Oscillator],
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
             env, motion, batteries, air, scene, plan,
@@ -86,6 +88,9 @@ class World:
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = None
         """[N, N] what scenario events add to the path loss; None until one does."""
+        self.oscillators = oscillators
+        self._clocks = [each.at_start(scenario.fleet.clock.gnss) for each in oscillators]
+        self._read_clocks()
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self._scenario, self._recorder = scenario, recorder
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
@@ -129,6 +134,7 @@ class World:
             if frame:
                 self._measure_headrooms()
             self._frame = frame
+            self._read_clocks()
             self.now = self.plan.at(env.now)
             for prepare in before_frame:
                 prepare(frame)
@@ -147,6 +153,15 @@ class World:
             headrooms(scenario.fleet.computer, scenario.perception.compute_delay_s, a, b, lasts_s)
             for a, b in zip(self._work[0], self._work[-1], strict=True)
         ]
+
+    def _read_clocks(self) -> None:
+        for status, clock in zip(self.drones, self._clocks, strict=True):
+            status.clock_skew_s = clock.error_s(self.env.now)
+
+    def set_clock(self, drone: int, **changes: float) -> None:
+        """Change some values of a drone's clock from now on."""
+        self._clocks[drone] = self._clocks[drone].at(self.env.now)._replace(**changes)
+        self._read_clocks()
 
     def reroute(self, motion: Trajectories) -> None:
         """Replace the motion from the present frame on; earlier frames must be equal."""

@@ -193,6 +193,9 @@ class LiveNode:
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
         self.gate.republish()
 
+    def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
+        self._new.notices.append(Notice(t_s, drone, text))
+
     # --- what comes in ---------------------------------------------------------------------------
 
     def _on_descriptor(self, cdr: bytes) -> None:

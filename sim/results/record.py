@@ -255,6 +255,10 @@ class AgentNotes:
         self._eval_ns.append(elapsed_ns)
         self._rows["ages"].append((t_s, drone, peer_ages_s))
 
+    def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
+        """Something that a drone found out."""
+        self._rows["events"].append((t_s, drone, kind, text))
+
     def totals(self) -> dict[str, float]:
         """Context-plane bytes: descriptors on the air, directives to the gates."""
         return {

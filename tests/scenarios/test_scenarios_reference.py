@@ -127,6 +127,8 @@ def test_units_stand_in_names() -> None:
         "kg",
         "m2",
         "kgpm3",
+        "ppm",
+        "min",
         "v",
         "c",
     }

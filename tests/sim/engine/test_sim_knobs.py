@@ -32,6 +32,7 @@ LOST = "events=[{kind: drone_lost, at_s: 1, drone: 1}]"
 JOINS, LEAVES = (f"events=[{{kind: {kind}, at_s: 1, drone: 1}}]" for kind in ("drone_joins", "drone_leaves"))
 FAULT = "events=[{kind: battery_fault, at_s: 1, drone: 1, lost_fraction: 0.5}]"
 CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
+DRIFT = "events=[{kind: clock_drift, at_s: 1, drone: 1, drift_ppm: -100000}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
 TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20, cycles: 10, payload_kg: 0.1}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
@@ -108,6 +109,10 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.motion.pose_jitter_m": ("1", ()),
     "fleet.motion.pose_jitter_time_s": ("5", ()),
     "fleet.motion.pose_error_m": ("1", ()),
+    "fleet.clock.gnss": ("false", ("fleet.clock.drift_ppm=40000",)),
+    "fleet.clock.offset_s": ("0.3", ()),
+    "fleet.clock.drift_ppm": ("40000", ("fleet.clock.gnss=false",)),
+    "fleet.clock.drift_growth_ppm_per_min": ("100000", ("fleet.clock.gnss=false",)),
     "fleet.motion.heading_error_deg": ("5", (FIXED, "mission.target=null")),
     "fleet.viewpoints.reach_m": ("20", LOOKS),
     "fleet.viewpoints.speed_mps": ("6", SHARP),
@@ -236,6 +241,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "events.power_dbm": ("20", (JAM,)),
     "events.lost_fraction": ("0.2", (FAULT,)),
     "events.skew_s": ("-2", (SKEW,)),
+    "events.drift_ppm": ("50000", (DRIFT,)),
     "events.about": ("battery", (LIE,)),
     "events.claim": ("little", (LIE,)),
     "events.attack": ("oversized", (SPOOF,)),
