@@ -172,6 +172,11 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
     return reduced._replace(reason=current.reason) if _level(reduced) == _level(current) else reduced
 
 
+def is_switch(a: Directive, b: Directive) -> bool:
+    """Whether two directives for one link differ by more than a small move of the disc, which damping ignores."""
+    return a is not b and a != b and not (_level(a) == _level(b) and _is_small_move(a, b))
+
+
 def _is_small_move(proposed: Directive, current: Directive) -> bool:
     """Whether two directives of one level are equal, or differ only by a small move of their disc."""
     a, b = proposed.roi, current.roi

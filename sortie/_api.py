@@ -247,7 +247,7 @@ def compare(
     return Comparison(*compare_policies(flown, chosen, progress=progress))
 
 
-def replay(run: Run, policy: PolicyLike | None = None) -> Replay:
+def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = False) -> Replay:
     """Decide again over the views that a run kept, and compare with what was decided in flight.
 
     The recorded world does not answer: a decision that differs changes no later view. Policies' own answers are
@@ -257,6 +257,8 @@ def replay(run: Run, policy: PolicyLike | None = None) -> Replay:
         run: one that was flown with `record.views`.
         policy: who decides; None takes the policies that decided in flight, each where it did. They must give the same
             decisions, if they are functions of the view alone.
+        disagreement: also measure how often two drones' views lead to different choices about one link. Its time grows
+            with the third power of the number of drones.
 
     Raises:
         RunError: the run kept no views, or a function decided in flight that the scenario does not name.
@@ -277,7 +279,7 @@ def replay(run: Run, policy: PolicyLike | None = None) -> Replay:
         raise RunError(f"run: {run!r}, must be a Run, as sortie.open_run gives it")
     chosen, function = _with_policy(run.scenario, policy)
     plan = plan_of(chosen.policy) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
-    return decide_again(run.record, plan, as_flown=policy is None)
+    return decide_again(run.record, plan, as_flown=policy is None, disagreement=disagreement)
 
 
 @dataclass(frozen=True, eq=False)

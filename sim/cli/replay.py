@@ -17,6 +17,12 @@ def replay(
     run: Annotated[Path, typer.Argument(help="A run's folder, flown with --set record.views=true.")],
     policy: PolicyOption = None,
     expect_same: Annotated[bool, typer.Option("--expect-same", help="Exit with code 1 if a decision differs.")] = False,
+    disagreement: Annotated[
+        bool,
+        typer.Option(
+            "--disagreement", help="Measure how often two drones' views lead to different choices about a link."
+        ),
+    ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write every difference here, as CSV.")] = None,
 ) -> None:
     """Decide again over the recorded views of a run, and print where the decisions differ and why.
@@ -24,7 +30,7 @@ def replay(
     Without --policy the policies that flew decide again. The recorded world does not answer to other decisions.
     """
     ensure_files(out_file)
-    replayed = sortie.replay(sortie.open_run(run), policy)
+    replayed = sortie.replay(sortie.open_run(run), policy, disagreement=disagreement)
     out.print(replayed.summary())
     if out_file is not None:
         replayed.save(out_file)

@@ -63,14 +63,14 @@ class PolicyPlan(NamedTuple):
     replays: tuple[tuple[float, int, FleetView], ...] = ()
 
     @property
-    def policies(self) -> tuple[NamedPolicy, ...]:
-        """Every policy that may decide."""
-        return (self.first, *(policy for _, policy in self.changes))
+    def policies(self) -> dict[str, NamedPolicy]:
+        """Every policy that may decide, by name."""
+        return {policy.name: policy for policy in (self.first, *(policy for _, policy in self.changes))}
 
     @property
     def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
-        return any(viewpoint_of(policy.decide) is not None for policy in self.policies)
+        return any(viewpoint_of(policy.decide) is not None for policy in self.policies.values())
 
 
 Keep = Callable[[int, str, FleetView, Sequence[Directive], Reposition | None], None]

@@ -41,8 +41,10 @@ from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, ca
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds
 from sortie.sim.identity import code_version, name_of, own_files
+from sortie.sim.results import disagreement
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
-from sortie.sim.results.views import Journal
+from sortie.sim.results.views import TABLES as VIEW_TABLES
+from sortie.sim.results.views import Journal, decisions
 
 KEY_ID = 1
 PHASE_SHARE, PHASE_S = 0.1, 0.01
@@ -93,7 +95,7 @@ def run_sortie(
     parts = build(scenario, policies, seed, replication, detector_of)
     files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited while the sortie flies
     _fly(parts, progress, observer)
-    record = _collect(parts, name, seed, replication)
+    record = _collect(parts, policies, name, seed, replication)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, wall=wall)
 
@@ -121,7 +123,7 @@ class Parts:
     audit: Audit
     notes: AgentNotes
     journal: Journal | None
-    """None where no views are kept."""
+    """None where decisions are neither kept nor compared."""
 
 
 def build(
@@ -164,7 +166,7 @@ def build(
     if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
-    journal = Journal(env) if scenario.record.views else None
+    journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
     request = None if choreography is None else choreography.request
     pilots = [Pilot(i, policies, audit, request, None if journal is None else journal.decided) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
@@ -236,13 +238,13 @@ def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Obser
     each_second(parts.env.now)
 
 
-def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRecord:
+def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replication: int) -> SortieRecord:
     """The record of a sortie that has ended."""
     air, notes, recorder = parts.air, parts.notes, parts.recorder
     tables = recorder.tables()
     recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
     if parts.journal is not None:
-        tables |= parts.journal.tables()
+        tables |= _decided(parts.journal, policies, parts.scenario)
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
         scenario=parts.scenario,
@@ -256,6 +258,17 @@ def _collect(parts: Parts, policy: str, seed: int, replication: int) -> SortieRe
         calibration=parts.detector.calibration if isinstance(parts.detector, DetectsMany) else None,
         wall=notes.policy_eval_us(),
     )
+
+
+def _decided(journal: Journal, policies: PolicyPlan, scenario: Scenario) -> dict[str, pa.Table]:
+    """The tables of decisions that the scenario wants to be kept."""
+    views, wanted = journal.tables(), scenario.record
+    tables = {name: views[name] for name in VIEW_TABLES if wanted.views}
+    if wanted.disagreement:
+        known = policies.policies
+        pairs = disagreement.measure(decisions(views), lambda d: known[d.policy].decide, scenario.frame_s)
+        tables[disagreement.TABLE] = disagreement.pairs_table(pairs)
+    return tables
 
 
 def _rules(scenario: Scenario) -> PlaneRules:

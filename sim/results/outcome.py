@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
 from sortie.radio.transmission import Status
+from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
@@ -99,6 +100,9 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "phases": [_phase(record, both, begin_s, end_s, name) for begin_s, end_s, name in _phases(record)],
         "distrusted_by": _distrusted_by(tables["trust"]),
         "events": tables["events"].to_pylist(),
+        "disagreement": disagreement.figures(
+            disagreement.pairs_of(tables[disagreement.TABLE]) if disagreement.TABLE in tables else ()
+        ),
         "policy_eval_us": {
             "p50": record.wall.get("policy_eval_us_p50"),
             "p99": record.wall.get("policy_eval_us_p99"),

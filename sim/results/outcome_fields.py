@@ -133,6 +133,38 @@ Transition = TypedDict(
 )
 
 
+class Causes(TypedDict):
+    roster: Annotated[float | None, "One of them has not heard a drone.", SHARE]
+    trust: Annotated[float | None, "One of them doubts a drone.", SHARE]
+    values: Annotated[
+        float | None,
+        "They read other values in one descriptor: its author does not believe the lie that it publishes.",
+        SHARE,
+    ]
+    descriptor: Annotated[float | None, "One of them has a later descriptor of a drone, with other contents.", SHARE]
+    age: Annotated[float | None, "A descriptor is too old for one of them: packets were lost, or clocks differ.", SHARE]
+
+
+class Disagreement(TypedDict):
+    share: Annotated[
+        float | None,
+        "Share of the time in which two drones' views lead to different directives for a link, over all pairs of drones "
+        "and all links. Both take the policy of the link's source, and put the source in the ego's place. A disc that "
+        "moved by less than damping ignores is no difference.",
+        SHARE,
+    ]
+    sends_share: Annotated[
+        float | None, "The part of it in episodes where one would send and the other would not.", SHARE
+    ]
+    episodes: Annotated[int | None, "How often such a disagreement began, for one pair and link."]
+    mean_s: Annotated[float | None, "How long one lasts on average, in whole frames."]
+    p99_s: Annotated[float | None, "99th percentile of that."]
+    longest_s: Annotated[float | None, "The longest."]
+    causes: Annotated[
+        Causes, "The share by cause: which difference between the two views must go for the choices to agree."
+    ]
+
+
 class PhaseOutcome(TypedDict):
     phase: Annotated[str, "The mission's phase."]
     begin_s: Annotated[float, "From when."]
@@ -202,6 +234,9 @@ class Outcome(TypedDict):
         dict[str, int], "For each drone that anyone came to doubt (`fleet/trust.py`), how many did."
     ]
     events: Annotated[list[Event], "What happened to the fleet: scenario events, landings, policies that took over."]
+    disagreement: Annotated[
+        Disagreement, "How often drones' views lead to different choices; null without `record.disagreement`."
+    ]
     policy_eval_us: Annotated[Percentiles, "Wall time of a decision; no part of the fingerprint."]
     wall_s: Annotated[float | None, "Wall time of the flight; no part of the fingerprint."]
     realtime_factor: Annotated[float | None, "Simulated over wall time; no part of the fingerprint."]

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
-from sortie.sim.results import views
+from sortie.sim.results import disagreement, views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
@@ -60,11 +60,18 @@ def page() -> str:
             ((f"`{name}`", ABOUT[name], _columns(columns)) for name, columns in TABLES.items()),
         ),
         "",
-        "With `record.views: true` these too. They are no part of the fingerprint.",
+        "With `record.views: true` the first three of these too, with `record.disagreement: true` the last one. They are no "
+        "part of the fingerprint.",
         "",
         *table(
             ("table", "a row is", "columns"),
-            ((f"`{name}`", views.ABOUT[name], _columns(columns)) for name, columns in views.TABLES.items()),
+            (
+                (f"`{name}`", about, _columns(columns))
+                for name, about, columns in (
+                    *((name, views.ABOUT[name], columns) for name, columns in views.TABLES.items()),
+                    (disagreement.TABLE, disagreement.ABOUT, disagreement.COLUMNS),
+                )
+            ),
         ),
         "",
     ]

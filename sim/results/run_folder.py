@@ -14,14 +14,20 @@ import pyarrow.parquet as pq
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, ensure_folder, replacing
-from sortie.sim.results import views
+from sortie.sim.results import disagreement, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
 PAGE = "report.html"
 WRITTEN = frozenset(
-    {OUTCOME, SCENARIO, RECORD, RECORDING, *(f"{name}.parquet" for name in (*TABLES, *views.TABLES))}
+    {
+        OUTCOME,
+        SCENARIO,
+        RECORD,
+        RECORDING,
+        *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE)),
+    }
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
@@ -128,7 +134,11 @@ def load(path: Path) -> SortieRecord:
     try:
         about = json.loads((path / RECORD).read_text())
         scenario = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
-        expected = TABLES | (views.TABLES if scenario.record.views else {})
+        expected = dict(TABLES)
+        if scenario.record.views:
+            expected |= views.TABLES
+        if scenario.record.disagreement:
+            expected[disagreement.TABLE] = disagreement.COLUMNS
         tables = {name: pq.read_table(path / f"{name}.parquet") for name in expected}
         for name, columns in expected.items():
             if lacking := [c for c in columns if c not in tables[name].column_names]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -94,10 +95,23 @@ def outcome_table(result: dict[str, Any]) -> Table:
     table.add_row(
         "wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(result['realtime_factor'], '.1f')} × real time"
     )
+    if result["disagreement"]["share"] is not None:
+        table.add_row("disagreement", disagreement_in_words(result["disagreement"]))
     if result["own_files"]:
         table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
     table.add_row("fingerprint", result["fingerprint"][:16])
     return table
+
+
+def disagreement_in_words(figures: Mapping[str, Any]) -> str:
+    """How often drones' views lead to different choices, how long that lasts, and why."""
+    told = f"{percent(figures['share'])} of link-time, {percent(figures['sends_share'])} about whether to send"
+    if not figures["episodes"]:
+        return told
+    causes = {cause: share for cause, share in figures["causes"].items() if share}
+    why = ", ".join(f"{cause} {percent(share)}" for cause, share in sorted(causes.items(), key=lambda c: -c[1]))
+    lasts = f"mean {figures['mean_s']:.2f} s, p99 {figures['p99_s']:.2f} s, longest {figures['longest_s']:.1f} s"
+    return f"{told}; {figures['episodes']} episodes, {lasts}; by cause: {why}"
 
 
 def _mission_in_words(mission: dict[str, Any]) -> str:

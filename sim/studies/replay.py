@@ -15,6 +15,7 @@ from sortie.policies.registry import viewpoint_of
 from sortie.scenarios.representation import NAME_OF
 from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, ask, ask_viewpoint
 from sortie.sim.folders import RunError
+from sortie.sim.results.disagreement import figures, measure
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.views import DECISIONS, Decision, decisions
 from sortie.sim.studies.replayed import NO_PEER, Difference, Replay
@@ -24,13 +25,14 @@ Choose = Callable[[Decision], NamedPolicy]
 """Which policy decides again."""
 
 
-def replay(record: SortieRecord, plan: PolicyPlan, *, as_flown: bool) -> Replay:
+def replay(record: SortieRecord, plan: PolicyPlan, *, as_flown: bool, disagreement: bool = False) -> Replay:
     """Decide again over a run's views, in the order of flight.
 
     Args:
         record: of a run that kept its views.
         plan: the policies.
         as_flown: each decision by the policy that made it in flight; else all by the plan's first.
+        disagreement: also measure how often two drones' views lead these policies to different choices.
 
     Raises:
         RunError: the run kept no views, or the plan lacks a policy that decided in flight.
@@ -40,13 +42,17 @@ def replay(record: SortieRecord, plan: PolicyPlan, *, as_flown: bool) -> Replay:
     flown, again = dict[str, None](), dict[str, None]()  # in the order of their first decision
     differences: list[Difference] = []
     decided, directives = Counter[int](), 0
-    for decision in kept_decisions(record):
+    kept = list(kept_decisions(record))
+    for decision in kept:
         policy = chosen(decision)
         flown[decision.policy] = again[policy.name] = None
         directives += len(decision.view.peers)
         differences += compare(decision, decided[decision.drone], *decide_again(policy, decision))
         decided[decision.drone] += 1
-    return Replay(", ".join(flown), ", ".join(again), decided.total(), directives, tuple(differences))
+    measured = None
+    if disagreement:
+        measured = figures(measure(kept, lambda decision: chosen(decision).decide, record.scenario.frame_s))
+    return Replay(", ".join(flown), ", ".join(again), len(kept), directives, tuple(differences), measured)
 
 
 def kept_decisions(record: SortieRecord) -> Iterator[Decision]:
@@ -102,7 +108,7 @@ def compare(
 
 
 def _chooser(plan: PolicyPlan) -> Choose:
-    known = {policy.name: policy for policy in plan.policies}
+    known = plan.policies
 
     def choose(decision: Decision) -> NamedPolicy:
         if decision.policy not in known:

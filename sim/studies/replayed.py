@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -72,6 +72,9 @@ class Replay:
     """Links decided on, summed over decisions."""
     differences: tuple[Difference, ...]
     """In the order of flight."""
+    disagreement: Mapping[str, Any] | None = None
+    """How often two drones' views lead this policy to different choices, as `disagreement` in the outcome; None where it
+    was not asked for."""
 
     @property
     def same(self) -> bool:
@@ -137,6 +140,10 @@ def _parts(replayed: Replay) -> Iterable[Table | str]:
     total.add_row("links that differ", f"{links} ({percent(links / max(1, replayed.directives))})")
     for field, count in Counter(name for d in differences for name in d.fields).most_common():
         total.add_row(f"  in {field}", str(count))
+    if replayed.disagreement is not None:
+        from sortie.sim.results.summary import disagreement_in_words
+
+        total.add_row("two drones disagree", disagreement_in_words(replayed.disagreement))
     yield total
     if not differences:
         return
