@@ -35,7 +35,7 @@ from sortie.policies.contract import (
     check_directives,
     nothing,
 )
-from sortie.policies.damping import DampedLink, damp
+from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 
 _FRESH = LinkHealth.FRESH
 
@@ -150,6 +150,7 @@ class Agent:
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
+        self._published: Descriptor | None = None
         self._chart = Chart()
         self._clock_off_s = 0.0
         self._look: Sensed | None = None
@@ -213,6 +214,10 @@ class Agent:
             region=region,
             priority_target_ids=target_ids,
         )
+        if self._published is not None:
+            # by the publisher, not by those who hear it: what they read would depend on which packets they lost
+            descriptor = apply_hysteresis(self._published, descriptor, self._rules.hysteresis)
+        self._published = descriptor
         if not due:
             return decode_descriptor(self._encode(descriptor))
         claimed = descriptor

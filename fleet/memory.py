@@ -13,7 +13,6 @@ from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
-from sortie.policies.damping import apply_hysteresis
 from sortie.scenarios.representation import MAPS
 
 
@@ -42,8 +41,7 @@ class PeerMemory:
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
         self.clocks = PeerClocks(rules.period_s)
         self._inbox = Inbox()
-        self._claims: dict[int, Descriptor] = {}
-        self._known: dict[int, Descriptor] = {}  # the claims as policies read them, by ascending id
+        self._known: dict[int, Descriptor] = {}  # by ascending id
         self._heard_at_s: dict[int, float] = {}
         self._standings: dict[int, Standing] = {}
         self._doubted: frozenset[int] = frozenset()
@@ -67,9 +65,8 @@ class PeerMemory:
     def hold(self, descriptor: Descriptor, now_s: float) -> None:
         """Replace the last descriptor of this sender, which may be the drone itself."""
         known, sender = self._known, descriptor.agent_id
-        self._claims[sender] = descriptor
         if sender in known:
-            known[sender] = apply_hysteresis(known[sender], descriptor, self._rules.hysteresis)
+            known[sender] = descriptor
         else:  # by ascending id, so that the order of arrival decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = now_s
@@ -129,7 +126,7 @@ class PeerMemory:
 
     def believed(self) -> list[Descriptor]:
         """The latest descriptors of the peers that it does not doubt."""
-        return [d for i, d in self._claims.items() if i != self.drone and i not in self._doubted]
+        return [d for i, d in self._known.items() if i != self.drone and i not in self._doubted]
 
     def trust_in(self, peer: int) -> float:
         """Trust in a peer, 0 … 1. The fusion weight of its payloads is multiplied by it."""
@@ -144,7 +141,7 @@ class PeerMemory:
         before = self._standings
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
         looking: set[int] = set()
-        heard = {i: self._claims[i] for i in self._known if self._heard_at_s[i] > since_s}
+        heard = {i: d for i, d in self._known.items() if self._heard_at_s[i] > since_s}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             claimed_s = (

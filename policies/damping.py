@@ -1,7 +1,7 @@
-"""Damping around a policy: it does not read small changes of context, and short changes do not switch a link.
+"""Damping around a policy: small changes of context are not published, and short changes do not switch a link.
 
-Before the policy there is a hysteresis band (`apply_hysteresis`). A value that a policy reads falls at once and rises
-only by more than the band. A threshold therefore switches up at a higher value than it switches down.
+Before the policy there is a hysteresis band (`apply_hysteresis`). A value that a drone publishes falls at once and
+rises only by more than the band. A threshold therefore switches up at a higher value than it switches down.
 
 After the policy there is a dwell time (`damp`). Reductions take effect at once. An upgrade is granted as far as it was
 proposed without a break for the dwell time: the least of that time, in every part. Repeating a directive changes nothing.
@@ -23,42 +23,31 @@ EPSILON_S = 1e-9
 """Tolerance of times: a dwell of 1 s is over at the tenth frame, whatever the rounding."""
 
 
-def apply_hysteresis(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
-    """A descriptor as a policy reads it: goodput, charge and headrooms with a hysteresis band, all else as heard.
+def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float) -> Descriptor:
+    """A descriptor as it is published: goodput, charge and headrooms with a hysteresis band, all else as measured.
 
-    The play operator (backlash) of width h in the logarithm: for a quantity u the value read is
-    min(u, max(value read before, u / (1 + h))).
+    The publisher does this once, so all who hear a descriptor read the same, whichever ones they missed before.
+
+    The play operator (backlash) of width h in the logarithm: for a quantity u the value published is
+    min(u, max(value published before, u / (1 + h))).
 
     Args:
-        before: the descriptor of that drone that it read the last time.
-        heard: the drone's new descriptor.
-        hysteresis: h, the share by which a quantity must rise before its rise is read, ≥ 0.
+        before: what the drone published last, before the wire rounded it.
+        measured: what it measures now.
+        hysteresis: h, the share by which a quantity must rise before its rise is published, ≥ 0.
 
     Returns:
-        A descriptor of which no value is better than in `heard`; `heard` itself if they are equal.
+        A descriptor of which no value is better than in `measured`; `measured` itself if they are equal.
     """
     if not hysteresis:
-        return heard
-    last = _last_results.get(heard.agent_id)  # all receivers of one broadcast call this with the same arguments in turn
-    if last is not None and last[0] is before and last[1] is heard and last[2] == hysteresis:
-        return last[3]
-    result = _banded(before, heard, hysteresis)
-    _last_results[heard.agent_id] = before, heard, hysteresis, result
-    return result
-
-
-_last_results: dict[int, tuple[Descriptor, Descriptor, float, Descriptor]] = {}
-"""By drone: the last arguments of `apply_hysteresis`, and its result."""
-
-
-def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descriptor:
+        return measured
     part = 1.0 / (1.0 + hysteresis)
-    # unpacked and built again for speed: every drone reads every other one in every frame
+    # unpacked and built again for speed: every drone does this in every frame
     (
-        stamp, agent, at, turn, velocity, footprint, heard_soc, heard_cpu, heard_gpu, heard_links, grid, flags, phase, region, targets,
+        stamp, agent, at, turn, velocity, footprint, own_soc, own_cpu, own_gpu, own_links, grid, flags, phase, region, targets,
         *optional,
-    ) = heard  # fmt: skip
-    soc, cpu, gpu, links, last = heard_soc, heard_cpu, heard_gpu, heard_links, before.peer_goodput_mbps
+    ) = measured  # fmt: skip
+    soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
     if links != last and len(links) == len(last):  # else the roster is another
         links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
     if soc > before.battery_soc:
@@ -67,8 +56,8 @@ def _banded(before: Descriptor, heard: Descriptor, hysteresis: float) -> Descrip
         cpu = max(before.cpu_headroom, cpu * part)
     if gpu > before.gpu_headroom:
         gpu = max(before.gpu_headroom, gpu * part)
-    if soc == heard_soc and cpu == heard_cpu and gpu == heard_gpu and links == heard_links:
-        return heard
+    if soc == own_soc and cpu == own_cpu and gpu == own_gpu and links == own_links:
+        return measured
     return Descriptor(
         stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets,
         *optional,

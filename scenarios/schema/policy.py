@@ -39,7 +39,10 @@ class PolicySection(Section):
     params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
     dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
     hysteresis: float = Field(
-        0.2, ge=0, le=10, description="By which share goodput, charge or headroom must rise before policies read it."
+        0.2,
+        ge=0,
+        le=10,
+        description="By which share goodput, charge or headroom must rise before a drone publishes the rise.",
     )
     changes: tuple[PolicyChange, ...] = Field(
         (),

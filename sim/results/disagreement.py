@@ -32,7 +32,7 @@ ABOUT = (
     "A pair of drones that both decided: how long they could be compared, summed over links, and each time in which "
     "their views led to different directives for the link from `source` to `destination`. `sends`: one would send and "
     "the other would not. `cause`: `roster` (one has not heard a drone), `trust` (one doubts it), `values` (one descriptor "
-    "read differently: hysteresis, or a lie that its author does not believe), `descriptor` (one has a later one), "
+    "read differently: its author does not believe the lie that it publishes), `descriptor` (one has a later one), "
     "`age` (the descriptors' ages alone)."
 )
 

@@ -1,7 +1,7 @@
 """The exact view and answer of every decision of a sortie, kept in few bytes, and read back bit by bit.
 
 Views of one instant differ little: most drones read the same descriptors. So each descriptor that a policy read is
-kept once, as it was read: after the hysteresis band, and after trust took away what is doubted. A decision names the
+kept once, as it was read: after trust took away what is doubted. A decision names the
 rows of the descriptors in its view and their ages. Directives are kept in the same way.
 """
 
@@ -39,6 +39,7 @@ class _Row(NamedTuple):
     drone: int
     policy: str
     period_s: float
+    detached_after_periods: float
     descriptors: tuple[int, ...]
     ages_s: tuple[float, ...]
     directives: tuple[int, ...]
@@ -53,7 +54,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
 ABOUT = {
     DECISIONS: "A decision: rows of `view_descriptors` that its view held and their ages in the same order, rows of "
     "`view_directives` that the policy answered before staleness and damping, and the viewpoint that it asked for.",
-    DESCRIPTORS: "A descriptor as policies read it: after hysteresis, and after trust took away what is doubted.",
+    DESCRIPTORS: "A descriptor as policies read it: after trust took away what is doubted.",
     DIRECTIVES: "A directive that a policy answered.",
 }
 """What a row of each table is."""
@@ -80,7 +81,7 @@ class Journal:
         known, answers = self._descriptors, self._directives
         self._rows.append(
             _Row(
-                self._env.now, drone, policy, view.period_s,
+                self._env.now, drone, policy, view.period_s, view.detached_after_periods,
                 tuple([known.setdefault(d, len(known)) for d in view.descriptors.values()]),
                 tuple([view.age_s[i] for i in view.descriptors]),
                 tuple([answers.setdefault(tuple(d), len(answers)) for d in directives]),
@@ -101,8 +102,9 @@ def decisions(tables: Mapping[str, pa.Table]) -> Iterator[Decision]:
     """The decisions that a run kept, in the order in which they were made."""
     descriptors = from_table(Descriptor, tables[DESCRIPTORS])
     directives = from_table(Directive, tables[DIRECTIVES])
-    for t_s, drone, policy, period_s, rows, ages_s, answers, viewpoint in from_table(_Row, tables[DECISIONS]):
-        read = [descriptors[row] for row in rows]
-        ids = [d.agent_id for d in read]
-        view = FleetView(drone, period_s, dict(zip(ids, read, strict=True)), dict(zip(ids, ages_s, strict=True)))
-        yield Decision(t_s, drone, policy, view, tuple([directives[row] for row in answers]), viewpoint)
+    for d in from_table(_Row, tables[DECISIONS]):
+        known = {descriptors[row].agent_id: descriptors[row] for row in d.descriptors}
+        ages_s = dict(zip(known, d.ages_s, strict=True))
+        view = FleetView(d.drone, d.period_s, known, ages_s, d.detached_after_periods)
+        answers = tuple([directives[row] for row in d.directives])
+        yield Decision(d.t_s, d.drone, d.policy, view, answers, d.viewpoint)

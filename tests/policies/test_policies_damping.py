@@ -263,7 +263,7 @@ FLICKERING = ("battery_soc", "cpu_headroom", "gpu_headroom")
 
 
 def read(values: list[float], field: str = "goodput", band: float = BAND) -> list[float]:
-    """What a policy reads of one quantity, value by value."""
+    """What a drone publishes of one quantity, value by value."""
     known, seen = None, []
     for value in values:
         heard = HEARD._replace(**({"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}))
@@ -310,17 +310,6 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
 def test_the_band_never_hides_that_a_link_was_measured(values: list[float], band: float) -> None:
     for heard, seen in zip(values, read(values, band=band), strict=True):
         assert (state_of(seen) == LinkState.NEVER_MEASURED) == (state_of(heard) == LinkState.NEVER_MEASURED)
-
-
-def test_an_answer_is_kept_for_who_asks_the_same_alone() -> None:
-    """Each receiver has its own history, and each sortie its own band; a drone's broadcast is one object for all."""
-    poor, fair, rich = (HEARD._replace(peer_goodput_mbps=(mbps, 0.0)) for mbps in (10.0, 20.0, 24.0))
-    other = rich._replace(agent_id=2)
-    asked = [(poor, rich, BAND), (fair, rich, BAND), (fair, rich, 0.1), (fair, other, 0.1), (poor, rich, BAND)]
-    read = [apply_hysteresis(*a).peer_goodput_mbps[0] for a in asked]
-    assert read == pytest.approx([24 / 1.25, 20.0, 24 / 1.1, 24 / 1.1, 24 / 1.25])
-    assert apply_hysteresis(poor, rich, BAND) is apply_hysteresis(poor, rich, BAND)
-    assert apply_hysteresis(poor, other, BAND).agent_id == 2
 
 
 def test_the_cells_of_another_representation_bound_nothing() -> None:

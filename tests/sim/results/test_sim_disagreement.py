@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pyarrow.compute as pc
 import pytest
 from cli_examples import command
 
@@ -16,6 +17,7 @@ from sortie.fleet.messages.compact import FULL
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.trust import discounted
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, nothing
+from sortie.policies.damping import apply_hysteresis
 from sortie.policies.registry import POLICIES, resolve
 from sortie.policies.verification.views import draw_view
 from sortie.sim.results.disagreement import CAUSES, Pair, figures, measure, pairs_of, pairs_table
@@ -50,7 +52,9 @@ def cautious(view: FleetView) -> list[Directive]:
 def flight(*frames: Sequence[FleetView]) -> list[Decision]:
     """Each drone decides a moment after the one before it."""
     return [
-        Decision(k * PERIOD_S + 0.001 * v.ego, v.ego, "cautious", v, ()) for k, views in enumerate(frames) for v in views
+        Decision(k * PERIOD_S + 0.001 * v.ego, v.ego, "cautious", v, ())
+        for k, views in enumerate(frames)
+        for v in views
     ]
 
 
@@ -91,7 +95,9 @@ def test_a_third_drone_decides_for_others_too_and_a_drone_that_left_is_no_source
 def test_a_small_move_of_a_disc_is_no_disagreement() -> None:
     def discs(away_m: float) -> Callable[[FleetView], list[Directive]]:
         return lambda v: [
-            Directive(v.ego, p, Representation.FEATURES, 0.1, Disc(away_m * v.descriptors[v.ego].battery_soc, 0.0, 32.0), 10)
+            Directive(
+                v.ego, p, Representation.FEATURES, 0.1, Disc(away_m * v.descriptors[v.ego].battery_soc, 0.0, 32.0), 10
+            )
             for p in v.peers
         ]
 
@@ -157,30 +163,29 @@ def test_equal_and_fresh_descriptors_leave_nothing_to_disagree_about(policy: str
 DRONES, CHANGES_UNTIL, FRAMES = 4, 10, 19
 
 
-
-def rehearse(
-    policy: str, seed: int, *, delay_s: float, loss: float = 0.0, hysteresis: float = 0.2
-) -> tuple[list[Pair], list[Decision]]:
+def rehearse(policy: str, seed: int, *, delay_s: float, loss: float = 0.0) -> tuple[list[Pair], list[Decision]]:
     """Drones whose contexts change at random in every frame until `CHANGES_UNTIL`, and packets that are lost until then.
 
     Every descriptor that is not lost arrives within `delay_s`. The memories are those that fly.
     """
     rng = random.Random(seed)
-    rules = PlaneRules(PERIOD_S, FRAMES, 3.0, 10.0, 1.0, hysteresis, 0.03, form=FULL)
+    rules = PlaneRules(PERIOD_S, FRAMES, 3.0, 10.0, 1.0, 0.2, 0.03, form=FULL)
     memories = [PeerMemory(i, rules, DroneStatus()) for i in range(DRONES)]
     contexts = [_context(rng, i) for i in range(DRONES)]
     on_the_way: list[tuple[float, int, Descriptor]] = []
     decisions, latest = [], dict[tuple[int, int], int]()
+    published: dict[int, Descriptor] = {}
     for frame in range(FRAMES):
         for i, memory in enumerate(memories):
             now_s = frame * PERIOD_S + 0.001 * i
             if frame <= CHANGES_UNTIL:
                 contexts[i] = _context(rng, i)
             own = contexts[i]._replace(stamp_ns=round(frame * PERIOD_S * 1e9))
+            own = published[i] = apply_hysteresis(published.get(i, own), own, rules.hysteresis)
             memory.hold(own, now_s)
-            for j in range(DRONES):
-                if j != i and not (frame <= CHANGES_UNTIL and rng.random() < loss):
-                    on_the_way.append((now_s + rng.uniform(0.2, 1.0) * delay_s, j, own))
+            lost = loss if frame <= CHANGES_UNTIL else 0.0
+            hearers = [j for j in range(DRONES) if j != i and rng.random() >= lost]
+            on_the_way += [(now_s + rng.uniform(0.2, 1.0) * delay_s, j, own) for j in hearers]
             for arrives_s, j, heard in sorted(on_the_way, key=lambda each: each[0]):
                 if arrives_s <= now_s and heard.stamp_ns > latest.get((j, heard.agent_id), -1):
                     latest[j, heard.agent_id] = heard.stamp_ns  # one that was overtaken is refused, as by its counter
@@ -217,6 +222,15 @@ def test_disagreement_ends_a_period_and_a_delay_after_the_last_change(policy: st
         assert last_s > CHANGES_UNTIL * PERIOD_S - 0.5
 
 
+@pytest.mark.parametrize("policy", ["worked", "deputies", "learned"])
+def test_packets_lost_before_leave_no_disagreement_behind(policy: str) -> None:
+    """Once every drone has heard a packet of every other one, what each missed before decides nothing."""
+    for seed in range(8):
+        pairs, _ = rehearse(policy, seed, delay_s=0.08, loss=0.3)
+        last_s = max(e.begin_s + e.duration_s for pair in pairs for e in pair.episodes)
+        assert last_s <= (CHANGES_UNTIL + 2) * PERIOD_S + 1e-9, seed
+
+
 # --- in flight -------------------------------------------------------------------------------------
 
 SHORT = {"duration_s": 6, "perception.detector": "none", "record.disagreement": True}
@@ -235,6 +249,16 @@ def test_a_step_of_one_charge_is_disagreed_about_for_one_period() -> None:
     assert [e.begin_s for _, _, e in after] == pytest.approx([3.0] * len(after))
     assert [e.duration_s for _, _, e in after] == pytest.approx([0.1] * len(after))
     assert {e.cause for _, _, e in after} == {"descriptor"}
+
+
+def test_all_who_hear_a_descriptor_read_the_same() -> None:
+    """Whichever packets they lost before. A doubted one aside, of which nobody reads the claims."""
+    lossy = {"fleet.formation.spacing_m": 150, "radio.bursts.good_to_bad": 0.3, "context.trust": False}
+    run = sortie.fly("track_target", {**SHORT, **lossy, "duration_s": 12, "record.views": True})
+    read = run.tables["view_descriptors"].select(["agent_id", "stamp_ns"]).to_pylist()
+    assert len({(d["agent_id"], d["stamp_ns"]) for d in read}) == len(read)
+    assert max(pc.list_flatten(run.tables["views"]["ages_s"]).to_pylist()) > 1.0, "packets were lost"
+    assert run.outcome["disagreement"]["causes"]["values"] == 0.0
 
 
 def test_the_outcome_has_it_and_the_fingerprint_does_not(tmp_path: Path) -> None:

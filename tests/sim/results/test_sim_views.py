@@ -33,6 +33,7 @@ MEETS: dict[str, dict[str, object]] = {
     "a wrong clock": {"events": [{"kind": "clock_skew", "at_s": 1, "drone": 1, "skew_s": -0.37}]},
     "a small descriptor": {"context.form": "small"},
     "rare descriptors": {"context.publish_every": 7},
+    "another rule of age": {"context.detached_after_periods": 4},
     "a lost drone": {"events": [{"kind": "drone_lost", "at_s": 2, "drone": 1}]},
     "an attack on an open plane": {
         "context.authentication": False,
@@ -106,6 +107,11 @@ def test_what_a_policy_says_is_kept_before_the_shield() -> None:
 def test_a_wrong_directive_is_reported_as_without_views() -> None:
     with pytest.raises(sortie.PolicyError, match="a policy returns Directive, got NoneType"):
         sortie.fly("track_target", SHORT, policy=lambda view: [None for _ in view.peers])  # type: ignore[misc]
+
+
+def test_every_part_of_a_view_is_kept() -> None:
+    """A new field of the view needs a column in `sortie.sim.results.views`."""
+    assert FleetView._fields == ("ego", "period_s", "descriptors", "age_s", "detached_after_periods")
 
 
 class Colour(IntEnum):
