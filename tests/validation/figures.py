@@ -65,6 +65,18 @@ def _context_forms() -> Tables:
     }
 
 
+def _disagreement() -> Tables:
+    import disagreement
+
+    return {"disagreement": disagreement.table()}
+
+
+def _views_cost() -> Tables:
+    import disagreement
+
+    return {"views_cost": disagreement.cost()}
+
+
 def _viewpoints() -> Tables:
     import repositions
 
@@ -519,6 +531,8 @@ FIGURES: dict[str, Figure] = {
     "energy": Figure(0.5, _energy),
     "flight": Figure(0.5, _flight),
     "survey": Figure(1, _survey),
+    "views_cost": Figure(0.5, _views_cost, timed=True),
+    "disagreement": Figure(2, _disagreement),
     "compare": Figure(2, _compare),
     "coverage": Figure(0.5, _coverage),
     "viewpoints": Figure(2, _viewpoints),
