@@ -207,7 +207,7 @@ class Agent:
             battery_soc=soc,
             cpu_headroom=cpu_headroom,
             gpu_headroom=gpu_headroom,
-            peer_goodput_mbps=self._modem.goodput_mbps(),
+            peer_goodput_mbps=self.memory.probes.fill(self.drone, self._modem.goodput_mbps(), self._env.now),
             coverage_grid=grid,
             novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids),
             task_phase=phase,

@@ -10,6 +10,7 @@ from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
 from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.probes import Probes
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
@@ -37,6 +38,7 @@ class PeerMemory:
         self.drone, self.status = drone, status
         self.held: dict[int, Received] = {}
         """The newest payload of each peer."""
+        self.probes = Probes(rules.descriptor_period_s, rules.detached_after_periods)
         self._rules = rules
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
         self.clocks = PeerClocks(rules.period_s)
@@ -60,6 +62,7 @@ class PeerMemory:
         if heard.agent_id != self.drone:
             self.clocks.heard(heard.agent_id, now_s + self.status.clock_skew_s - heard.stamp_ns * 1e-9)
             self.hold(heard, now_s)
+            self.probes.heard(heard.agent_id, now_s)
         return None
 
     def hold(self, descriptor: Descriptor, now_s: float) -> None:

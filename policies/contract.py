@@ -104,11 +104,11 @@ class Descriptor(NamedTuple):
         return math.floor(y_m / COVERAGE_CELL_M) - half, math.floor(x_m / COVERAGE_CELL_M) - half
 
     def link_state(self, peer: int) -> LinkState:
-        """Whether this drone ever measured its link to `peer`, and whether anything got through the last time."""
+        """Whether this drone knows its link to `peer`: measured, probed by descriptors, silent or unknown."""
         return state_of(self.goodput_to(peer))
 
     def goodput_to(self, peer: int) -> float:
-        """Goodput to `peer`, Mb/s, as this drone measured it (0 before the first measurement and off the roster)."""
+        """Goodput to `peer`, Mb/s, as this drone measured it (0 where unknown and off the roster; `link_state` explains tiny values)."""
         me, known = self.agent_id, self.peer_goodput_mbps
         slot = peer - (peer > me)
         return known[slot] if peer != me and slot < len(known) else 0.0

@@ -15,6 +15,7 @@ from functools import reduce
 from typing import NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation
+from sortie.scenarios.link_state import PROBED_MBPS
 
 _NONE = Representation.NONE
 SAME_DISC_M = 1.6
@@ -48,8 +49,13 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
         *optional,
     ) = measured  # fmt: skip
     soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
-    if links != last and len(links) == len(last):  # else the roster is another
-        links = tuple([u if u <= v else (v if v > u * part else u * part) for u, v in zip(links, last, strict=True)])
+    if links != last and len(links) == len(last):  # else the roster is another; tiny values are states, not rates
+        links = tuple(
+            [
+                u if u <= v or u <= PROBED_MBPS else (v if v > u * part else u * part)
+                for u, v in zip(links, last, strict=True)
+            ]
+        )
     if soc > before.battery_soc:
         soc = max(before.battery_soc, soc * part)
     if cpu > before.cpu_headroom:

@@ -383,7 +383,7 @@ class Air:
     def goodput_mbps(self, sender: int) -> tuple[float, ...]:
         """Goodput to every other drone, ascending by id, as the sender measured it; see `sortie.radio.goodput`.
 
-        0 to a drone to which nothing was measured; at least `SILENT_MBPS` to any other.
+        0 to a drone to which nothing was measured in the last `MEASURED_FOR_S`; at least `SILENT_MBPS` to any other.
         Samples that are still in service or queued lower it already by how little has got through so far. Where a
         payload would go over others, it is the goodput of its hops in sequence.
         """
@@ -400,7 +400,7 @@ class Air:
 
     def _known_mbps(self, sender: int) -> list[float]:
         """Goodput to every drone over the direct link, 0 to itself."""
-        known = self._goodput.read(sender)
+        known = self._goodput.read(sender, self._env.now)
         head = self.medium.in_service(sender)
         if head is not None:
             drained, now = self._drained(sender), self._env.now
@@ -434,7 +434,7 @@ class Air:
             self._book(s)
             window = now_s - s.mark_s
             if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.t_start_s):
-                self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6)
+                self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6, now_s)
         else:
             waited = now_s - s.t_queued_s
             if s.repairs == 0 and waited >= _WINDOW_S:

@@ -10,8 +10,8 @@ payload bits over time in service.
 **The estimate** of a link falls to a lower measurement at once and rises to a higher one by `RISE` of the gap.
 A sample that expires or is replaced half-way counts with what was acknowledged so far. One that never came to
 be served was held up by its own sender's queue, and the rate at which that queue moved bounds the estimate.
-A link never measured reports 0. A measured one reports at least `SILENT_MBPS`, which says that nothing got through
-(`sortie.scenarios.link_state`).
+A measurement counts for `MEASURED_FOR_S`. A link without one reports 0. A measured link reports at least `SILENT_MBPS`,
+which says that nothing got through (`sortie.scenarios.link_state`).
 
 **Bias and lag** were measured (`tests/validation/link.py`, see the README): none on a still link; some 5 % low under
 shadowing, because falling is quicker than rising; a drop shows in the next frame, a recovery in eight.
@@ -19,28 +19,38 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
-from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
+from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, WAITING_MBPS
 
 RISE = 0.3
 
 
 class Goodput:
-    """The estimates of every ordered link, Mb/s; 0 is a link without a measurement."""
+    """The estimates of every ordered link, Mb/s; 0 is a link without a measurement of the last `MEASURED_FOR_S`."""
 
     def __init__(self, n_drones: int) -> None:
         self._mbps = [[0.0] * n_drones for _ in range(n_drones)]
+        self._measured_at_s: list[dict[int, float]] = [{} for _ in range(n_drones)]  # of the links that are not 0
 
-    def measured(self, sender: int, receiver: int, mbps: float) -> None:
-        """A measurement: down at once, up by `RISE` of the gap; the first one is taken as it is."""
+    def measured(self, sender: int, receiver: int, mbps: float, now_s: float) -> None:
+        """A measurement: down at once, up by `RISE` of the gap; one without another lately is taken as it is."""
+        self._expire(sender, now_s)
         row = self._mbps[sender]
         before = row[receiver]
+        self._measured_at_s[sender][receiver] = now_s
         row[receiver] = before + RISE * (mbps - before) if 0.0 < before < mbps else max(mbps, SILENT_MBPS)
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
-        """A link cannot be said to be better than this now; its state stays, since nothing was tried over it."""
+        """A link cannot be said to be better than this now; state and age stay, since nothing was tried over it."""
         row = self._mbps[sender]
         row[receiver] = min(row[receiver], max(mbps, WAITING_MBPS))
 
-    def read(self, sender: int) -> list[float]:
-        """The estimates to all drones (0 where unmeasured, and to itself)."""
+    def read(self, sender: int, now_s: float) -> list[float]:
+        """The estimates to all drones (0 where nothing was measured lately, and to itself)."""
+        self._expire(sender, now_s)
         return self._mbps[sender].copy()
+
+    def _expire(self, sender: int, now_s: float) -> None:
+        measured_at_s = self._measured_at_s[sender]
+        for receiver in [i for i, t_s in measured_at_s.items() if now_s - t_s > MEASURED_FOR_S]:
+            del measured_at_s[receiver]
+            self._mbps[sender][receiver] = 0.0

@@ -24,7 +24,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sortie.perception.metrics.ap import average_precision
-from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, LinkState, Representation, TaskPhase
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
@@ -167,7 +167,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
 
 def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
     """Heard; age, s; place from the ego, 100 m, and velocity, 10 m/s; footprint, 100 m; charge, headrooms, goodput from
-    the ego, 100 Mb/s, and its state (0 never measured, 0.5 silent, 1 measured); phase, one-hot; region: there, place
+    the ego, 100 Mb/s, and its state (0 unknown, 1/3 silent, 2/3 probed, 1 measured); phase, one-hot; region: there, place
     from the ego, radius, 100 m; share of the grid seen well; whether it reports targets."""
     place = [(a - b) / 100 for a, b in zip(d.position_m, me.position_m, strict=True)]
     phase = [float(d.task_phase == p) for p in TaskPhase]
@@ -178,7 +178,7 @@ def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
     cells = np.unpackbits(np.frombuffer(d.coverage_grid, np.uint8), bitorder="little").reshape(-1, 2) @ (1, 2)
     return [
         1.0, age_s, *place, *(v / 10 for v in d.velocity_mps), d.footprint_radius_m / 100, d.battery_soc,
-        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, me.link_state(d.agent_id) / 2, *phase, *region,
+        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, me.link_state(d.agent_id) / LinkState.MEASURED, *phase, *region,
         float((cells >= Coverage.WELL).mean()), float(bool(d.priority_target_ids)),
     ]  # fmt: skip
 

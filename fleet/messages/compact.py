@@ -5,7 +5,7 @@
     · optional fields (`sortie.fleet.messages.extensions`)
 
 Numbers are fixed point over their field's range, saturating (`_RANGES`); 32 bits are IEEE floats. A goodput's lowest
-number is a link never measured, the next one a silent link (`sortie.scenarios.link_state`). A coarse cell stands
+number is a link not measured lately, probed or not, the next one a silent link (`sortie.scenarios.link_state`). A coarse cell stands
 for a block of fine ones and is as most of them are. The format says itself how it is to be read, so that fleets need
 agree on nothing; what a policy reads has the shape of the full descriptor either way.
 """
@@ -169,8 +169,8 @@ def _to_int(value: float, bounds: tuple[float, float], bits: int) -> int:
     steps = round((min(max(value, low), high) - low) / _step(bounds, bits))
     if bounds is _GOODPUT:
         state = state_of(value)
-        # 0 is never measured, 1 silent; a measured link reads at least a step, however weak it is
-        return 1 + max(steps, 1) if state == LinkState.MEASURED else int(state)
+        # 0 is not measured lately, 1 silent; a measured link reads at least a step, however weak it is
+        return 1 + max(steps, 1) if state == LinkState.MEASURED else int(state == LinkState.SILENT)
     # a radius of a region is above 0, however coarse
     return max(steps, 1) if bounds is _REGION[2] else steps
 

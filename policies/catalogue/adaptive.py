@@ -36,6 +36,8 @@ CARRIED = 0.5
 """A drone sends at most this share of its mean goodput, because the others send as well."""
 STEPS_A_HALVING = 2
 """What the air carries is rounded down in steps of √2, so that a varying goodput does not change the directive."""
+TRIED = (LinkState.SILENT, LinkState.MEASURED)
+"""Links with a goodput that counts; the others have not carried a payload lately."""
 EVERYONE = 255
 LEARNED = Path(__file__).with_name("learned.json")
 
@@ -94,11 +96,11 @@ def spend(view: FleetView, arm: Arm, sent_budget: float, why: str) -> list[Direc
 
 
 def carried(me: Descriptor, peers: Sequence[int]) -> float:
-    """The share of a map that each of these links carries in time, by the drone's measured goodput; 1 if none is measured.
+    """The share of a map that each of these links carries in time, by the drone's measured goodput; 1 if none is.
 
     Samples beyond that would wait for one another and miss their deadlines.
     """
-    measured = [me.goodput_to(peer) for peer in peers if me.link_state(peer) != LinkState.NEVER_MEASURED]
+    measured = [me.goodput_to(peer) for peer in peers if me.link_state(peer) in TRIED]
     if not measured:
         return 1.0
     share = CARRIED * fsum(measured) / len(measured) / (len(peers) * FEATURE_MAP_MEGABITS * RATE_HZ)

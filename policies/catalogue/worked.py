@@ -14,7 +14,8 @@ TOP_PEERS = 2
 TRACK = TaskPhase.TRACK
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS  # slow to look up, each time
 NO_GOODPUT = {
-    LinkState.NEVER_MEASURED: "goodput not measured yet",
+    LinkState.UNKNOWN: "goodput not measured yet",
+    LinkState.PROBED: "goodput not measured lately",
     LinkState.SILENT: "goodput: link silent, nothing got through",
 }
 """Reasons for links without a goodput to name."""

@@ -20,14 +20,14 @@ from sortie.policies.contract import (
     TaskPhase,
 )
 from sortie.scenarios.errors import SortieError
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
 GONE = "detached_after_periods"
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
-_SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
+_SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, PROBED_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
 _SPECIAL_AGE_PERIODS = (0.0, 1.0, 3.0, 3.1, 10.0, 10.1, 600.0)
 _PERIODS_S = (0.1, 0.2, 1.0)
 

@@ -9,6 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from sortie.scenarios.link_state import is_tried
+
 Floats = NDArray[np.float64]
 Rgba = tuple[int, int, int, int]
 
@@ -48,12 +50,12 @@ def drone_colour(drone: int) -> Rgba:
 
 
 def goodput_colours(mbps: Floats) -> NDArray[np.uint8]:
-    """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above; grey if never measured."""
+    """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above; grey if not measured lately."""
     level = np.clip(np.log10(np.maximum(mbps, 1e-3)) / 2.0, 0.0, 1.0)
     red, green = np.clip(2.0 - 2.0 * level, 0.0, 1.0), np.clip(2.0 * level, 0.0, 1.0)
     colour = np.stack([50 + 205 * red, 45 + 185 * green, np.full_like(red, 60), np.full_like(red, 255)], axis=-1)
-    never_measured = np.expand_dims(mbps <= 0.0, -1)
-    return np.where(never_measured, UNMEASURED, colour).astype(np.uint8)
+    unmeasured = np.expand_dims(~is_tried(mbps), -1)
+    return np.where(unmeasured, UNMEASURED, colour).astype(np.uint8)
 
 
 def packed(rgba: NDArray[np.uint8]) -> NDArray[np.uint32]:

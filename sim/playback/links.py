@@ -12,6 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from sortie.scenarios.link_state import is_tried
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
 
@@ -73,7 +74,7 @@ class LinkArrows:
 
     def _broken(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], goodput: Floats) -> None:
         """Cross out each pair of drones between which a link was measured and is all but gone."""
-        broken = (goodput > 0) & (goodput < BROKEN_MBPS)
+        broken = is_tried(goodput) & (goodput < BROKEN_MBPS)
         i, j = np.triu_indices(self._n, 1)
         crossed = (broken | broken.swapaxes(1, 2))[:, i, j] & airborne[:, i] & airborne[:, j]
         middle = (position[:, i] + position[:, j]) / 2

@@ -81,7 +81,7 @@ ABOUT = {
     "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU. "
     "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`; "
     "`looks` counts the frames before this one in which perception ran.",
-    "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, Mb/s; 0 is never measured, at most 2⁻¹⁰ is silent: nothing got through.",
+    "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, Mb/s; 0 is unknown, at most 2⁻¹⁰ is silent, at most 2⁻⁹ has no payload lately but descriptors arrive.",
     "drops": "A descriptor refused at a receiver, with the reason.",
     "directives": "A change of what a gate enforces, with the reason that decided it.",
     "interventions": 'A directive that the shield replaced ("shield"), or that breaks an invariant all the same '

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.traffic import TargetPath
+from sortie.scenarios.link_state import is_tried
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import matched, transitions
@@ -54,7 +55,7 @@ def figures(record: SortieRecord) -> dict[str, str]:
         ("What each drone sent on its best link, and when it changed", 0.4 + 0.34 * (_drones(record) + 1), _lanes),
         ("Accuracy of all drones over the last five seconds, AP@0.5", 2.2, _accuracy),
         ("Traffic by representation and fate, Mb/s", 2.2, _traffic),
-        ("Goodput, mean of each drone's links that were ever measured, Mb/s", 2.2, _goodput),
+        ("Goodput, mean of each drone's links measured lately, Mb/s", 2.2, _goodput),
         ("Battery, %", 2.0, _battery),
         ("Age of descriptors when a policy read them, 99th percentile, ms", 1.8, _age),
         ("The way over the ground, m: drones, and the target with its mission disc", 4.2, _map),
@@ -198,8 +199,10 @@ def _goodput(axes: Axes, record: SortieRecord) -> None:
         return
     drone, t_s = table["drone"].to_numpy(), _column(table, "t_s")
     links = table["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(len(t_s), _drones(record) - 1)
-    known = links > 0
-    mean = np.where(known.any(axis=1), links.sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+    known = is_tried(links)
+    mean = np.where(
+        known.any(axis=1), np.where(known, links, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan
+    )
     for i in range(_drones(record)):
         axes.plot(t_s[drone == i], mean[drone == i], color=colour(i), linewidth=1.0, label=f"drone {i}")
     axes.set_ylim(bottom=0.0)

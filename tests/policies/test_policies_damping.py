@@ -309,7 +309,7 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
 @given(st.lists(st.sampled_from([0.0, SILENT_MBPS, 0.002, 4.0, 80.0]), min_size=1, max_size=20), st.floats(0, 3))
 def test_the_band_never_hides_that_a_link_was_measured(values: list[float], band: float) -> None:
     for heard, seen in zip(values, read(values, band=band), strict=True):
-        assert (state_of(seen) == LinkState.NEVER_MEASURED) == (state_of(heard) == LinkState.NEVER_MEASURED)
+        assert (state_of(seen) == LinkState.UNKNOWN) == (state_of(heard) == LinkState.UNKNOWN)
 
 
 def test_the_cells_of_another_representation_bound_nothing() -> None:

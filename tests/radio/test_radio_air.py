@@ -439,10 +439,10 @@ def test_arguments_out_of_bounds_are_refused() -> None:
 def test_a_link_whose_payloads_only_waited_is_not_silent() -> None:
     """Silent means that something was tried and nothing got through; a queue behind another link says less."""
     links = Goodput(3)
-    links.measured(0, 1, 50.0)
+    links.measured(0, 1, 50.0, 1.0)
     links.bounded(0, 1, 0.0)
     links.bounded(0, 2, 0.0)
-    assert [state_of(mbps) for mbps in links.read(0)[1:]] == [LinkState.MEASURED, LinkState.NEVER_MEASURED]
-    links.measured(0, 1, 0.0)
+    assert [state_of(mbps) for mbps in links.read(0, 1.0)[1:]] == [LinkState.MEASURED, LinkState.UNKNOWN]
+    links.measured(0, 1, 0.0, 1.0)
     links.bounded(0, 1, 3.0)
-    assert state_of(links.read(0)[1]) == LinkState.SILENT
+    assert state_of(links.read(0, 1.0)[1]) == LinkState.SILENT

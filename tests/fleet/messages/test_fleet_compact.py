@@ -57,7 +57,12 @@ def test_every_form_keeps_the_state_of_a_link(encode: Callable[[Descriptor], byt
     """Never measured, silent, measured however weakly, measured."""
     d = DESCRIPTOR._replace(agent_id=0, peer_goodput_mbps=(0.0, SILENT_MBPS, 0.01, 80.0))
     back = decode_descriptor(encode(d))
-    assert [back.link_state(i) for i in (1, 2, 3, 4)] == [*LinkState, LinkState.MEASURED]
+    assert [back.link_state(i) for i in (1, 2, 3, 4)] == [
+        LinkState.UNKNOWN,
+        LinkState.SILENT,
+        LinkState.MEASURED,
+        LinkState.MEASURED,
+    ]
     assert decode_descriptor(encode(back)).peer_goodput_mbps == back.peer_goodput_mbps
 
 

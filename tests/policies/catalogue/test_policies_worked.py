@@ -54,7 +54,7 @@ def test_a_weak_link_carries_detections(goodput: float, rung: Representation) ->
 @pytest.mark.parametrize(
     ("goodput", "state", "reason"),
     [
-        (0.0, LinkState.NEVER_MEASURED, "goodput not measured yet"),
+        (0.0, LinkState.UNKNOWN, "goodput not measured yet"),
         (SILENT_MBPS, LinkState.SILENT, "goodput: link silent, nothing got through"),
         (3.14, LinkState.MEASURED, "goodput 3.1 < 5 Mb/s"),
     ],

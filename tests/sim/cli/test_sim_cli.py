@@ -337,7 +337,7 @@ def test_check_tells_what_failed_and_why(scenario: Path) -> None:
     assert [v.holds for v in verdicts] == [True, False, False, True, True, False]
     assert verdicts[2].got.startswith("bytes.datasent: bytes has no 'datasent', it has context_sent")
     assert "drone 0: features with ROI because of 'track' decided in [2.9, 3.1] s" in verdicts[4].expected
-    assert verdicts[5].got.startswith("0.41 s: 0 → 1 detections at 2 Hz (goodput not measured yet); ")
+    assert verdicts[5].got.startswith("0.41 s: 0 → 1 detections at 2 Hz (goodput not measured lately); ")
 
 
 def test_check_passes_with_code_0(scenario: Path) -> None:

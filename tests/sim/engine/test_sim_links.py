@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import example
 
-from sortie.scenarios.link_state import LinkState, state_of
+from sortie.scenarios.link_state import MEASURED_FOR_S, LinkState, state_of
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.expectations import check
 from sortie.sim.engine.sortie import run_sortie
@@ -96,16 +96,16 @@ def test_a_trace_of_one_link_leaves_the_others_as_they_are(power_dbm: int, gaine
     assert after == [k + gained for k in before]
 
 
-def test_a_link_is_first_not_measured_then_measured_then_silent() -> None:
+def test_a_link_is_first_unknown_then_probed_then_measured_then_silent() -> None:
     """Drone 1's links break at 4 s. What each descriptor says of its link to drone 0, and why drone 0 sends what."""
     record = run_sortie(example("events=[{kind: link_drop, at_s: 4, drone: 1, loss_db: 90}]"))
     said = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1]
     states = [(d["t_s"], state_of(d["goodput_mbps"][0])) for d in said]
     order = [states[0][1], *(b for (_, a), (_, b) in pairwise(states) if b != a)]
-    assert order == [LinkState.NEVER_MEASURED, LinkState.MEASURED, LinkState.SILENT]
-    assert max(t_s for t_s, state in states if state == LinkState.NEVER_MEASURED) > 0.3
+    assert order == [LinkState.UNKNOWN, LinkState.PROBED, LinkState.MEASURED, LinkState.SILENT]
+    assert max(t_s for t_s, state in states if state == LinkState.PROBED) > 0.3
     reasons = [r["reason"] for r in record.tables["directives"].to_pylist() if r["drone"] == 1]
-    assert reasons[0] == "goodput not measured yet"
+    assert reasons[0] == "goodput not measured lately"
     assert "goodput: link silent, nothing got through" in reasons
     assert not any("goodput 0.0" in reason for reason in reasons)
 
@@ -116,3 +116,21 @@ def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:
     checks = check(scenario, record, outcome(record))
     assert [c for c in checks if not c.holds] == []
     assert len(checks) == 7
+
+
+STOP_S = 4.0
+LAST_WORD_S = STOP_S + MEASURED_FOR_S + 0.3
+"""A measurement just before the stop expires, and the next descriptor says so."""
+
+
+@pytest.mark.parametrize(("loss_db", "state"), [(120, LinkState.SILENT), (0, LinkState.PROBED)])
+def test_a_link_without_payloads_forgets_its_goodput(loss_db: int, state: LinkState) -> None:
+    """All payloads end at 4 s. Whether the link is there shows by the descriptors alone."""
+    lost = "" if not loss_db else f"{{kind: link_drop, at_s: {STOP_S}, drone: 1, loss_db: {loss_db}}}"
+    stop = f"policy={{name: best-2, changes: [{{at_s: {STOP_S}, name: silence}}]}}"
+    record = run_sortie(example("duration_s=8", "perception.detector=none", stop, f"events=[{lost}]"))
+    said = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1]
+    assert any(mbps > 5.0 for d in said if d["t_s"] < STOP_S for mbps in d["goodput_mbps"])
+    last = [{state_of(mbps) for mbps in d["goodput_mbps"]} for d in said if d["t_s"] > LAST_WORD_S]
+    assert len(last) > 10
+    assert set().union(*last) == {state}

@@ -1,0 +1,44 @@
+"""Descriptors as probes: a link without payloads is known by what arrives of its peer."""
+
+from __future__ import annotations
+
+import pytest
+
+from sortie.fleet.probes import Probes
+from sortie.radio.goodput import Goodput
+from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, LinkState, heard_share, state_of
+
+
+def test_probes_count_the_descriptors_heard_and_missed() -> None:
+    probes = Probes(0.1, 10)
+    for k in range(30):
+        if k % 5:  # every fifth is missed
+            probes.heard(1, 0.003 * (k % 2) + 0.1 * k)
+    assert probes.share(1, 2.93) == pytest.approx(0.8)
+    assert probes.share(1, 3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
+    assert probes.share(1, 3.98) == 0.0 == probes.share(1, 1e6)
+    assert probes.share(2, 3.0) is None
+
+
+def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:
+    probes = Probes(0.1, 10)
+    for k in range(10):
+        probes.heard(0, 0.1 * k)
+        if k < 5:
+            probes.heard(3, 0.1 * k)
+    known = probes.fill(1, (0.0, 40.0, 0.0, 0.0), 0.95)  # to drones 0, 2, 3 and 4
+    assert [state_of(mbps) for mbps in known] == [
+        LinkState.PROBED, LinkState.MEASURED, LinkState.PROBED, LinkState.UNKNOWN,
+    ]  # fmt: skip
+    assert [heard_share(mbps) for mbps in known] == [pytest.approx(1.0), None, pytest.approx(0.5), None]
+    later = probes.fill(1, (0.0, 40.0, 0.0, 0.0), 3.0)
+    assert later == (SILENT_MBPS, 40.0, SILENT_MBPS, 0.0)
+
+
+def test_a_measurement_expires_and_the_next_one_is_taken_as_it_is() -> None:
+    links = Goodput(2)
+    links.measured(0, 1, 70.0, 1.0)
+    assert links.read(0, 1.0 + MEASURED_FOR_S) == [0.0, 70.0]
+    assert links.read(0, 1.01 + MEASURED_FOR_S) == [0.0, 0.0]
+    links.measured(0, 1, 90.0, 10.0)
+    assert links.read(0, 10.0) == [0.0, 90.0]
