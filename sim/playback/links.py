@@ -20,7 +20,7 @@ RECENT_S = 1.0
 MANY_DRONES = 8
 """In fleets above this, links that carry nothing are left out."""
 BROKEN_MBPS = 1.0
-"""A link that was measured and is below this now is crossed out, also while nothing is sent on it."""
+"""A link that was measured or is silent, and is below this now, is crossed out, also while nothing is sent on it."""
 CROSS_M = 1.3
 _DIAGONALS = [np.array(d) * CROSS_M for d in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1))]
 _CROSS = np.stack([[-d, d] for d in _DIAGONALS])

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from sim_examples import example
 
 from sortie.perception.budget import CELL_M
-from sortie.scenarios.link_state import SILENT_MBPS
+from sortie.scenarios.link_state import SILENT_MBPS, is_tried
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -285,7 +285,7 @@ def test_a_link_that_is_all_but_gone_is_crossed_out(rows: Rows, record: SortieRe
         expected = set()
         for i, j in ((i, j) for i in range(n) for j in range(n) if i != j):
             known = [d["goodput_mbps"][j - (j > i)] for d in before if d["drone"] == i]
-            if any(known) and known[-1] < 1.0 and not (frame > 60 and 3 in (i, j)):
+            if is_tried(known[-1]) and known[-1] < 1.0 and not (frame > 60 and 3 in (i, j)):
                 expected.add(frozenset((i, j)))
         assert expected, frame
         assert len(drawn[frame]) == 4 * len(expected)  # four diagonals each
