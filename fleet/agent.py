@@ -213,6 +213,7 @@ class Agent:
             task_phase=phase,
             region=region,
             priority_target_ids=target_ids,
+            feature_space=self.status.feature_space,
         )
         if self._published is not None:
             # by the publisher, not by those who hear it: what they read would depend on which packets they lost
@@ -319,7 +320,10 @@ class Agent:
         for directive in self._gate.due(self._env.now):
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
-                made[what] = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes, tracks_in)
+                payload = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes, tracks_in)
+                if payload is not None and self.status.feature_space:
+                    payload = payload._replace(feature_space=self.status.feature_space)
+                made[what] = payload
             payload = made[what]
             if payload is not None:
                 self.status.work.payload_bytes += payload.size_bytes

@@ -17,7 +17,7 @@ from sortie.policies.contract import Directive, Disc, Representation
 from sortie.scenarios.representation import BOXES, NAME_OF
 
 HEADER_BYTES = 40
-"""Capture stamp (8), sender (4), estimated position (12) and attitude (16)."""
+"""Capture stamp (8), sender and its feature space (4), estimated position (12) and attitude (16)."""
 
 _EPSILON_S = 1e-6
 # members of an enumeration are slow to look up
@@ -48,6 +48,8 @@ class Payload(NamedTuple):
     """Bytes of a tile, None where the payload is one sample."""
     tracks: Tracks | None = None
     """The tracks that it carries, as they are read from its bytes; None where it carries none, or no tracker runs."""
+    feature_space: str = ""
+    """Of its feature cells: the network that made them."""
 
     @property
     def reliable(self) -> bool:

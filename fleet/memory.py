@@ -14,7 +14,9 @@ from sortie.fleet.probes import Probes
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
-from sortie.scenarios.representation import MAPS
+from sortie.scenarios.representation import MAPS, Representation
+
+FEATURES = Representation.FEATURES  # slow to look up, each time
 
 
 class Received(NamedTuple):
@@ -74,8 +76,12 @@ class PeerMemory:
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
         self._heard_at_s[sender] = now_s
 
+    def can_fuse(self, payload: Payload) -> bool:
+        """Whether the drone's network can use it. Feature cells of another network mean nothing to it."""
+        return payload.representation != FEATURES or payload.feature_space == self.status.feature_space
+
     def receive(self, received: Received) -> None:
-        """Keep a peer's payload, unless a newer capture of that peer arrived before it."""
+        """Keep a peer's payload, unless a newer capture of that peer arrived before it, or this drone cannot fuse it."""
         peer = received.capture.drone
         held = self.held.get(peer)
         self.status.work.payload_bytes += received.payload.size_bytes
@@ -87,6 +93,8 @@ class PeerMemory:
                     0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
                 )
             )
+        if not self.can_fuse(received.payload):
+            return
         if self.status.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
             self.held[peer] = received
 

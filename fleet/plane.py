@@ -48,6 +48,8 @@ class DroneStatus:
     It is made before them and handed to each, so that none of them has to hold another.
     """
 
+    feature_space: str = ""
+    """The network of the drone: only maps of one feature space can be fused. Empty: the fleet's common one."""
     airborne: bool = True
     """False while the drone is on the ground or lost."""
     perceiving: bool = False

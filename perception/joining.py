@@ -78,6 +78,8 @@ def source_of(share: Share, alone: Boxes | None) -> SourceBoxes:
     where = share.weight, share.capture.est_pose, share.roi
     tracks, age_s = share.tracks, share.age_s
     if alone is None:
+        alone = share.boxes
+    if alone is None:
         assert tracks is not None  # noqa: S101 (what `is_detected` says)
         cut = len(tracks) >= budget.MAX_TRACKS
         return SourceBoxes(boxes_of(tracks), *where, cut, age_s, *motion_of(tracks, age_s))

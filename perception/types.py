@@ -66,6 +66,8 @@ class Share(NamedTuple):
     """From the capture to the fusion, as the receiver knows it. What it leaves of a share is in `perception.lateness`."""
     tracks: Tracks | None = None
     """Of a payload of tracks: the tracks that came. Of detections: the receiver's own tracks, which say how late boxes move."""
+    boxes: Boxes | None = None
+    """The sender's own boxes, best first, where another network than the receiver's made them."""
 
     @property
     def is_map(self) -> bool:
@@ -74,8 +76,8 @@ class Share(NamedTuple):
 
     @property
     def is_detected(self) -> bool:
-        """Whether it holds boxes that a detector finds in its capture; tracks bring their own."""
-        return not self.is_map and (self.representation != "tracks" or self.tracks is None)
+        """Whether it holds boxes that the receiver's detector finds in its capture; tracks bring their own."""
+        return self.boxes is None and not self.is_map and (self.representation != "tracks" or self.tracks is None)
 
 
 @dataclass(frozen=True, slots=True)

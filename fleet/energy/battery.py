@@ -56,7 +56,7 @@ class FleetBatteries:
 
     def __init__(
         self,
-        config: Battery,
+        config: Battery | Sequence[Battery],
         overrides: Sequence[DroneOverride],
         n: int,
         traces: Mapping[int, BatteryTrace] | None = None,
@@ -64,16 +64,24 @@ class FleetBatteries:
         """Packs of `n` drones at take-off.
 
         Args:
-            config: the fleet's pack.
+            config: the fleet's pack, or one for each drone.
             overrides: `fleet.overrides` of the scenario.
             n: number of drones.
             traces: drones whose charge is not modelled but read from a trace.
         """
-        packs = [config] * n
+        packs = [config] * n if isinstance(config, Battery) else list(config)
         for override in overrides:
             changes = override.model_dump(exclude={"drone", "payload_kg"}, exclude_none=True)
             packs[override.drone] = packs[override.drone].model_copy(update=changes)
-        self._config, self._now_s = config, 0.0
+        self._packs, self._now_s = packs, 0.0
+        self._loads = [
+            (
+                p.drivetrain_efficiency, p.avionics_w, p.compute_idle_w, p.compute_active_w - p.compute_idle_w,
+                p.radio_idle_w, p.radio_tx_w - p.radio_idle_w, p.landing_soc, p.cutoff_cell_v,
+                p.ambient_c is not None, p.polarisation.resistance_mohm > 0,
+            )
+            for p in packs
+        ]  # fmt: skip
         self._traces: dict[int, BatteryTrace] = dict(traces or {})
         aged = [ageing(pack.cycles, pack.life_cycles) for pack in packs]
         self._full_j = [pack.capacity_wh * 3600.0 * share for pack, (share, _) in zip(packs, aged, strict=True)]
@@ -85,7 +93,7 @@ class FleetBatteries:
         self._polarised_v = [0.0] * n
         self._heat_jpk = [heat_capacity_jpk(pack.capacity_wh) for pack in packs]
         self.cells = [pack.cells for pack in packs]
-        self.temperature_c = [REFERENCE_C if config.ambient_c is None else config.ambient_c] * n
+        self.temperature_c = [REFERENCE_C if pack.ambient_c is None else pack.ambient_c for pack in packs]
         self.soc = [self._traces[i].soc_at(0.0) if i in self._traces else p.initial_soc for i, p in enumerate(packs)]
         self.energy_left_j = [
             full * float(energy_fraction(soc)) for full, soc in zip(self._full_j, self.soc, strict=True)
@@ -94,7 +102,7 @@ class FleetBatteries:
         self.energy_j: dict[str, list[float]] = {cause: [0.0] * n for cause in causes}
         self.voltage_v = [float(open_circuit_cell_v(s)) * k for s, k in zip(self.soc, self.cells, strict=True)]
         self.current_a = [0.0] * n
-        self.landed = [soc <= config.landing_soc for soc in self.soc]
+        self.landed = [soc <= pack.landing_soc for soc, pack in zip(self.soc, packs, strict=True)]
         self.landing_reason = [self._charge(i) if down else "" for i, down in enumerate(self.landed)]
         """In words, for whom the pack brought down."""
         self._kept = [1.0] * n  # of what a trace says, after faults
@@ -118,16 +126,11 @@ class FleetBatteries:
         A drone whose pack cannot deliver the power lands at once and draws nothing in this step; one that reaches
         landing_soc, falls below cutoff_cell_v, or empties, lands at the step's end.
         """
-        config, left, soc, landed = self._config, self.energy_left_j, self.soc, self.landed
+        loads, left, soc, landed = self._loads, self.energy_left_j, self.soc, self.landed
         full_j, pack_ohm, pack_cells, traces = self._full_j, self._resistance_ohm, self.cells, self._traces
         voltage_v, current_a_, polarised_v = self.voltage_v, self.current_a, self._polarised_v
         rotor_j, avionics_j, compute_j = self.energy_j["rotor"], self.energy_j["avionics"], self.energy_j["compute"]
         radio_j, ohmic_j = self.energy_j["radio"], self.energy_j["ohmic"]
-        efficiency, avionics = config.drivetrain_efficiency, config.avionics_w
-        idle, active = config.compute_idle_w, config.compute_active_w - config.compute_idle_w
-        listen, send = config.radio_idle_w, config.radio_tx_w - config.radio_idle_w
-        landing_soc, cutoff_cell_v = config.landing_soc, config.cutoff_cell_v
-        thermal, polarises, warmth = config.ambient_c is not None, config.polarisation.resistance_mohm > 0, 1.0
         self._now_s += dt_s
         for i, down in enumerate(landed):
             if down:
@@ -136,6 +139,8 @@ class FleetBatteries:
                 self._follow(i, dt_s)
                 continue
             full, cells, resistance = full_j[i], pack_cells[i], pack_ohm[i]
+            efficiency, avionics, idle, active, listen, send, landing_soc, cutoff_cell_v, thermal, polarises = loads[i]
+            warmth = 1.0
             at = left[i] / full * STEPS
             k = int(at)
             ocv = cells * (CELL_TABLE[k] + (at - k) * (CELL_TABLE[k + 1] - CELL_TABLE[k]))
@@ -187,7 +192,7 @@ class FleetBatteries:
         self._lose(drone, lost_fraction)
         self._kept[drone] *= 1.0 - lost_fraction
         self._read_off(drone)
-        if self.soc[drone] <= self._config.landing_soc:
+        if self.soc[drone] <= self._packs[drone].landing_soc:
             self.land(drone)
 
     def drop_cell(self, drone: int) -> None:
@@ -214,7 +219,7 @@ class FleetBatteries:
 
     def take_off(self, drone: int) -> None:
         """Put a drone into the air, unless its charge would land it at once."""
-        self.landed[drone] = self.soc[drone] <= self._config.landing_soc
+        self.landed[drone] = self.soc[drone] <= self._packs[drone].landing_soc
         self.landing_reason[drone] = self._charge(drone) if self.landed[drone] else ""
 
     def _charge(self, drone: int) -> str:
@@ -228,14 +233,14 @@ class FleetBatteries:
     def _polarise(self, drone: int, current_a: float, dt_s: float) -> None:
         """One RC element a cell, exact for a constant current; its resistance ages with the rest, and `current_a` has
         the cold in it."""
-        config = self._config
+        config = self._packs[drone]
         towards_v = current_a * config.polarisation.resistance_mohm / 1000.0 * self._worn[drone]
         fades = math.exp(-dt_s / config.polarisation.time_s)
         self._polarised_v[drone] = towards_v + (self._polarised_v[drone] - towards_v) * fades
 
     def _warm(self, drone: int, lost_w: float, dt_s: float) -> None:
         """What the resistance takes warms the pack, the air cools it."""
-        ambient_c, heat = self._config.ambient_c, self._heat_jpk[drone]
+        ambient_c, heat = self._packs[drone].ambient_c, self._heat_jpk[drone]
         assert ambient_c is not None  # noqa: S101
         equilibrium_c = ambient_c + lost_w * COOLING_TIME_S / heat
         fades = math.exp(-dt_s / COOLING_TIME_S)
@@ -255,7 +260,7 @@ class FleetBatteries:
             self.voltage_v[drone] = voltage_v
         current = trace.current_at(now_s)
         self.current_a[drone] = spent_j / dt_s / self.voltage_v[drone] if current is None else current
-        if self.soc[drone] <= self._config.landing_soc:
+        if self.soc[drone] <= self._packs[drone].landing_soc:
             self.land(drone)
 
     def _read_off(self, drone: int) -> None:

@@ -103,17 +103,19 @@ def induced_speed(forward: npt.ArrayLike, climb: npt.ArrayLike) -> Array:
 
 
 def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
-    """Power at the rotors of every drone in every frame, W [T, N], by the scenario's model and payloads."""
-    airframe = fleet.airframe
-    payload_kg = np.full(fleet.drones, airframe.payload_kg)
-    for override in fleet.overrides:
-        if override.payload_kg is not None:
-            payload_kg[override.drone] = override.payload_kg
-    mass_kg = airframe.mass_kg + payload_kg
-    if airframe.power_model == "momentum":
-        return momentum_power_w(motion.velocity_mps - motion.wind_mps, motion.acceleration_mps2, airframe, mass_kg)
-    level: Array = rotor_power_w(motion.air_speed_mps, airframe, mass_kg)
-    return level + climb_power_w(motion.velocity_mps[..., 2], airframe, mass_kg)
+    """Power at the rotors of every drone in every frame, W [T, N], by the airframes' models and payloads."""
+    machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
+    power_w = np.empty(motion.position_m.shape[:2])
+    for airframe in dict.fromkeys(a for a, _ in machines):
+        of = [i for i, (a, _) in enumerate(machines) if a == airframe]
+        mass_kg = airframe.mass_kg + np.array([machines[i][1] for i in of])
+        if airframe.power_model == "momentum":
+            air_mps = (motion.velocity_mps - motion.wind_mps)[:, of]
+            power_w[:, of] = momentum_power_w(air_mps, motion.acceleration_mps2[:, of], airframe, mass_kg)
+        else:
+            level_w = rotor_power_w(motion.air_speed_mps[:, of], airframe, mass_kg)
+            power_w[:, of] = level_w + climb_power_w(motion.velocity_mps[:, of, 2], airframe, mass_kg)
+    return power_w
 
 
 def figure_of_merit(thrust_coefficient: float, power_coefficient: float) -> float:

@@ -12,7 +12,8 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.traces import located
 
 FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.recording", "perception.recorded_fusion")
-"""Fields that name a file; so do a policy's name and those of its changes where they are `file.py:function`."""
+"""Fields that name a file; so do the weights of a make, and a policy's name, those of its changes and those of makes where
+they are `file.py:function`."""
 
 
 def named_files(sections: dict[str, Any]) -> list[str]:
@@ -48,6 +49,11 @@ def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
         room, _, key = field.partition(".")
         if sections.get(room, {}).get(key) is not None:
             yield sections[room], key
+    for make in sections.get("fleet", {}).get("makes", ()):
+        if make.get("weights") is not None:
+            yield make, "weights"
+        if ":" in (make.get("policy") or ""):
+            yield make, "policy"
     policy = sections.get("policy", {})
     for named in (policy, *policy.get("changes", ())):
         if ":" in named.get("name", ""):

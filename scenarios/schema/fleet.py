@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -209,6 +209,52 @@ class DroneOverride(Section):
     payload_kg: float | None = Field(None, ge=0, le=100, description="As fleet.airframe.payload_kg.")
 
 
+def _or_a_preset(schema: dict[str, Any]) -> None:
+    """Let editors accept a preset's name beside the section and nothing."""
+    schema["anyOf"].insert(0, {"enum": list(Airframe.presets)})
+
+
+class Make(Section):
+    """Drones of one kind within a fleet. What is left out is the fleet's."""
+
+    name: str = Field(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$", description="Its name.")
+    drones: tuple[DroneId, ...] = Field(min_length=1, description="Which drones are of this make.")
+    airframe: Airframe | None = Field(
+        None,
+        description="In place of fleet.airframe, as a whole.",
+        json_schema_extra=_or_a_preset,
+    )
+    battery: Battery | None = Field(None, description="In place of fleet.battery, as a whole.")
+    computer: Computer | None = Field(None, description="In place of fleet.computer, as a whole.")
+    tx_power_dbm: float | None = Field(None, ge=-20, le=36, description="In place of radio.tx_power_dbm.")
+    policy: str | None = Field(
+        None, min_length=1, description="A policy of its own: a registered one, or path/to/file.py:function."
+    )
+    policy_params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of that policy.")
+    weights: str | None = Field(
+        None, description="A network of its own, as perception.weights. Its maps are of another feature space."
+    )
+    feature_space: str | None = Field(
+        None,
+        max_length=32,
+        pattern=r"^([A-Za-z0-9][A-Za-z0-9_.+-]*)?$",
+        description="What its feature maps are called; only maps of one name can be fused. Left out, the make's name where weights are given, else the fleet's common one, which has no name.",
+    )
+
+    @property
+    def space(self) -> str:
+        """The feature space that its drones publish; empty is the fleet's common one."""
+        if self.feature_space is not None:
+            return self.feature_space
+        return "" if self.weights is None else self.name
+
+    @model_validator(mode="after")
+    def _parameters_of_a_policy(self) -> Make:
+        if self.policy_params and self.policy is None:
+            raise inconsistent(("policy_params",), f"{self.policy_params}", "left out where there is no policy")
+        return self
+
+
 class Fleet(Section):
     drones: int = Field(5, ge=1, le=200, description="Number of drones; ids are 0 … drones − 1.")
     formation: Formation = Formation()
@@ -223,8 +269,11 @@ class Fleet(Section):
     battery: Battery = Battery()
     computer: Computer = Computer()
     clock: Clocks = Clocks()
+    makes: tuple[Make, ...] = Field(
+        (), description="Kinds of drones that differ from the fleet's; other drones are as the fleet says."
+    )
     overrides: tuple[DroneOverride, ...] = Field(
-        (), description="Drones whose battery or payload differs from the fleet's."
+        (), description="Drones whose battery or payload differs from their make's."
     )
     trace: str | None = Field(
         None,
@@ -241,7 +290,59 @@ class Fleet(Section):
             if override.drone in seen:
                 raise inconsistent(at, f"{override.drone}", "named once, it has an override above")
             seen.add(override.drone)
-            if override.cycles is not None and override.cycles > 2 * self.battery.life_cycles:
-                bound = f"at most twice fleet.battery.life_cycles = {self.battery.life_cycles:g}"
+            life_cycles = self.batteries[override.drone].life_cycles
+            if override.cycles is not None and override.cycles > 2 * life_cycles:
+                bound = f"at most twice the drone's battery.life_cycles = {life_cycles:g}"
                 raise inconsistent(("overrides", i, "cycles"), f"{override.cycles:g}", bound)
         return self
+
+    @model_validator(mode="after")
+    def _makes_fit(self) -> Fleet:
+        names: set[str] = set()
+        made: dict[int, str] = {}
+        for i, make in enumerate(self.makes):
+            if make.name in names:
+                raise inconsistent(("makes", i, "name"), repr(make.name), "given once, it is a make above")
+            names.add(make.name)
+            for k, drone in enumerate(make.drones):
+                at = ("makes", i, "drones", k)
+                if drone >= self.drones:
+                    raise inconsistent(at, f"{drone}", f"below fleet.drones = {self.drones}")
+                if drone in made:
+                    raise inconsistent(at, f"{drone}", f"of one make, it is of {made[drone]!r} already")
+                made[drone] = make.name
+        return self
+
+    def make_of(self, drone: int) -> Make | None:
+        """The make that names a drone; None for one that is as the fleet says."""
+        return next((make for make in self.makes if drone in make.drones), None)
+
+    @property
+    def airframes(self) -> tuple[Airframe, ...]:
+        """Each drone's airframe, with its payload."""
+        own = [self.airframe] * self.drones
+        for make in self.makes:
+            for drone in make.drones:
+                own[drone] = make.airframe or self.airframe
+        for override in self.overrides:
+            if override.payload_kg is not None:
+                own[override.drone] = own[override.drone].model_copy(update={"payload_kg": override.payload_kg})
+        return tuple(own)
+
+    @property
+    def batteries(self) -> tuple[Battery, ...]:
+        """Each drone's pack, overrides not included."""
+        makes = [self.make_of(drone) for drone in range(self.drones)]
+        return tuple(self.battery if make is None else make.battery or self.battery for make in makes)
+
+    @property
+    def computers(self) -> tuple[Computer, ...]:
+        """Each drone's companion computer."""
+        makes = [self.make_of(drone) for drone in range(self.drones)]
+        return tuple(self.computer if make is None else make.computer or self.computer for make in makes)
+
+    @property
+    def feature_spaces(self) -> tuple[str, ...]:
+        """Each drone's feature space; empty is the fleet's common one."""
+        makes = [self.make_of(drone) for drone in range(self.drones)]
+        return tuple("" if make is None else make.space for make in makes)

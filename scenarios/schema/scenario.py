@@ -90,6 +90,13 @@ class Scenario(Section):
                 if who >= n:
                     at = ("mission", "groups", k, "drones", i)
                     raise inconsistent(at, f"{who}", f"below fleet.drones = {n}")
+        for i, make in enumerate(self.fleet.makes):
+            detector = self.perception.detector
+            if make.weights is not None and detector not in ("torch", "surrogate"):
+                raise inconsistent(("fleet", "makes", i, "weights"), repr(make.weights), f"left out for {detector}")
+            if make.tx_power_dbm is not None and self.radio.trace is not None:
+                bound = "left out where radio.trace says what links are worth"
+                raise inconsistent(("fleet", "makes", i, "tx_power_dbm"), f"{make.tx_power_dbm:g}", bound)
         degraded, detached = self.context.degraded_after_periods, self.context.detached_after_periods
         if detached <= degraded:
             bound = f"above degraded_after_periods = {degraded:g}"

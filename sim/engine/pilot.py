@@ -61,11 +61,16 @@ class PolicyPlan(NamedTuple):
     rules: tuple[Invariant, ...] = ()
     shielded: bool = False
     replays: tuple[tuple[float, int, FleetView], ...] = ()
+    of_makes: Mapping[int, NamedPolicy] = {}
+    """By drone: the policy of its make, where that has one; it decides in place of `first`."""
 
     @property
     def policies(self) -> dict[str, NamedPolicy]:
         """Every policy that may decide, by name."""
-        return {policy.name: policy for policy in (self.first, *(policy for _, policy in self.changes))}
+        return {
+            policy.name: policy
+            for policy in (self.first, *self.of_makes.values(), *(policy for _, policy in self.changes))
+        }
 
     @property
     def chooses_viewpoints(self) -> bool:
@@ -193,8 +198,9 @@ class Pilot:
             request_viewpoint: takes the viewpoints that the policy chooses; None where no policy of the plan does.
             keep: takes every decision; None keeps none.
         """
-        self.drone, self.policy, self._request, self._keep = drone, plan.first, request_viewpoint, keep
-        self._viewpoint = viewpoint_of(plan.first.decide)
+        self.drone, self._request, self._keep = drone, request_viewpoint, keep
+        self.policy = plan.of_makes.get(drone, plan.first)
+        self._viewpoint = viewpoint_of(self.policy.decide)
         changes = enumerate(plan.changes)
         self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision

@@ -34,12 +34,13 @@ from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, route_bounds
+from sortie.sim.engine.world import OwnSenses, World, route_bounds, strongest_dbm
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results import disagreement
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
@@ -136,16 +137,16 @@ def build(
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
     env, recorder = simpy.Environment(), Recorder()
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
-    statuses = [DroneStatus() for _ in drones]
+    statuses = [DroneStatus(space) for space in scenario.fleet.feature_spaces]
     memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
 
     motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
-    batteries = FleetBatteries(scenario.fleet.battery, scenario.fleet.overrides, len(drones), charges)
+    batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges)
     up = up_vector(motion.orientation_xyzw)
     air = Air(
         env,
-        AirSettings.of(scenario.radio.model_dump(exclude={"framing"})),
+        AirSettings.of(scenario.radio.model_dump(exclude={"framing"}) | {"tx_power_dbm": strongest_dbm(scenario)}),
         motion.position_m,
         seed=seed,
         replication=replication,
@@ -170,7 +171,7 @@ def build(
     request = None if choreography is None else choreography.request
     pilots = [Pilot(i, policies, audit, request, None if journal is None else journal.decided) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
-    detector = detector_of(scene, scenario.perception, seed, replication)
+    detector = mixed(detector_of, scene, scenario, seed, replication)
     count_boxes = None if detector is None else detector.count_boxes
 
     def capture_of(drone: int, frame: int) -> Capture:
@@ -297,10 +298,12 @@ def _rates_mbps(scenario: Scenario) -> Sequence[float]:
 def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, PolicyPlan]:
     """The policy's name in the record, and who decides when.
 
-    The scenario's parameters and changes go with the scenario's own policy only; its invariants and shield with all.
+    The scenario's parameters, changes and policies of makes go with the scenario's own policy only; its invariants and
+    shield with all.
     """
     section = scenario.policy
     if policy is None or policy == section.name:
-        return section.name, plan_of(section)
+        own = {i: named_policy(m.policy, m.policy_params) for m in scenario.fleet.makes if m.policy for i in m.drones}
+        return section.name, plan_of(section)._replace(of_makes=own)
     first = named_policy(policy, {}) if isinstance(policy, str) else NamedPolicy(name_of(policy), policy)
     return first.name, plan_of(section, first)

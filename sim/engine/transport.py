@@ -20,8 +20,12 @@ from sortie.fleet.tiles import cells_of
 from sortie.perception.types import Capture
 from sortie.policies.contract import Representation
 from sortie.radio import Air, Transmission
+from sortie.radio.transmission import Status
 from sortie.scenarios.representation import NAME_OF
 from sortie.sim.results.record import HANDSHAKE, Recorder
+
+OTHER_SPACE = "other_feature_space"
+"""The reason of delivered feature maps that their receiver refused: another network made them."""
 
 
 class Transport:
@@ -117,6 +121,8 @@ class Transport:
 
     def _done(self, transmission: Transmission) -> None:
         payload, capture, stamp_s = self._pending.pop(transmission.number)
+        if transmission.status == Status.DELIVERED and not self._receivers[transmission.receiver].can_fuse(payload):
+            transmission = transmission._replace(reason=OTHER_SPACE)  # it took the air all the same
         self._write(transmission, payload, capture)
         if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
             missing, mcs, rates_mbps = transmission.missing, transmission.mcs, self._rates_mbps

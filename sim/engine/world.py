@@ -65,6 +65,25 @@ def with_frame(t_s: float, frame_s: float) -> float:
     return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
 
 
+def strongest_dbm(scenario: Scenario) -> float:
+    """The highest transmit power in the fleet, which the air reckons with."""
+    return max(sent_dbm(scenario))
+
+
+def sent_dbm(scenario: Scenario) -> list[float]:
+    """Each drone's transmit power."""
+    makes = [scenario.fleet.make_of(drone) for drone in range(scenario.fleet.drones)]
+    common = scenario.radio.tx_power_dbm
+    return [common if m is None or m.tx_power_dbm is None else m.tx_power_dbm for m in makes]
+
+
+def weaker_senders_db(scenario: Scenario) -> np.ndarray | None:
+    """[N, N], sender by receiver: how much weaker than the strongest a drone sends; None where all are equal."""
+    dbm = np.array(sent_dbm(scenario))
+    loss = np.repeat((dbm.max() - dbm)[:, None], len(dbm), axis=1)
+    return loss if loss.any() else None
+
+
 class World:
     """Positions, batteries, links and mission, stepped once a frame."""
 
@@ -86,13 +105,14 @@ class World:
         )  # fmt: skip
         self.drones = drones
         n = len(drones)
-        self.extra_loss_db: np.ndarray | None = None
-        """[N, N] what scenario events add to the path loss; None until one does."""
+        self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
+        """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
         self.oscillators = oscillators
         self._clocks = [each.at_start(scenario.fleet.clock.gnss) for each in oscillators]
         self._read_clocks()
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self._scenario, self._recorder = scenario, recorder
+        self._computers = scenario.fleet.computers
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
         self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field)
@@ -150,8 +170,8 @@ class World:
         self._work.append([replace(status.work) for status in self.drones])
         lasts_s = (len(self._work) - 1) * scenario.frame_s
         self._headrooms = [
-            headrooms(scenario.fleet.computer, scenario.perception.compute_delay_s, a, b, lasts_s)
-            for a, b in zip(self._work[0], self._work[-1], strict=True)
+            headrooms(computer, scenario.perception.compute_delay_s, a, b, lasts_s)
+            for computer, a, b in zip(self._computers, self._work[0], self._work[-1], strict=True)
         ]
 
     def _read_clocks(self) -> None:

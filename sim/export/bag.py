@@ -66,7 +66,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     n, states = record.scenario.fleet.drones, record.tables["states"]
     names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
-    rate_hz = record.scenario.context.rate_hz
+    rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.fleet.feature_spaces
     for row in rows:
         k = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1) * n + row["drone"]
         region = (
@@ -89,6 +89,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             novelty_flags=row["novelty_flags"],
             task_phase=PHASE_OF[row["phase"]],
             region=region,
+            feature_space=spaces[row["drone"]],
             priority_target_ids=(TARGET_ID,) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
 

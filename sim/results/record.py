@@ -87,7 +87,7 @@ ABOUT = {
     "interventions": 'A directive that the shield replaced ("shield"), or that breaks an invariant all the same '
     '("broken"); peer −1: all of a drone\'s together.',
     "transmissions": "A payload handed to the radio, with its fate. `partial`: some of its tiles arrived, "
-    "`arrived_bytes` of it.",
+    "`arrived_bytes` of it. The reason `other_feature_space`: delivered feature maps that the receiver's network cannot fuse.",
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
     "detections": "A box that an ego detected, ENU.",
     "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
