@@ -48,6 +48,15 @@ def live(
             help="Master key of the fleet (32 bytes or 64 hex digits; mode 600). Default: SORTIE_KEY, or a random key.",
         ),
     ] = None,
+    fallback: Annotated[
+        str,
+        typer.Option(
+            metavar="RUNG@HZ", help="What links get while a policy gives no answer: detections, tracks, none."
+        ),
+    ] = "detections@2",
+    decide_within: Annotated[
+        float | None, typer.Option(help="Longest time for one decision, s; default: one frame.")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
     ] = None,
@@ -71,6 +80,7 @@ def live(
     with user_errors():
         from sortie.sim.live.seals import find_key
         from sortie.sim.live.session import fly_live
+        from sortie.sim.live.watchdog import parse_fallback
 
     ensure_files(out_file)
     with stages() as report:
@@ -82,6 +92,8 @@ def live(
             kill=killed,
             domain=number,
             key=find_key(key),
+            fallback=parse_fallback(fallback),
+            decide_within_s=decide_within,
             progress=lambda what, done, of: report(what, round(done), round(of)),
         )
     _show(result)
@@ -127,11 +139,14 @@ def _show(result: LiveResult) -> None:
             f"{t.bytes_per_s / 1e3:.1f}", _share(t.heard_share), _share(t.delivered_share),
         )  # fmt: skip
     out.print(table)
-    table = Table("drone", "CPU", "published", "heard", "lost", "refused", "publishes within", title="processes")
+    table = Table(
+        "drone", "CPU", "published", "heard", "lost", "refused", "fallback", "publishes within", title="processes"
+    )
     for d in result.each:
         refused = ", ".join(f"{n} {why}" for why, n in d.refused.items()) or "0"
         table.add_row(
             f"{d.drone}", f"{d.cpu_percent:.1f} %", f"{d.published}", f"{d.heard}", f"{d.dropped_by_loss}", refused,
+            f"{d.fallbacks}",
             f"{1e3 * d.publishes_within_s:.0f} ms",
         )  # fmt: skip
     out.print(table)

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import signal
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 from sortie.fleet.agent import Agent
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.plane import DroneStatus, PlaneRules
-from sortie.policies.contract import PolicyError
+from sortie.policies.contract import Directive, FleetView, PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
-from sortie.sim.engine.pilot import Audit, Pilot, plan_of, schedule_policies
 from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.engine.world import at
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
-from sortie.sim.live.reports import Failed, Go, Home, Notice, Ready, Report
+from sortie.sim.live.policy_process import Begin, PolicyOrders
+from sortie.sim.live.reports import Failed, Go, Home, Ready
 from sortie.sim.live.seals import Seals, Secrets
-from sortie.sim.results.record import Recorder
+from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
 
 POLL_S = 0.02
 """How often a process that waits for others looks at its pipe."""
@@ -42,6 +43,9 @@ class Orders:
     domain: int
     secrets: Secrets | None = None
     """None: the fleet's messages come bare."""
+    fallback: Fallback = DETECTIONS
+    decide_within_s: float | None = None
+    """None: one frame."""
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
@@ -62,59 +66,78 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
 def fly_one(orders: Orders, pipe: Connection) -> None:
     """The process of one drone: ready, go, fly, report. It ends with its flight, or when the bench says so or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the bench handles Ctrl-C and stops every process
+    scenario, drone = orders.scenario, orders.drone
+    policy: Watchdog | None = None
     try:
         node = LiveNode(
-            Bus(orders.domain), Seals(orders.secrets, orders.drone), orders.drone, orders.scenario.fleet.drones,
-            seed=orders.scenario.seed, loss=orders.loss,
+            Bus(orders.domain), Seals(orders.secrets, drone), drone, scenario.fleet.drones,
+            seed=scenario.seed, loss=orders.loss,
         )  # fmt: skip
-        senses = ReplaySenses(orders.scenario, orders.drone, orders.trace, orders.begin_s)
-        while not node.all_found(orders.scenario.fleet.drones):
+        policy = Watchdog(
+            PolicyOrders(scenario.policy, drone, scenario.frame_s),
+            fallback=orders.fallback,
+            deadline_s=scenario.frame_s if orders.decide_within_s is None else orders.decide_within_s,
+            note=node.note,
+            decided=node.decided,
+        )
+        senses = ReplaySenses(scenario, drone, orders.trace, orders.begin_s)
+        while not node.all_found(scenario.fleet.drones):
             if pipe.poll(POLL_S):
                 return
-        pipe.send(Ready(orders.drone))
+        policy.wait_until_loaded()
+        pipe.send(Ready(drone))
         go = pipe.recv()
         if isinstance(go, Go):
-            _fly(orders, node, senses, go, pipe)
+            policy.begin(Begin(orders.begin_s, go.monotonic_s))
+            _fly(orders, node, policy, senses, go, pipe)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody is left to report to
     except (PolicyError, OSError) as error:
-        pipe.send(Failed(orders.drone, str(error)))
+        pipe.send(Failed(drone, str(error)))
     finally:
+        if policy is not None:
+            policy.close()
         pipe.close()
 
 
-def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Connection) -> None:
+def _fly(orders: Orders, node: LiveNode, policy: Watchdog, senses: ReplaySenses, go: Go, pipe: Connection) -> None:
     scenario, drone = orders.scenario, orders.drone
     time.sleep(max(0.0, go.monotonic_s - time.monotonic()))
     clock = WallClock(orders.begin_s, go.monotonic_s)
-    recorder = Recorder()
-    plan = plan_of(scenario.policy)._replace(replays=())
-    pilot = Pilot(drone, plan, Audit(clock, recorder))
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
     phase_s = PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
     # stamps are nanoseconds since 1970, as in ROS 2
     memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
+
+    def decide(view: FleetView) -> Sequence[Directive]:
+        node.note_health(view)
+        return policy(view)
+
     agent = Agent(
         clock,
         memory,
         rules=rules,
-        policy=node.watched(pilot),
+        policy=decide,
         senses=senses,
         modem=node,
         gate=node.gate,
         log=node,
         sealer=None,  # the node seals what it writes
         phase_s=orders.begin_s + phase_s,
-        handshake_bytes=pilot.handshake_bytes,
+        handshake_bytes=lambda: policy.handshake_bytes,
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
-    schedule_policies(clock, plan, [pilot], scenario.frame_s)
     if orders.trace.end_s < orders.end_s:
         at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
 
     def send_report() -> None:
-        pipe.send(_with_notices(node.report(clock.now), recorder))
+        report = node.report(clock.now)
+        pipe.send(
+            replace(
+                report, cpu_s=report.cpu_s + policy.cpu_s, fallbacks=policy.fallbacks, policy_restarts=policy.restarts
+            )
+        )
 
     reported_s = orders.begin_s
     while clock.now < orders.end_s and not pipe.poll():
@@ -126,14 +149,3 @@ def _fly(orders: Orders, node: LiveNode, senses: ReplaySenses, go: Go, pipe: Con
             send_report()
     send_report()
     pipe.send(Home(drone))
-
-
-def _with_notices(report: Report, recorder: Recorder) -> Report:
-    """The report with what the audit wrote since the last one."""
-    for t_s, drone, _, text in recorder.rows["events"]:
-        report.new.notices.append(Notice(t_s, drone, text))
-    for t_s, drone, peer, _, kind, text in recorder.rows["interventions"]:
-        report.new.notices.append(Notice(t_s, drone, f"{kind} → {peer}: {text}"))
-    recorder.rows["events"].clear()
-    recorder.rows["interventions"].clear()
-    return report

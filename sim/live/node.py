@@ -27,7 +27,7 @@ from sortie.fleet.plane import PlaneRules
 from sortie.fleet.staleness import LinkHealth, health
 from sortie.fleet.trust import Standing
 from sortie.perception.types import Capture
-from sortie.policies.contract import Descriptor, Directive, FleetView, Policy
+from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import PHASE_SHARE
@@ -35,6 +35,7 @@ from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.messages import pack_bytes, unpack_bytes
+from sortie.sim.live.policy_process import Decision
 from sortie.sim.live.reports import Count, HealthChange, NewDirective, Notice, Report, SinceLastReport
 from sortie.sim.live.seals import Seals
 
@@ -120,17 +121,14 @@ class LiveNode:
         self.goodput_mbps = goodput_mbps
         self._began_cpu_s = time.process_time()
 
-    def watched(self, decide: Policy) -> Policy:
-        """The policy, with a record of its time and of the health of every peer."""
+    def decided(self, decision: Decision) -> None:
+        """Keep a decision's processor time and events for the next report."""
+        self._new.decide_ns.append(decision.elapsed_ns)
+        self._new.notices += decision.notices
 
-        def watching(view: FleetView) -> Sequence[Directive]:
-            self._note_health(view)
-            begin_ns = time.thread_time_ns()
-            directives = decide(view)
-            self._new.decide_ns.append(time.thread_time_ns() - begin_ns)
-            return directives
-
-        return watching
+    def note(self, text: str) -> None:
+        """Keep an event for the next report."""
+        self._new.notices.append(Notice(self._clock.now, self.drone, text))
 
     def wait(self, timeout_s: float) -> None:
         """Sleep until a sample arrives or the time is over."""
@@ -273,7 +271,7 @@ class LiveNode:
         """Count a refused message; the first of its kind is an event."""
         kind = f"{what} {reason}".replace("_", " ")
         if kind not in self._refused:
-            self._new.notices.append(Notice(self._clock.now, self.drone, f"refused a {kind}: {detail}"))
+            self.note(f"refused a {kind}: {detail}")
         self._refused[kind] += 1
 
     def _clock_s(self) -> float:
@@ -302,7 +300,8 @@ class LiveNode:
             self._draws[sender] = stream(self._seed, 0, (sender, self.drone), "live loss")
         return self._draws[sender]
 
-    def _note_health(self, view: FleetView) -> None:
+    def note_health(self, view: FleetView) -> None:
+        """Keep each change of a peer's health for the next report."""
         rules, now_s = self._rules, self._clock.now
         for peer in view.peers:
             age_s = view.age_s[peer]

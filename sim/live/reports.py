@@ -70,7 +70,7 @@ class Report:
     drone: int
     t_s: float
     cpu_s: float
-    """Processor time of all threads of the process."""
+    """Processor time of all threads of the process, and of its policy's process."""
     published: int
     heard: int
     """Valid descriptors of other drones."""
@@ -83,6 +83,10 @@ class Report:
     sent: dict[TopicKind, Count]
     received: dict[TopicKind, Count]
     new: SinceLastReport
+    fallbacks: int = 0
+    """Decisions by the fallback, because the policy gave none in time."""
+    policy_restarts: int = 0
+    """New processes for the policy."""
 
 
 class Ready(NamedTuple):

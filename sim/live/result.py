@@ -41,6 +41,9 @@ class DroneResult(NamedTuple):
     refused: dict[str, int]
     payloads_arrived: int
     """Accepted payloads, of all kinds."""
+    fallbacks: int
+    """Decisions by the fallback, because the policy gave none in time."""
+    policy_restarts: int
     publishes_within_s: float
     """From a frame's begin to its descriptor, at most."""
 
@@ -138,7 +141,7 @@ def summarise(
     each = [
         DroneResult(
             r.drone, 100 * r.cpu_s / max(r.t_s - begin_s, 1e-9), r.published, r.heard, r.lost, r.refused,
-            sum(r.received[kind].samples for kind in PAYLOADS), r.late_s,
+            sum(r.received[kind].samples for kind in PAYLOADS), r.fallbacks, r.policy_restarts, r.late_s,
         )
         for r in fleet.last.values()
     ]  # fmt: skip

@@ -22,6 +22,7 @@ from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
 from sortie.sim.live.result import LiveResult, Lost, summarise
 from sortie.sim.live.seals import secrets_of
+from sortie.sim.live.watchdog import DETECTIONS, Fallback
 
 MAX_DRONES = 20
 """The most processes that this starts on one host."""
@@ -50,6 +51,8 @@ def fly_live(
     kill: tuple[int, float] | None = None,
     domain: int = 0,
     key: bytes | None = None,
+    fallback: Fallback | None = None,
+    decide_within_s: float | None = None,
     progress: Progress | None = None,
     begun: Callable[[dict[int, int]], None] | None = None,
 ) -> LiveResult:
@@ -64,6 +67,8 @@ def fly_live(
         domain: DDS domain, as `ROS_DOMAIN_ID`.
         key: the master key of 32 B, from which every drone gets its secrets; None: a new random one. Unused where the
             scenario's `context.authentication` is off.
+        fallback: what links get while a policy gives no answer; None: detections at 2 Hz.
+        decide_within_s: the longest time for one decision; None: one frame.
         progress: called with (what is done, how much of it, of how much).
         begun: called with the process ids by drone when the fleet begins to fly.
 
@@ -75,7 +80,7 @@ def fly_live(
         PolicyError: an unknown policy, or one that breaks its contract.
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
-    _check(scenario, begin_s, end_s, loss, kill)
+    _check(scenario, begin_s, end_s, loss, kill, decide_within_s)
     report_progress = progress or (lambda what, done, of: None)
     found = traces(
         scenario.model_copy(update={"duration_s": end_s}),
@@ -90,7 +95,10 @@ def fly_live(
     try:
         for i, trace in enumerate(found):
             held = secrets_of(master, i) if authentic else None
-            flown.append(_start(Orders(scenario, i, trace, begin_s, end_s, loss, domain, held)))
+            orders = Orders(
+                scenario, i, trace, begin_s, end_s, loss, domain, held, fallback or DETECTIONS, decide_within_s
+            )
+            flown.append(_start(orders))
         _wait_until_connected(flown, report_progress)
         go = Go(time.monotonic() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9))
         for drone in flown:
@@ -129,7 +137,10 @@ def fly_live(
         _clean_up(flown)
 
 
-def _check(scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None) -> None:
+def _check(
+    scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None,
+    decide_within_s: float | None,
+) -> None:  # fmt: skip
     drones = scenario.fleet.drones
     if drones > MAX_DRONES:
         raise RunError(f"fleet.drones is {drones}, live flights have at most {MAX_DRONES}: each is a process")
@@ -138,6 +149,8 @@ def _check(scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: 
             f"the flight is to be from {begin_s:g} s to {end_s:g} s, must be within the scenario's "
             f"{scenario.duration_s:g} s"
         )
+    if decide_within_s is not None and not 0 < decide_within_s <= 1:
+        raise RunError(f"decide_within_s is {decide_within_s:g}, must be in (0, 1]")
     if not 0 <= loss <= 1:
         raise RunError(f"loss is {loss:g}, must be in [0, 1]")
     if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):
@@ -145,10 +158,10 @@ def _check(scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: 
 
 
 def _start(orders: Orders) -> _Drone:
-    """A new process; spawned, not forked: the bench's DDS threads would not survive a fork."""
+    """A new process; spawned, not forked: the bench's DDS threads would not survive a fork. It starts one of its own."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=fly_one, args=(orders, theirs), name=f"drone {orders.drone}", daemon=True)
+    process = context.Process(target=fly_one, args=(orders, theirs), name=f"drone {orders.drone}")
     with _ignoring_interrupts():
         process.start()
     theirs.close()  # so that our end shows when the process is gone

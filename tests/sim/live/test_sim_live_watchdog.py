@@ -1,0 +1,201 @@
+"""A policy that raises, hangs, dies or breaks its contract in flight: the fallback takes over until it answers again."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from policies_examples import fleet_of
+from sim_examples import example
+from typer.testing import CliRunner
+
+from sortie.policies.contract import PolicyError, Representation
+from sortie.scenarios.schema import PolicySection
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
+from sortie.sim.live import watchdog
+from sortie.sim.live.policy_process import Begin, PolicyOrders
+from sortie.sim.live.sentences import describe_changes
+from sortie.sim.live.session import fly_live
+from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog, parse_fallback
+
+DOMAIN = os.getpid() % 200 + 22
+POLICY = """
+import os, time
+from pathlib import Path
+from sortie.policies.contract import Directive, Representation
+
+MODE = Path(__file__).with_name("mode")
+
+def decide(view):
+    mode = MODE.read_text() if MODE.exists() else ""
+    if mode == "raise":
+        raise RuntimeError("no more ideas")
+    if mode == "break":
+        return [Directive(view.ego, p, rho=2.0) for p in view.peers]
+    if mode == "hang":
+        while True:
+            pass
+    if mode == "slow":
+        time.sleep(0.3)
+    if mode == "die":
+        MODE.unlink()
+        os._exit(3)
+    return [Directive(view.ego, p, Representation.FEATURES, 0.1, None, 10.0, reason="fine") for p in view.peers]
+"""
+VIEW = fleet_of(3)
+
+
+class Watched(NamedTuple):
+    """A watchdog over the policy above, the file that says what it does, and what was noted."""
+
+    watchdog: Watchdog
+    mode: Path
+    notes: list[str]
+
+    def until(self, holds: Callable[[], bool]) -> None:
+        """Ask for decisions until something holds."""
+        end_s = time.monotonic() + 60
+        while not holds():
+            assert time.monotonic() < end_s
+            self.watchdog(VIEW)
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Iterator[Watched]:
+    """A policy that decides."""
+    (tmp_path / "mine.py").write_text(POLICY)
+    notes: list[str] = []
+    orders = PolicyOrders(PolicySection(name=f"{tmp_path}/mine.py:decide"), 0, 0.1)
+    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1, note=notes.append, decided=lambda _: None)
+    try:
+        dog.wait_until_loaded()
+        dog.begin(Begin(0.0, time.monotonic()))
+        found = Watched(dog, tmp_path / "mode", notes)
+        found.until(lambda: rung(dog) == Representation.FEATURES)  # the first decision of a busy host may be late
+        notes.clear()
+        dog.fallbacks = 0
+        yield found
+    finally:
+        dog.close()
+
+
+def rung(dog: Watchdog) -> Representation:
+    """What it decides for every peer."""
+    directives = dog(VIEW)
+    assert [d.destination for d in directives] == [1, 2]
+    (found,) = {(d.representation, d.rate_hz) for d in directives}
+    assert found in ((Representation.FEATURES, 10.0), (Representation.DETECTIONS, 2.0))
+    return found[0]
+
+
+@pytest.mark.parametrize(
+    ("mode", "why"), [("raise", "raises RuntimeError: no more ideas"), ("break", "rho is 2.0, must be in [0, 1]")]
+)
+def test_a_policy_that_fails_is_replaced_for_each_failed_decision(watched: Watched, mode: str, why: str) -> None:
+    watched.mode.write_text(mode)
+    assert [rung(watched.watchdog) for _ in range(3)] == [Representation.DETECTIONS] * 3
+    assert len(watched.notes) == 1
+    assert watched.notes[0].startswith("fallback to detections at 2 Hz: ")
+    assert why in watched.notes[0]
+    watched.mode.write_text("")
+    watched.until(lambda: len(watched.notes) == 2)
+    assert "the policy decides again after " in watched.notes[1]
+    assert watched.watchdog.restarts == 0
+
+
+def test_a_policy_that_dies_gets_a_new_process(watched: Watched) -> None:
+    before = watched.watchdog.pid
+    watched.mode.write_text("die")
+    assert rung(watched.watchdog) == Representation.DETECTIONS
+    assert watched.notes == ["fallback to detections at 2 Hz: the policy's process ended with exit code 3"]
+    watched.until(lambda: len(watched.notes) == 2)
+    assert watched.watchdog.restarts == 1
+    assert watched.watchdog.pid not in (before, None)
+    assert rung(watched.watchdog) == Representation.FEATURES
+
+
+def test_a_policy_that_hangs_delays_its_drone_once_and_is_killed(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watchdog, "HANGS_S", 0.3)
+    before = watched.watchdog.pid
+    waits: list[float] = []
+    pipe = watched.watchdog._pipe
+    assert pipe is not None
+    poll = pipe.poll
+    monkeypatch.setattr(pipe, "poll", lambda timeout_s=0.0: waits.append(timeout_s) or poll(timeout_s))
+    watched.mode.write_text("hang")
+    assert rung(watched.watchdog) == Representation.DETECTIONS
+    assert watched.notes == ["fallback to detections at 2 Hz: the policy did not answer within 0.1 s"]
+    watched.until(lambda: watched.watchdog.pid is None)
+    assert [w for w in waits if w] == [0.1]
+    assert watched.notes[1].startswith("the policy's process was killed: no answer for 0.")
+    assert before is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(before, 0)
+    watched.mode.write_text("")
+    watched.until(lambda: len(watched.notes) == 3)
+    assert "decides again" in watched.notes[2]
+
+
+def test_a_late_answer_is_dropped_and_the_policy_is_asked_again(watched: Watched) -> None:
+    watched.mode.write_text("slow")
+    before = watched.watchdog.pid
+    assert rung(watched.watchdog) == Representation.DETECTIONS
+    watched.mode.write_text("")
+    watched.until(lambda: len(watched.notes) == 2)
+    assert rung(watched.watchdog) == Representation.FEATURES
+    assert (watched.watchdog.pid, watched.watchdog.restarts) == (before, 0)
+
+
+def test_a_policy_that_cannot_be_loaded_is_an_error_before_the_flight() -> None:
+    orders = PolicyOrders(PolicySection(name="none-such"), 0, 0.1)
+    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1, note=str, decided=lambda _: None)
+    with pytest.raises(PolicyError, match="none-such"):
+        dog.wait_until_loaded()
+    dog.close()
+
+
+def test_the_fallback_is_a_safe_rung() -> None:
+    assert parse_fallback("detections@2") == DETECTIONS
+    assert parse_fallback("tracks@5") == Fallback(Representation.TRACKS, 5.0)
+    assert parse_fallback("none") == Fallback(Representation.NONE, 0.0)
+    for text in ("features@2", "detections", "detections@31", "tracks@x", "none@1", ""):
+        with pytest.raises(RunError, match=r"must be none, detections@RATE or tracks@RATE with at most 30 Hz$"):
+            parse_fallback(text)
+    done = CliRunner().invoke(app, ["live", "--fallback", "raw@10"])
+    assert str(done.exception).startswith("fallback is 'raw@10', must be ")
+    with pytest.raises(RunError, match=r"^decide_within_s is 2, must be in \(0, 1\]$"):
+        fly_live(example(), decide_within_s=2.0)
+
+
+def test_a_drone_flies_on_as_its_policy_dies(tmp_path: Path) -> None:
+    """Drone 0's policy dies at its eleventh decision of the live flight; the flight in simulation has another process."""
+    (tmp_path / "mine.py").write_text(
+        "import multiprocessing, os\nfrom pathlib import Path\n"
+        "from sortie.policies.contract import Directive, Representation\n"
+        "DEAD, made = Path(__file__).with_name('dead'), []\n"
+        "def decide(view):\n"
+        "    made.append(view.ego)\n"
+        "    if multiprocessing.current_process().name == 'policy of drone 0' and len(made) > 10 and not DEAD.exists():\n"
+        "        DEAD.touch()\n        os.abort()\n"
+        "    return [Directive(view.ego, p, Representation.FEATURES, 0.05, None, 10.0) for p in view.peers]\n"
+    )
+    policy = f"policy={{name: '{tmp_path}/mine.py:decide', dwell_s: 0.3}}"
+    result = fly_live(example("fleet.drones=2", "duration_s=10", policy), domain=DOMAIN)
+    broken, sound = result.each
+    assert (broken.policy_restarts, sound.policy_restarts) == (1, 0)
+    assert 5 < broken.fallbacks < 95
+    assert min(broken.published, sound.published) > 90  # of 100; it published as its policy was dead
+    carried = [o.representation for o in result.orders if o.drone == 0]
+    assert carried[0] == "features"
+    assert carried[-3:] == ["features", "detections", "features"]
+    text = "\n".join(describe_changes(result))
+    assert "drone 0: fallback to detections at 2 Hz: the policy's process ended with exit code -6" in text
+    assert "drone 0: the policy decides again after " in text
