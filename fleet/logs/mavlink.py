@@ -12,7 +12,7 @@ import math
 import os
 import struct
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,9 @@ _MARKS = {0xFE: 8, 0xFD: 12}
 """First byte of a MAVLink 1 and 2 frame, and what stands around its payload; a signature adds 13."""
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _YEARS_US = (0, 4_000_000_000_000_000)  # 1970 … 2096
+
+
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +84,29 @@ class Telemetry:
 
 def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
     """ENU metres to latitude and longitude in degrees and altitude in metres."""
-    a, e2 = 6378137.0, 6.69437999014e-3  # WGS-84
+    east_m, north_m = _metres_per_radian(origin)
+    east, north, up = position_m
+    latitude = origin.latitude_deg + math.degrees(north / north_m)
+    longitude = origin.longitude_deg + math.degrees(east / east_m)
+    return latitude, (longitude + 180) % 360 - 180, origin.altitude_m + up
+
+
+def local_enu(latitude_deg: float, longitude_deg: float, altitude_m: float, origin: Origin) -> Vector:
+    """The inverse of `geodetic`: ENU metres."""
+    east_m, north_m = _metres_per_radian(origin)
+    east_deg = (longitude_deg - origin.longitude_deg + 180) % 360 - 180
+    north_deg = latitude_deg - origin.latitude_deg
+    return math.radians(east_deg) * east_m, math.radians(north_deg) * north_m, altitude_m - origin.altitude_m
+
+
+def _metres_per_radian(origin: Origin) -> tuple[float, float]:
+    """Metres eastward per radian of longitude and northward per radian of latitude, on the WGS-84 ellipsoid."""
+    a, e2 = 6378137.0, 6.69437999014e-3
     phi = math.radians(origin.latitude_deg)
     w = math.sqrt(1 - e2 * math.sin(phi) ** 2)
     meridian_m = a * (1 - e2) / w**3 + origin.altitude_m
     normal_m = a / w + origin.altitude_m
-    east, north, up = position_m
-    latitude = origin.latitude_deg + math.degrees(north / meridian_m)
-    longitude = origin.longitude_deg + math.degrees(east / (normal_m * math.cos(phi)))
-    return latitude, (longitude + 180) % 360 - 180, origin.altitude_m + up
+    return normal_m * math.cos(phi), meridian_m
 
 
 def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:
@@ -196,6 +213,34 @@ class Transmitter:
         frame: bytes = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
+
+
+class Companion:
+    """A drone's companion computer on the telemetry link: what it sends to its vehicle."""
+
+    def __init__(self) -> None:
+        self._mav = mavlink2.MAVLink(None, srcComponent=mavlink2.MAV_COMP_ID_ONBOARD_COMPUTER)
+
+    def ask(self, vehicle: int, rates_hz: Mapping[int, float]) -> bytes:
+        """A heartbeat, and a request for messages at their rates, by message id; MAV_CMD_SET_MESSAGE_INTERVAL."""
+        self._mav.srcSystem = vehicle
+        said: list[mavlink2.MAVLink_message] = [
+            mavlink2.MAVLink_heartbeat_message(
+                mavlink2.MAV_TYPE_ONBOARD_CONTROLLER, mavlink2.MAV_AUTOPILOT_INVALID, 0, 0, mavlink2.MAV_STATE_ACTIVE, 3
+            )
+        ]
+        command = mavlink2.MAV_CMD_SET_MESSAGE_INTERVAL
+        said += [
+            mavlink2.MAVLink_command_long_message(
+                vehicle, mavlink2.MAV_COMP_ID_AUTOPILOT1, command, 0, number, 1e6 / rate_hz, 0, 0, 0, 0, 0
+            )
+            for number, rate_hz in rates_hz.items()
+        ]
+        frames = b""
+        for message in said:
+            frames += bytes(message.pack(self._mav))
+            self._mav.seq = (self._mav.seq + 1) % 256
+        return frames
 
 
 class Listener:

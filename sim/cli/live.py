@@ -57,6 +57,14 @@ def live(
     decide_within: Annotated[
         float | None, typer.Option(help="Longest time for one decision, s; default: one frame.")
     ] = None,
+    mavlink: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ADDRESS", help="A vehicle's MAVLink port, once for each drone: udpin:127.0.0.1:14550"),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON[,ALT]", help="With --mavlink: where (0, 0, 0) lies; default: local positions."),
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
     ] = None,
@@ -78,6 +86,7 @@ def live(
     if policy is not None:
         flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
     with user_errors():
+        from sortie.sim.export.telemetry import parse_origin
         from sortie.sim.live.seals import find_key
         from sortie.sim.live.session import fly_live
         from sortie.sim.live.watchdog import parse_fallback
@@ -94,6 +103,8 @@ def live(
             key=find_key(key),
             fallback=parse_fallback(fallback),
             decide_within_s=decide_within,
+            mavlink=mavlink or (),
+            origin=None if origin is None else parse_origin(origin),
             progress=lambda what, done, of: report(what, round(done), round(of)),
         )
     _show(result)

@@ -135,7 +135,7 @@ class MavlinkEndpoint:
         self, address: str, pace: float | None = 1.0, origin: Origin = ORIGIN, key: bytes | None = None,
         *, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        self._waits, host, port = _parse(address)
+        self._waits, host, port = parse_address(address)
         self._pace, self._origin, self._key, self._clock = pace, origin, key, clock
         self._stream: Stream | None = None
         self._listener = Listener()
@@ -198,7 +198,7 @@ class MavlinkEndpoint:
                 return
 
 
-def _parse(address: str) -> tuple[bool, str, int]:
+def parse_address(address: str) -> tuple[bool, str, int]:
     """Whether to wait for a peer, and host and port."""
     kind, _, rest = address.partition(":")
     host, _, port = rest.rpartition(":")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 from sortie.fleet.agent import Agent
+from sortie.fleet.logs.mavlink import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.policies.contract import Directive, FleetView, PolicyError
@@ -16,10 +17,12 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.engine.world import at
+from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
+from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders
 from sortie.sim.live.reports import Failed, Go, Home, Ready
 from sortie.sim.live.seals import Seals, Secrets
@@ -46,6 +49,10 @@ class Orders:
     fallback: Fallback = DETECTIONS
     decide_within_s: float | None = None
     """None: one frame."""
+    mavlink: str | None = None
+    """Where the drone's vehicle is heard; None: its poses and charge are replayed."""
+    origin: Origin | None = None
+    """Where ENU (0, 0, 0) lies for vehicles; None: each vehicle's own local origin."""
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
@@ -68,6 +75,7 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the bench handles Ctrl-C and stops every process
     scenario, drone = orders.scenario, orders.drone
     policy: Watchdog | None = None
+    link: MavlinkLink | None = None
     try:
         node = LiveNode(
             Bus(orders.domain), Seals(orders.secrets, drone), drone, scenario.fleet.drones,
@@ -80,7 +88,12 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
             note=node.note,
             decided=node.decided,
         )
-        senses = ReplaySenses(scenario, drone, orders.trace, orders.begin_s)
+        replay = ReplaySenses(scenario, drone, orders.trace, orders.begin_s)
+        senses: ReplaySenses | MavlinkSenses = replay
+        if orders.mavlink is not None:
+            link = MavlinkLink(orders.mavlink, orders.origin)
+            link.wait_until_found()
+            senses = MavlinkSenses(link, replay, drone, node.note)
         while not node.all_found(scenario.fleet.drones):
             if pipe.poll(POLL_S):
                 return
@@ -92,15 +105,19 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
             _fly(orders, node, policy, senses, go, pipe)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody is left to report to
-    except (PolicyError, OSError) as error:
+    except (PolicyError, RunError, OSError) as error:
         pipe.send(Failed(drone, str(error)))
     finally:
         if policy is not None:
             policy.close()
+        if link is not None:
+            link.close()
         pipe.close()
 
 
-def _fly(orders: Orders, node: LiveNode, policy: Watchdog, senses: ReplaySenses, go: Go, pipe: Connection) -> None:
+def _fly(
+    orders: Orders, node: LiveNode, policy: Watchdog, senses: ReplaySenses | MavlinkSenses, go: Go, pipe: Connection
+) -> None:
     scenario, drone = orders.scenario, orders.drone
     time.sleep(max(0.0, go.monotonic_s - time.monotonic()))
     clock = WallClock(orders.begin_s, go.monotonic_s)
@@ -127,7 +144,10 @@ def _fly(orders: Orders, node: LiveNode, policy: Watchdog, senses: ReplaySenses,
         handshake_bytes=lambda: policy.handshake_bytes,
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
-    if orders.trace.end_s < orders.end_s:
+    if isinstance(senses, MavlinkSenses):
+        senses.begin(orders.begin_s - go.monotonic_s, rules)
+        node.is_muted = lambda: senses.muted
+    elif orders.trace.end_s < orders.end_s:
         at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
 

@@ -107,6 +107,8 @@ class LiveNode:
         self._received = dict.fromkeys(PAYLOADS, Count())
         self._new = SinceLastReport()
         self._began_cpu_s = 0.0
+        self.is_muted: Callable[[], bool] = lambda: False
+        """Whether the drone does not know where it is, and says nothing."""
 
     def all_found(self, drones: int) -> bool:
         """Whether every writer has found its readers: each drone's and the bench's."""
@@ -158,13 +160,15 @@ class LiveNode:
     goodput_mbps: Callable[[], tuple[float, ...]]
 
     def broadcast(self, datagram: bytes) -> None:
+        if self.is_muted():
+            return
         self._published += 1
         self._context.write(self._seals.seal(CONTEXT, datagram))
 
     def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
         """Publish a payload of its exact size: header and directive as they are, zeros for the features."""
         directive = self.gate.in_force(peer)
-        if directive is None:
+        if directive is None or self.is_muted():
             return
         stamp_ns = round((capture.t_s + self._memory.status.clock_skew_s) * 1e9)
         header = _HEADER.pack(stamp_ns, self.drone, *capture.est_position_m, *capture.orientation_xyzw)

@@ -7,14 +7,16 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
+from sortie.fleet.logs.mavlink import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
+from sortie.sim.export.telemetry import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.context import traces
@@ -53,6 +55,8 @@ def fly_live(
     key: bytes | None = None,
     fallback: Fallback | None = None,
     decide_within_s: float | None = None,
+    mavlink: Sequence[str] = (),
+    origin: Origin | None = None,
     progress: Progress | None = None,
     begun: Callable[[dict[int, int]], None] | None = None,
 ) -> LiveResult:
@@ -69,6 +73,9 @@ def fly_live(
             scenario's `context.authentication` is off.
         fallback: what links get while a policy gives no answer; None: detections at 2 Hz.
         decide_within_s: the longest time for one decision; None: one frame.
+        mavlink: where the vehicles of drones 0, 1, … are heard: `udpin:HOST:PORT` or `udpout:HOST:PORT`. Further drones
+            replay.
+        origin: where ENU (0, 0, 0) lies for these vehicles; None: at the origin of each vehicle's own estimator.
         progress: called with (what is done, how much of it, of how much).
         begun: called with the process ids by drone when the fleet begins to fly.
 
@@ -80,7 +87,7 @@ def fly_live(
         PolicyError: an unknown policy, or one that breaks its contract.
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
-    _check(scenario, begin_s, end_s, loss, kill, decide_within_s)
+    _check(scenario, begin_s, end_s, loss, kill, decide_within_s, mavlink)
     report_progress = progress or (lambda what, done, of: None)
     found = traces(
         scenario.model_copy(update={"duration_s": end_s}),
@@ -96,7 +103,18 @@ def fly_live(
         for i, trace in enumerate(found):
             held = secrets_of(master, i) if authentic else None
             orders = Orders(
-                scenario, i, trace, begin_s, end_s, loss, domain, held, fallback or DETECTIONS, decide_within_s
+                scenario,
+                i,
+                trace,
+                begin_s,
+                end_s,
+                loss,
+                domain,
+                held,
+                fallback or DETECTIONS,
+                decide_within_s,
+                mavlink[i] if i < len(mavlink) else None,
+                origin,
             )
             flown.append(_start(orders))
         _wait_until_connected(flown, report_progress)
@@ -140,6 +158,7 @@ def fly_live(
 def _check(
     scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None,
     decide_within_s: float | None,
+    mavlink: Sequence[str],
 ) -> None:  # fmt: skip
     drones = scenario.fleet.drones
     if drones > MAX_DRONES:
@@ -151,6 +170,10 @@ def _check(
         )
     if decide_within_s is not None and not 0 < decide_within_s <= 1:
         raise RunError(f"decide_within_s is {decide_within_s:g}, must be in (0, 1]")
+    if len(mavlink) > drones:
+        raise RunError(f"there are {len(mavlink)} MAVLink addresses, must be at most {drones}, one for each drone")
+    for address in mavlink:
+        parse_address(address)
     if not 0 <= loss <= 1:
         raise RunError(f"loss is {loss:g}, must be in [0, 1]")
     if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):

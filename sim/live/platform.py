@@ -1,0 +1,177 @@
+"""A live drone's own state from the vehicle that flies: a MAVLink port instead of the replayed poses and charge."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from sortie.fleet.agent import Platform, Task
+from sortie.fleet.coverage import footprint_radius_m, survey
+from sortie.fleet.flight.frames import yaw_rad
+from sortie.fleet.logs.mavlink import Companion, Listener, Origin
+from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
+from sortie.fleet.plane import PlaneRules
+from sortie.fleet.senses import Sensed
+from sortie.perception.types import Capture
+from sortie.policies.contract import Disc, TaskPhase
+from sortie.sim.export.telemetry import parse_address
+from sortie.sim.folders import RunError
+from sortie.sim.live.context import ReplaySenses
+
+FOUND_S = 30.0
+"""The longest time for a vehicle to be heard before the flight."""
+ASK_S = 1.0
+"""How often a drone sends its heartbeat and asks for messages: a vehicle that restarted has forgotten."""
+LOOK_S = 1.0
+"""The coverage grid is renewed this often."""
+_DATAGRAM = 65_535
+
+
+class MavlinkLink:
+    """The socket to a vehicle, and a thread that reads it: a message is timed as it comes in."""
+
+    def __init__(self, address: str, origin: Origin | None) -> None:
+        """Args: `address` is `udpin:HOST:PORT`, where the vehicle sends to, or `udpout:HOST:PORT`, where it waits.
+
+        Raises:
+            RunError: an address that is none, or one that is taken.
+        """
+        waits, host, port = parse_address(address)
+        self.address, self._origin = address, origin
+        self.state = VehicleState()
+        self._listener, self._companion = Listener(), Companion()
+        self._peer: tuple[str, int] | None = None if waits else (host, port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            if waits:
+                self._socket.bind((host, port))
+            self._socket.settimeout(0.2)
+        except (OSError, UnicodeError) as error:
+            self._socket.close()
+            raise RunError(f"{address}: {error}") from error
+        self.port = self._socket.getsockname()[1]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def wait_until_found(self, wait_s: float = FOUND_S) -> None:
+        """Wait for a vehicle's pose.
+
+        Raises:
+            RunError: none came, or no position in the frame that was asked for.
+        """
+        until_s = time.monotonic() + wait_s
+        while math.isinf(self.state.pose_s):
+            if time.monotonic() > until_s:
+                missing = "vehicle" if self.state.system is None else "position and attitude"
+                raise RunError(f"{self.address}: no {missing} heard within {wait_s:g} s")
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """End the thread and let go of the socket."""
+        self._stop.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _read(self) -> None:
+        asked_s = -math.inf
+        while not self._stop.is_set():
+            if self._peer is not None and time.monotonic() - asked_s > ASK_S:
+                asked_s = time.monotonic()
+                with contextlib.suppress(OSError):  # best effort, as on any telemetry radio
+                    self._socket.sendto(self._companion.ask(self.state.system or 1, WANTED_HZ), self._peer)
+            try:
+                data, sender = self._socket.recvfrom(_DATAGRAM)
+            except TimeoutError:
+                continue
+            except OSError:  # nobody waits at the address yet
+                time.sleep(0.05)
+                continue
+            state, now_s = self.state, time.monotonic()
+            for message in self._listener.heard(data):
+                state = after(state, message, now_s, self._origin)
+            if state.system is not None and state.others == self.state.others:
+                self._peer = sender
+            self.state = state
+
+
+class MavlinkSenses:
+    """One drone's own sensors (sortie.fleet.agent.Senses): pose and charge of a flying vehicle, the rest replayed.
+
+    A capture's time is when its pose came in. When telemetry stops, the stamps of descriptors and payloads therefore stay
+    behind, and the staleness rules degrade and detach the drone at its peers. When peers would detach it, it says nothing.
+    """
+
+    def __init__(self, link: MavlinkLink, replay: ReplaySenses, drone: int, note: Callable[[str], None]) -> None:
+        self._link, self._replay, self._drone, self._note = link, replay, drone, note
+        self._offset_s = 0.0
+        self._rules: PlaneRules | None = None
+        self._looks: list[tuple[float, float, float]] = []
+        self._grid = bytes(64), False
+        self._looked_s = -math.inf
+        self._stale = False
+        self.muted = False
+        """Whether telemetry is so old that the drone publishes and sends nothing."""
+
+    def begin(self, offset_s: float, rules: PlaneRules) -> None:
+        """Args: `offset_s` from the host's monotonic clock to the flight's clock."""
+        self._offset_s, self._rules = offset_s, rules
+
+    def sense(self, frame: int) -> Sensed:
+        """The drone as its vehicle last described it."""
+        self._replay.sense(frame)
+        state = self._link.state
+        self._judge_age(time.monotonic() - state.pose_s)
+        radius_m = float(footprint_radius_m(state.position_m[2]))
+        if state.position_s - self._looked_s >= LOOK_S:
+            self._looked_s = state.position_s
+            self._looks.append((*state.position_m[:2], radius_m))
+            self._grid = survey(*zip(*self._looks, strict=True))[-1]
+        capture = Capture(
+            self._drone, state.pose_s + self._offset_s, state.position_m, state.orientation_xyzw, state.position_m,
+            float(yaw_rad(state.orientation_xyzw)),
+        )  # fmt: skip
+        return Sensed(capture, state.velocity_mps, radius_m, *self._grid)
+
+    def platform(self) -> Platform:
+        """The vehicle's charge, where it knows it; headrooms are replayed."""
+        replayed, soc = self._replay.platform(), self._link.state.soc
+        return replayed if soc is None else replayed._replace(soc=soc)
+
+    def task(self) -> Task:
+        """The scenario's mission; a vehicle on the ground is landing."""
+        task = self._replay.task()
+        return task._replace(phase=TaskPhase.LANDING) if self._link.state.landed else task
+
+    def goodput_mbps(self) -> tuple[float, ...]:
+        """To every other drone by ascending id; replayed."""
+        return self._replay.goodput_mbps()
+
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        """Cars of the scene in range of the vehicle."""
+        return self._replay.count_boxes(capture, roi)
+
+    def perceived(self, capture: Capture) -> None:
+        """The drone looked from where its vehicle is."""
+        self._replay.perceived(capture)
+
+    def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
+        """No tracks: no detector runs here."""
+
+    def _judge_age(self, age_s: float) -> None:
+        """Say when telemetry becomes old, and when it is back."""
+        rules = self._rules
+        assert rules is not None  # noqa: S101 - set in `begin`
+        stale = age_s > rules.fresh_s
+        muted = age_s > rules.descriptor_period_s * rules.detached_after_periods
+        if muted and not self.muted:
+            self._note(f"publishes nothing: the vehicle's last pose is {age_s:.2f} s old")
+        elif stale and not self._stale:
+            self._note(f"telemetry is stale: the vehicle's last pose is {age_s:.2f} s old")
+        elif self._stale and not stale:
+            self._note("telemetry is back")
+        self._stale, self.muted = stale, muted

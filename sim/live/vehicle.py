@@ -1,0 +1,91 @@
+"""A MAVLink vehicle of our own, for tests and demonstrations: it flies a circle and tells its telemetry by UDP.
+
+python -m sortie.sim.live.vehicle udpout:127.0.0.1:14550 --system 1
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from typing import Annotated
+
+import typer
+
+from sortie.fleet.logs.mavlink import STATUS, Origin, Telemetry, Transmitter, messages
+from sortie.sim.export.telemetry import ORIGIN, parse_address
+
+TELEMETRY_HZ = 20.0
+
+
+def circle(t_s: float, *, radius_m: float = 30.0, height_m: float = 60.0, speed_mps: float = 8.0) -> Telemetry:
+    """The vehicle after `t_s` on a circle about the origin, its nose along its way; its charge falls by 0.2 % a second."""
+    rate_radps = speed_mps / radius_m
+    angle = rate_radps * t_s
+    yaw = angle + math.pi / 2
+    return Telemetry(
+        time_s=t_s,
+        position_m=(radius_m * math.cos(angle), radius_m * math.sin(angle), height_m),
+        orientation_xyzw=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+        velocity_mps=(-speed_mps * math.sin(angle), speed_mps * math.cos(angle), 0.0),
+        body_rates_radps=(0.0, 0.0, rate_radps),
+        soc=max(0.0, 0.8 - 0.002 * t_s),
+        voltage_v=22.0,
+        current_a=20.0,
+        energy_used_j=440.0 * t_s,
+        cpu_load=0.3,
+        landed=False,
+    )
+
+
+class CirclingVehicle:
+    """The vehicle as a thread. `pause` stops its telemetry, not its flight."""
+
+    def __init__(self, address: str, system: int = 1, origin: Origin = ORIGIN) -> None:
+        """Args: `address` is `udpout:HOST:PORT`."""
+        _, host, port = parse_address(address)
+        self._to, self._origin = (host, port), origin
+        self._transmitter = Transmitter(system - 1)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._began_s = time.monotonic()
+        self._paused, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._fly, daemon=True)
+        self._thread.start()
+
+    def pause(self, paused: bool = True) -> None:
+        """Stop or go on with telemetry."""
+        self._paused.set() if paused else self._paused.clear()
+
+    def close(self) -> None:
+        """End the flight."""
+        self._stop.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _fly(self) -> None:
+        second = -1
+        while not self._stop.wait(1.0 / TELEMETRY_HZ):
+            state = circle(time.monotonic() - self._began_s)
+            status, second = int(state.time_s) != second, int(state.time_s)
+            if self._paused.is_set():
+                continue
+            for message in messages(state, self._origin):
+                if status or message.get_type() not in STATUS:
+                    self._socket.sendto(self._transmitter.pack(message), self._to)
+
+
+def main(
+    address: Annotated[str, typer.Argument(help="Where to send: udpout:127.0.0.1:14550")],
+    system: Annotated[int, typer.Option(help="Its MAVLink system id.", min=1, max=255)] = 1,
+) -> None:
+    """Fly a circle of 30 m at 60 m until Ctrl-C."""
+    vehicle = CirclingVehicle(address, system)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        vehicle.close()
+
+
+if __name__ == "__main__":
+    typer.run(main)

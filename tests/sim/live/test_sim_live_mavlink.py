@@ -1,0 +1,171 @@
+"""Drones whose state comes from a flying MAVLink vehicle: frames of reference, charge, stale telemetry, a live flight."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+from scipy.spatial.transform import Rotation
+from sim_examples import example
+
+from sortie.fleet.logs.mavlink import Companion, Listener, Origin, Transmitter, geodetic, local_enu, messages
+from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
+from sortie.policies.contract import TaskPhase
+from sortie.sim.export.telemetry import ORIGIN
+from sortie.sim.folders import RunError
+from sortie.sim.live import platform
+from sortie.sim.live.context import ReplaySenses, traces
+from sortie.sim.live.drone import rules_of
+from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
+from sortie.sim.live.sentences import describe_changes
+from sortie.sim.live.session import fly_live
+from sortie.sim.live.vehicle import CirclingVehicle, circle
+
+DOMAIN = os.getpid() % 200 + 23
+
+
+def heard(t_s: float = 3.0, origin: Origin | None = None, system: int = 1) -> VehicleState:
+    """The state after one round of the circling vehicle's messages."""
+    transmitter, listener, state = Transmitter(system - 1), Listener(), VehicleState()
+    for message in messages(circle(t_s), ORIGIN):
+        for read in listener.heard(transmitter.pack(message)):
+            state = after(state, read, 7.0, origin)
+    return state
+
+
+@pytest.mark.parametrize("origin", [None, ORIGIN])
+def test_the_state_is_the_vehicle_s_own(origin: Origin | None) -> None:
+    flown, state = circle(3.0), heard(3.0, origin)
+    assert (state.system, state.armed, state.landed) == (1, True, False)
+    assert state.position_m == pytest.approx(flown.position_m, abs=0.02)  # 1e-7 degrees are a centimetre
+    assert state.velocity_mps == pytest.approx(flown.velocity_mps, abs=0.01)
+    sign = math.copysign(1.0, state.orientation_xyzw[3] * flown.orientation_xyzw[3])
+    assert [sign * v for v in state.orientation_xyzw] == pytest.approx(flown.orientation_xyzw, abs=1e-6)
+    assert state.soc == pytest.approx(flown.soc, abs=0.006)
+    assert (state.heartbeat_s, state.pose_s) == (7.0, 7.0)
+
+
+def test_roll_pitch_yaw_and_the_quaternion_are_one_attitude() -> None:
+    tilted = tuple(Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_quat(canonical=True).tolist())
+    for name in ("ATTITUDE", "ATTITUDE_QUATERNION"):
+        state = VehicleState(system=1)
+        for message in messages(replace(circle(0.0), orientation_xyzw=tilted), ORIGIN):
+            for read in Listener().heard(Transmitter(0).pack(message)):
+                if read.get_type() == name:
+                    state = after(state, read, 1.0, None)
+        assert state.orientation_xyzw == pytest.approx(tilted, abs=1e-6)
+
+
+def test_another_system_moves_nothing() -> None:
+    state, listener = heard(), Listener()
+    other = Transmitter(6)
+    for message in messages(circle(20.0), ORIGIN):
+        for read in listener.heard(other.pack(message)):
+            state = after(state, read, 9.0, None)
+    assert state == heard()._replace(others=len(messages(circle(20.0), ORIGIN)))
+
+
+def test_the_globe_and_the_plane_are_inverse() -> None:
+    for origin in (ORIGIN, Origin(-33.9, 179.9999, 12.0)):
+        assert local_enu(*geodetic((123.0, -456.0, 78.0), origin), origin) == pytest.approx((123.0, -456.0, 78.0))
+
+
+def test_a_companion_asks_for_messages_at_their_rates() -> None:
+    said = Listener().heard(Companion().ask(3, WANTED_HZ))
+    assert [m.get_type() for m in said] == ["HEARTBEAT"] + ["COMMAND_LONG"] * len(WANTED_HZ)
+    assert {(m.target_system, m.command) for m in said[1:]} == {(3, 511)}
+    assert {int(m.param1): 1e6 / m.param2 for m in said[1:]} == pytest.approx(WANTED_HZ)
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in said} == {(3, 191)}
+
+
+# --- a port --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def link() -> Iterator[MavlinkLink]:
+    """A port that waits for a vehicle."""
+    found = MavlinkLink("udpin:127.0.0.1:0", None)
+    yield found
+    found.close()
+
+
+def test_a_silent_port_and_a_bad_address_are_errors(link: MavlinkLink) -> None:
+    with pytest.raises(RunError, match=r"^udpin:127.0.0.1:0: no vehicle heard within 0.05 s$"):
+        link.wait_until_found(0.05)
+    with pytest.raises(RunError, match="is no MAVLink address"):
+        fly_live(example(), mavlink=["tcp:1"])
+    with pytest.raises(RunError, match=r"^there are 6 MAVLink addresses, must be at most 5, one for each drone$"):
+        fly_live(example(), mavlink=["udpin:127.0.0.1:0"] * 6)
+    with pytest.raises(RunError, match="Address already in use"):
+        MavlinkLink(f"udpin:127.0.0.1:{link.port}", None)
+
+
+def test_what_a_drone_publishes_follows_its_vehicle_until_telemetry_stops(
+    link: MavlinkLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = example("fleet.drones=1")
+    vehicle, notes = CirclingVehicle(f"udpout:127.0.0.1:{link.port}"), []
+    try:
+        link.wait_until_found()
+        senses = MavlinkSenses(link, ReplaySenses(scenario, 0, traces(scenario)[0], 0.0), 0, notes.append)
+        senses.begin(100.0 - time.monotonic(), rules_of(scenario, 0.0, 6.0))
+        began_s = time.monotonic()
+        first = senses.sense(0)
+        assert math.hypot(*first.capture.position_m[:2]) == pytest.approx(30.0, abs=1e-3)
+        assert first.footprint_radius_m == pytest.approx(42.0, abs=0.1)
+        assert any(first.coverage_grid)
+        assert 99.0 < first.capture.t_s <= 100.0 + time.monotonic() - began_s
+        while math.dist(senses.sense(1).capture.position_m, first.capture.position_m) < 2.0:
+            assert time.monotonic() - began_s < 20
+            time.sleep(0.02)
+        assert senses.platform().soc == pytest.approx(0.8, abs=0.02)
+        assert senses.task().phase != TaskPhase.LANDING
+        link.state = link.state._replace(landed=True)
+        assert senses.task().phase == TaskPhase.LANDING
+    finally:
+        vehicle.close()
+    time.sleep(0.05)  # the last datagram is read
+    link.state = link.state._replace(landed=False)
+    heard_s, ages = link.state.pose_s, (0.2, 0.35, 0.9, 1.1, 1.5, 0.1)
+    stamps = []
+    for age_s in ages:
+        monkeypatch.setattr(platform.time, "monotonic", lambda age_s=age_s: heard_s + age_s)
+        stamps.append((round(senses.sense(2).capture.t_s, 6), senses.muted))
+    assert len({stamp for stamp, _ in stamps}) == 1  # the stamp stays behind: peers see its age
+    assert [muted for _, muted in stamps] == [False, False, False, True, True, False]
+    assert notes == [
+        "telemetry is stale: the vehicle's last pose is 0.35 s old",
+        "publishes nothing: the vehicle's last pose is 1.10 s old",
+        "telemetry is back",
+    ]
+
+
+def test_a_fleet_flies_with_a_vehicle_and_notices_that_it_falls_silent() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    vehicle = CirclingVehicle(f"udpout:127.0.0.1:{port}")
+    try:
+        result = fly_live(
+            example("fleet.drones=2", "duration_s=5"),
+            domain=DOMAIN,
+            mavlink=[f"udpin:127.0.0.1:{port}"],
+            begun=lambda _: threading.Timer(2.0, vehicle.pause).start(),
+        )
+    finally:
+        vehicle.close()
+    flown, other = result.each
+    assert 15 < flown.published < 40  # of 50: it published until its telemetry was 1 s old
+    assert other.published > 45
+    seen = [c.health.name for c in result.health if (c.drone, c.peer) == (1, 0)]
+    assert seen[0] == "FRESH"
+    assert seen[-1] == "DETACHED"
+    text = "\n".join(describe_changes(result))
+    assert "drone 0: telemetry is stale: the vehicle's last pose is 0." in text
+    assert "drone 0: publishes nothing: the vehicle's last pose is 1." in text
