@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import flown_motion
+from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Disc
@@ -85,6 +86,11 @@ class ReplaySenses:
         self._sensed = sensed = self._flight.at(self._first + frame)[self._drone]
         self._row = self._trace.at(sensed.capture.t_s)
         return sensed
+
+    @property
+    def height_field(self) -> HeightField:
+        """What hides the ground from the drones' cameras."""
+        return self._scene.height_field
 
     def platform(self) -> Platform:
         """Charge and headrooms."""

@@ -9,8 +9,10 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from sortie.fleet.agent import Platform, Task
-from sortie.fleet.coverage import footprint_radius_m, survey
+from sortie.fleet.coverage import Poses, footprint_radius_m, views
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.mavlink import Companion, Listener, Origin
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
@@ -26,8 +28,6 @@ FOUND_S = 30.0
 """The longest time for a vehicle to be heard before the flight."""
 ASK_S = 1.0
 """How often a drone sends its heartbeat and asks for messages: a vehicle that restarted has forgotten."""
-LOOK_S = 1.0
-"""The coverage grid is renewed this often."""
 _DATAGRAM = 65_535
 
 
@@ -110,9 +110,6 @@ class MavlinkSenses:
         self._link, self._replay, self._drone, self._note = link, replay, drone, note
         self._offset_s = 0.0
         self._rules: PlaneRules | None = None
-        self._looks: list[tuple[float, float, float]] = []
-        self._grid = bytes(64), False
-        self._looked_s = -math.inf
         self._stale = False
         self.muted = False
         """Whether telemetry is so old that the drone publishes and sends nothing."""
@@ -127,15 +124,14 @@ class MavlinkSenses:
         state = self._link.state
         self._judge_age(time.monotonic() - state.pose_s)
         radius_m = float(footprint_radius_m(state.position_m[2]))
-        if state.position_s - self._looked_s >= LOOK_S:
-            self._looked_s = state.position_s
-            self._looks.append((*state.position_m[:2], radius_m))
-            self._grid = survey(*zip(*self._looks, strict=True))[-1]
+        yaw = yaw_rad(state.orientation_xyzw)
+        position, attitude, heading = (np.asarray([[v]]) for v in (state.position_m, state.orientation_xyzw, yaw))
+        ((view,),) = views(Poses(position, attitude, heading, position, heading), self._replay.height_field)
         capture = Capture(
             self._drone, state.pose_s + self._offset_s, state.position_m, state.orientation_xyzw, state.position_m,
-            float(yaw_rad(state.orientation_xyzw)),
+            float(yaw),
         )  # fmt: skip
-        return Sensed(capture, state.velocity_mps, radius_m, *self._grid)
+        return Sensed(capture, state.velocity_mps, radius_m, view)
 
     def platform(self) -> Platform:
         """The vehicle's charge, where it knows it; headrooms are replayed."""

@@ -119,7 +119,7 @@ def test_what_a_drone_publishes_follows_its_vehicle_until_telemetry_stops(
         first = senses.sense(0)
         assert math.hypot(*first.capture.position_m[:2]) == pytest.approx(30.0, abs=1e-3)
         assert first.footprint_radius_m == pytest.approx(42.0, abs=0.1)
-        assert any(first.coverage_grid)
+        assert any(first.view.grid)
         assert 99.0 < first.capture.t_s <= 100.0 + time.monotonic() - began_s
         while math.dist(senses.sense(1).capture.position_m, first.capture.position_m) < 2.0:
             assert time.monotonic() - began_s < 20
