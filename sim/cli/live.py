@@ -38,6 +38,10 @@ def live(
     kill: Annotated[
         str | None, typer.Option(metavar="DRONE@SECONDS", help="Kill a drone's process at a time of the scenario: 2@70")
     ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="DRONE@SECONDS", help="Start a drone's process later, or again after --kill: 2@80"),
+    ] = None,
     domain: Annotated[
         int | None, typer.Option(help="DDS domain; default: ROS_DOMAIN_ID, or 0.", min=0, max=MAX_DOMAIN)
     ] = None,
@@ -81,7 +85,9 @@ def live(
         raise RunError(f"ROS_DOMAIN_ID is {os.environ['ROS_DOMAIN_ID']!r}, must be a number") from error
     if not 0 <= number <= MAX_DOMAIN:
         raise RunError(f"ROS_DOMAIN_ID is {number}, must be 0 to {MAX_DOMAIN}")
-    killed = None if kill is None else _kill(kill)
+    killed, started = (
+        None if text is None else _drone_at(option, text) for option, text in (("--kill", kill), ("--start", start))
+    )
     flown = load(scenario, set_ or [])
     if policy is not None:
         flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
@@ -99,6 +105,7 @@ def live(
             duration_s=duration,
             loss=loss,
             kill=killed,
+            start=started,
             domain=number,
             key=find_key(key),
             fallback=parse_fallback(fallback),
@@ -116,14 +123,14 @@ def live(
         raise typer.Exit(130)
 
 
-def _kill(text: str) -> tuple[int, float]:
+def _drone_at(option: str, text: str) -> tuple[int, float]:
     drone, at, t_s = text.partition("@")
     try:
         if not at:
             raise ValueError
         return int(drone), float(t_s)
     except ValueError as error:
-        raise RunError(f"--kill {text!r}, must be a drone and a time, as in 2@70") from error
+        raise RunError(f"{option} {text!r}, must be a drone and a time, as in 2@70") from error
 
 
 def _share(value: float | None) -> str:

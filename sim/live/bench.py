@@ -69,10 +69,11 @@ class FleetReports:
     """The drones' reports together."""
 
     def __init__(self) -> None:
-        self.last: dict[int, Report] = {}
+        self.last: dict[tuple[int, bool], Report] = {}
+        """By drone, and whether its process started when others were in the air."""
         self.news: list[SinceLastReport] = []
 
-    def add(self, report: Report) -> None:
-        """Add the next report of a drone."""
-        self.last[report.drone] = report
+    def add(self, report: Report, late: bool) -> None:
+        """Add the next report of a process."""
+        self.last[report.drone, late] = report
         self.news.append(report.new)

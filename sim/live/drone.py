@@ -44,6 +44,8 @@ class Orders:
     end_s: float
     loss: float
     domain: int
+    present: frozenset[int]
+    """Drones that are there from the begin; the drone waits until it has found them, unless it starts later."""
     secrets: Secrets | None = None
     """None: the fleet's messages come bare."""
     fallback: Fallback = DETECTIONS
@@ -53,6 +55,8 @@ class Orders:
     """Where the drone's vehicle is heard; None: its poses and charge are replayed."""
     origin: Origin | None = None
     """Where ENU (0, 0, 0) lies for vehicles; None: each vehicle's own local origin."""
+    late: bool = False
+    """Whether it starts when others are in the air."""
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
@@ -77,31 +81,36 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
     policy: Watchdog | None = None
     link: MavlinkLink | None = None
     try:
-        node = LiveNode(
-            Bus(orders.domain), Seals(orders.secrets, drone), drone, scenario.fleet.drones,
-            seed=scenario.seed, loss=orders.loss,
-        )  # fmt: skip
         policy = Watchdog(
             PolicyOrders(scenario.policy, drone, scenario.frame_s),
             fallback=orders.fallback,
             deadline_s=scenario.frame_s if orders.decide_within_s is None else orders.decide_within_s,
-            note=node.note,
-            decided=node.decided,
         )
         replay = ReplaySenses(scenario, drone, orders.trace, orders.begin_s)
+        go = None
+        if orders.late:
+            policy.wait_until_loaded()
+            go = _wait_for_start(drone, pipe)
+            if go is None:
+                return
+        node = LiveNode(
+            Bus(orders.domain), Seals(orders.secrets, drone), drone, scenario.fleet.drones,
+            seed=scenario.seed, loss=orders.loss,
+        )  # fmt: skip
         senses: ReplaySenses | MavlinkSenses = replay
         if orders.mavlink is not None:
             link = MavlinkLink(orders.mavlink, orders.origin)
             link.wait_until_found()
             senses = MavlinkSenses(link, replay, drone, node.note)
-        while not node.all_found(scenario.fleet.drones):
-            if pipe.poll(POLL_S):
-                return
-        policy.wait_until_loaded()
-        pipe.send(Ready(drone))
-        go = pipe.recv()
+        if go is None:
+            while not node.all_found(orders.present):
+                if pipe.poll(POLL_S):
+                    return
+            policy.wait_until_loaded()
+            pipe.send(Ready(drone))
+            go = pipe.recv()
         if isinstance(go, Go):
-            policy.begin(Begin(orders.begin_s, go.monotonic_s))
+            policy.begin(Begin(orders.begin_s, go.monotonic_s), node.note, node.decided)
             _fly(orders, node, policy, senses, go, pipe)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody is left to report to
@@ -113,6 +122,16 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
         if link is not None:
             link.close()
         pipe.close()
+
+
+def _wait_for_start(drone: int, pipe: Connection) -> Go | None:
+    """Be ready, and wait off the bus until it is time to start; None if the flight ends before."""
+    pipe.send(Ready(drone))
+    go = pipe.recv()
+    if isinstance(go, Go) and not pipe.poll(max(0.0, go.monotonic_s - time.monotonic())):
+        return go
+    pipe.send(Home(drone))
+    return None
 
 
 def _fly(
@@ -150,6 +169,8 @@ def _fly(
     elif orders.trace.end_s < orders.end_s:
         at(clock, orders.trace.end_s, memory.status.leave)
     agent.start()
+    if orders.late:
+        node.note("its process started")
 
     def send_report() -> None:
         report = node.report(clock.now)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -110,10 +110,10 @@ class LiveNode:
         self.is_muted: Callable[[], bool] = lambda: False
         """Whether the drone does not know where it is, and says nothing."""
 
-    def all_found(self, drones: int) -> bool:
-        """Whether every writer has found its readers: each drone's and the bench's."""
-        others = [w for link in self._links.values() for w in link.writers]
-        return self._context.listeners > drones and all(w.listeners >= 2 for w in others)
+    def all_found(self, present: Collection[int]) -> bool:
+        """Whether every writer has found its readers: those of the drones that are present, and the bench's."""
+        others = [w for peer, link in self._links.items() if peer in present for w in link.writers]
+        return self._context.listeners > len(present) and all(w.listeners >= 2 for w in others)
 
     def fly(
         self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]

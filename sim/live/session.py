@@ -39,6 +39,7 @@ Progress = Callable[[str, float, float], None]
 
 @dataclass
 class _Drone:
+    orders: Orders
     process: BaseProcess
     pipe: Connection
     over: bool = False
@@ -51,6 +52,7 @@ def fly_live(
     duration_s: float | None = None,
     loss: float = 0.0,
     kill: tuple[int, float] | None = None,
+    start: tuple[int, float] | None = None,
     domain: int = 0,
     key: bytes | None = None,
     fallback: Fallback | None = None,
@@ -68,6 +70,8 @@ def fly_live(
         duration_s: how long it flies, s; None: to the scenario's end.
         loss: share of descriptors that each drone drops on arrival, 0 … 1.
         kill: a drone whose process is killed (SIGKILL), and the scenario's time when.
+        start: a drone and the scenario's time when its process joins the others. If it was killed before, it comes back;
+            otherwise it is not there before.
         domain: DDS domain, as `ROS_DOMAIN_ID`.
         key: the master key of 32 B, from which every drone gets its secrets; None: a new random one. Unused where the
             scenario's `context.authentication` is off.
@@ -87,49 +91,50 @@ def fly_live(
         PolicyError: an unknown policy, or one that breaks its contract.
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
-    _check(scenario, begin_s, end_s, loss, kill, decide_within_s, mavlink)
+    _check(scenario, begin_s, end_s, loss, kill, start, decide_within_s, mavlink)
     report_progress = progress or (lambda what, done, of: None)
     found = traces(
         scenario.model_copy(update={"duration_s": end_s}),
         lambda t_s: report_progress("flying for the context", t_s, end_s),
     )
+    if start is not None:
+        start = start[0], round(start[1] / scenario.frame_s) * scenario.frame_s
     drones, master = scenario.fleet.drones, key or os.urandom(32)
     authentic = scenario.context.authentication
     bench, fleet = Bench(domain, drones), FleetReports()
     flown: list[_Drone] = []
     lost: list[Lost] = []
     t_s = begin_s
+    present = frozenset(range(drones))
+    if start is not None and (kill is None or kill[0] != start[0]):
+        present -= {start[0]}
+
+    def orders_of(drone: int, from_s: float, late: bool) -> Orders:
+        held = secrets_of(master, drone) if authentic else None
+        vehicle = mavlink[drone] if drone < len(mavlink) else None
+        return Orders(
+            scenario, drone, found[drone], from_s, end_s, loss, domain, present, held, fallback or DETECTIONS,
+            decide_within_s, vehicle, origin, late,
+        )  # fmt: skip
+
     try:
-        for i, trace in enumerate(found):
-            held = secrets_of(master, i) if authentic else None
-            orders = Orders(
-                scenario,
-                i,
-                trace,
-                begin_s,
-                end_s,
-                loss,
-                domain,
-                held,
-                fallback or DETECTIONS,
-                decide_within_s,
-                mavlink[i] if i < len(mavlink) else None,
-                origin,
-            )
-            flown.append(_start(orders))
+        flown += [_start(orders_of(drone, begin_s, late=False)) for drone in sorted(present)]
+        if start is not None:
+            flown.append(_start(orders_of(start[0], start[1], late=True)))
         _wait_until_connected(flown, report_progress)
         go = Go(time.monotonic() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9))
-        for drone in flown:
-            drone.pipe.send(go)
+        for process in flown:
+            after_s = process.orders.begin_s - begin_s
+            process.pipe.send(Go(go.monotonic_s + after_s, go.unix_ns + round(after_s * 1e9)))
         bench.begin()
         time.sleep(LEAD_S)
         if begun is not None:
-            begun({i: d.process.pid or 0 for i, d in enumerate(flown)})
+            begun({d.orders.drone: d.process.pid or 0 for d in flown if not d.orders.late})
         with _stop_on_interrupt() as stop:
             while not (stop.is_set() or all(d.over for d in flown)):
                 t_s = min(end_s, begin_s + time.monotonic() - go.monotonic_s)
                 if kill is not None and t_s >= kill[1]:
-                    _kill(flown[kill[0]].process)
+                    _kill(next(d.process for d in flown if d.orders.drone == kill[0]))
                     kill = None
                 bench.wait(0.05)
                 bench.take()
@@ -157,6 +162,7 @@ def fly_live(
 
 def _check(
     scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None,
+    start: tuple[int, float] | None,
     decide_within_s: float | None,
     mavlink: Sequence[str],
 ) -> None:  # fmt: skip
@@ -178,6 +184,10 @@ def _check(
         raise RunError(f"loss is {loss:g}, must be in [0, 1]")
     if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):
         raise RunError(f"kill {kill[0]}@{kill[1]:g}: must be a drone below {drones} and a time in the flight")
+    if start is not None and not (0 <= start[0] < drones and begin_s < start[1] < end_s):
+        raise RunError(f"start {start[0]}@{start[1]:g}: must be a drone below {drones} and a time in the flight")
+    if start is not None and kill is not None and start[0] == kill[0] and start[1] <= kill[1]:
+        raise RunError(f"start {start[0]}@{start[1]:g}: must be after the kill at {kill[1]:g} s")
 
 
 def _start(orders: Orders) -> _Drone:
@@ -188,7 +198,7 @@ def _start(orders: Orders) -> _Drone:
     with _ignoring_interrupts():
         process.start()
     theirs.close()  # so that our end shows when the process is gone
-    return _Drone(process, ours)
+    return _Drone(orders, process, ours)
 
 
 @contextmanager
@@ -239,17 +249,17 @@ def _wait_until_connected(flown: list[_Drone], report_progress: Progress) -> Non
 
 def _collect(flown: list[_Drone], fleet: FleetReports, lost: list[Lost], t_s: float) -> None:
     """Read every report that has arrived. A pipe that closes before its drone has ended means a lost drone."""
-    for number, drone in enumerate(flown):
+    for drone in flown:
         while not drone.over and drone.pipe.poll():
             message = _receive(drone.pipe)
             if isinstance(message, Report):
-                fleet.add(message)
+                fleet.add(message, drone.orders.late)
             elif isinstance(message, Home):
                 drone.over = True
             elif message is None:
                 drone.over = True
                 drone.process.join(EXIT_S)
-                lost.append(Lost(number, t_s, _describe_exit(drone.process.exitcode)))
+                lost.append(Lost(drone.orders.drone, t_s, _describe_exit(drone.process.exitcode)))
 
 
 def _receive(pipe: Connection) -> object | None:

@@ -72,20 +72,14 @@ def parse_fallback(text: str) -> Fallback:
 class Watchdog:
     """A policy in a process of its own, as a policy that always answers in time."""
 
-    def __init__(
-        self, orders: PolicyOrders, *, fallback: Fallback, deadline_s: float, note: Callable[[str], None],
-        decided: Callable[[Decision], None],
-    ) -> None:  # fmt: skip
+    def __init__(self, orders: PolicyOrders, *, fallback: Fallback, deadline_s: float) -> None:
         """
         Args:
             orders: what the process is started with.
             fallback: what links get without the policy.
             deadline_s: the longest time for a decision; the drone waits so long at most once for a policy that hangs.
-            note: called with each event as text.
-            decided: called with each decision that came in time.
         """
         self._orders, self._fallback, self._deadline_s = orders, fallback, deadline_s
-        self._note, self._decided = note, decided
         self._begin: Begin | None = None
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
@@ -128,8 +122,15 @@ class Watchdog:
         if loaded.fault:
             raise PolicyError(loaded.fault)
 
-    def begin(self, begin: Begin) -> None:
-        """Start the clock of the loaded policy."""
+    def begin(self, begin: Begin, note: Callable[[str], None], decided: Callable[[Decision], None]) -> None:
+        """Start the clock of the loaded policy.
+
+        Args:
+            begin: the time.
+            note: called with each event as text.
+            decided: called with each decision that came in time.
+        """
+        self._note, self._decided = note, decided
         assert self._pipe is not None  # noqa: S101 - it was loaded just now
         self._begin, self._loaded = begin, True
         self._pipe.send(begin)

@@ -72,10 +72,10 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
     (tmp_path / "mine.py").write_text(POLICY)
     notes: list[str] = []
     orders = PolicyOrders(PolicySection(name=f"{tmp_path}/mine.py:decide"), 0, 0.1)
-    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1, note=notes.append, decided=lambda _: None)
+    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1)
     try:
         dog.wait_until_loaded()
-        dog.begin(Begin(0.0, time.monotonic()))
+        dog.begin(Begin(0.0, time.monotonic()), notes.append, lambda _: None)
         found = Watched(dog, tmp_path / "mode", notes)
         found.until(lambda: rung(dog) == Representation.FEATURES)  # the first decision of a busy host may be late
         notes.clear()
@@ -156,7 +156,7 @@ def test_a_late_answer_is_dropped_and_the_policy_is_asked_again(watched: Watched
 
 def test_a_policy_that_cannot_be_loaded_is_an_error_before_the_flight() -> None:
     orders = PolicyOrders(PolicySection(name="none-such"), 0, 0.1)
-    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1, note=str, decided=lambda _: None)
+    dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1)
     with pytest.raises(PolicyError, match="none-such"):
         dog.wait_until_loaded()
     dog.close()

@@ -1,0 +1,61 @@
+"""Drones that start late, and drones that come back after their process was killed."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import pytest
+from sim_examples import example
+
+from sortie.fleet.staleness import LinkHealth
+from sortie.sim.folders import RunError
+from sortie.sim.live.result import LiveResult
+from sortie.sim.live.sentences import describe_changes
+from sortie.sim.live.session import fly_live
+
+DOMAIN = os.getpid() % 200 + 24
+POLICY = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
+
+
+def healths(result: LiveResult, drone: int, peer: int) -> list[LinkHealth]:
+    """What became of a drone's context about a peer, without what a busy host skips."""
+    seen = [c.health for c in result.health if (c.drone, c.peer) == (drone, peer)]
+    return [h for h in seen if h != LinkHealth.DEGRADED]
+
+
+def test_a_drone_that_starts_late_is_shared_with_and_shares() -> None:
+    result = fly_live(example("fleet.drones=2", POLICY), duration_s=4.0, start=(1, 2.0), domain=DOMAIN)
+    first, late = result.each
+    assert (first.drone, late.drone) == (0, 1)
+    assert late.published < 25 < first.published
+    assert healths(result, 0, 1) == healths(result, 1, 0) == [LinkHealth.FRESH]
+    assert all(c.t_s > 1.9 for c in result.health)
+    assert first.payloads_arrived > 3
+    assert late.payloads_arrived > 3
+    assert "drone 1: its process started" in "\n".join(describe_changes(result))
+
+
+def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
+    """Its counters begin above those that it used before."""
+    result = fly_live(
+        example("fleet.drones=2", POLICY), duration_s=5.0, kill=(1, 1.5), start=(1, 3.5), domain=DOMAIN + 1
+    )
+    assert [(d.drone, d.refused) for d in result.each] == [(0, {}), (1, {}), (1, {})]
+    assert healths(result, 0, 1) == [LinkHealth.FRESH, LinkHealth.DETACHED, LinkHealth.FRESH]
+    assert [gone.drone for gone in result.lost] == [1]
+    assert result.noticed[0].by == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": (7, 1.0)}, "start 7@1: must be a drone below 5 and a time in the flight"),
+        ({"start": (1, 9.0)}, "start 1@9: must be a drone below 5 and a time in the flight"),
+        ({"start": (1, 1.0), "kill": (1, 2.0)}, "start 1@1: must be after the kill at 2 s"),
+    ],
+)
+def test_a_start_that_does_not_fit_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(RunError) as error:
+        fly_live(example(), **options)
+    assert str(error.value) == message
