@@ -169,18 +169,30 @@ class Agent:
                 self._tick(frame)
 
     def _tick(self, frame: int) -> None:
+        sensed = self.publish(frame)
+        self.decide(frame)
+        self.look(frame, sensed)
+
+    def publish(self, frame: int) -> Sensed:
+        """The publisher's part of a frame: sense, and publish the descriptor if one is due."""
         sensed = self._senses.sense(frame)
         self.here = sensed.capture
         own = self._publish(sensed, due=frame % self._rules.publish_every == 0)
         self.memory.hold(own, self._env.now)
-        each_second = frame % self._judged_every == 0
-        if each_second:
+        if frame % self._judged_every == 0:
             self._chart.fold(self.memory.believed())
             self._check_clock()
-        if self._rules.trust and each_second:
+        return sensed
+
+    def decide(self, frame: int) -> None:
+        """The policy node's part: judge the peers' claims once a second, and decide on every link."""
+        if self._rules.trust and frame % self._judged_every == 0:
             for peer, standing in self.memory.judge(self._env.now):
                 self._log.trust(self._env.now, self.drone, peer, standing)
         self._decide()
+
+    def look(self, frame: int, sensed: Sensed) -> None:
+        """The gate's part: look in as many frames as its directives want, and send what the look gives."""
         duty = self._gate.duty_percent
         self.status.perceiving = (frame + 1) * duty // 100 > frame * duty // 100
         self.status.work.looks += self.status.perceiving

@@ -6,9 +6,9 @@ import time
 
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind, links
-from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader
-from sortie.sim.live.messages import unpack_bytes
+from sortie.sim.live.payload_message import unpack_bytes
 from sortie.sim.live.reports import Count, Report, SinceLastReport
+from sortie.sim.live.transport import MAX_DEPTH, Bus, Reader
 
 PAYLOAD_DEPTH = 16
 """Samples of a payload topic that are stored until they are read. A bench that is later than that misses some."""
@@ -17,8 +17,8 @@ PAYLOAD_DEPTH = 16
 class Bench:
     """One participant that only listens."""
 
-    def __init__(self, domain: int, drones: int) -> None:
-        self._bus = Bus(domain)
+    def __init__(self, bus: Bus, drones: int) -> None:
+        self._bus = bus
         depths = {TopicKind.CONTEXT: MAX_DEPTH, TopicKind.DIRECTIVE: MAX_DEPTH}
         topics = [CONTEXT, *(Topic(kind, *link) for link in links(drones) for kind in (TopicKind.DIRECTIVE, *PAYLOADS))]
         self._readers = [self._bus.reader(topic, depths.get(topic.kind, PAYLOAD_DEPTH)) for topic in topics]

@@ -14,6 +14,7 @@ from cyclonedds.topic import Topic as DdsTopic
 
 from sortie.sim.export.topics import Topic, TopicKind
 from sortie.sim.live.messages import dds_type
+from sortie.sim.live.transport import MAX_DEPTH
 
 LOOPBACK = """\
 <CycloneDDS><Domain Id="any">
@@ -32,7 +33,6 @@ LOOPBACK = """\
 </Domain></CycloneDDS>
 """
 """Cyclone's configuration if `CYCLONEDDS_URI` is not set: this host alone, fragments of the largest datagram size."""
-MAX_DEPTH = 64
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 
 

@@ -11,11 +11,9 @@ from multiprocessing.connection import Connection
 from sortie.fleet.agent import Agent
 from sortie.fleet.logs.mavlink import Origin
 from sortie.fleet.memory import PeerMemory
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus
 from sortie.policies.contract import Directive, FleetView, PolicyError
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.streams import stream
-from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.engine.world import at
 from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
@@ -25,6 +23,7 @@ from sortie.sim.live.node import LiveNode
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders
 from sortie.sim.live.reports import Failed, Go, Home, Ready
+from sortie.sim.live.rules import phase_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
 
@@ -57,21 +56,6 @@ class Orders:
     """Where ENU (0, 0, 0) lies for vehicles; None: each vehicle's own local origin."""
     late: bool = False
     """Whether it starts when others are in the air."""
-
-
-def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
-    """The plane's rules on the bus: samples go whole, descriptors in full."""
-    return PlaneRules(
-        period_s=scenario.frame_s,
-        frames=round((end_s - begin_s) / scenario.frame_s),
-        degraded_after_periods=scenario.context.degraded_after_periods,
-        detached_after_periods=scenario.context.detached_after_periods,
-        dwell_s=scenario.policy.dwell_s,
-        hysteresis=scenario.policy.hysteresis,
-        compute_delay_s=scenario.perception.compute_delay_s,
-        publish_every=scenario.context.publish_every,
-        trust=scenario.context.trust,
-    )
 
 
 def fly_one(orders: Orders, pipe: Connection) -> None:
@@ -141,7 +125,7 @@ def _fly(
     time.sleep(max(0.0, go.monotonic_s - time.monotonic()))
     clock = WallClock(orders.begin_s, go.monotonic_s)
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
-    phase_s = PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
+    phase_s = phase_of(scenario, drone)
     # stamps are nanoseconds since 1970, as in ROS 2
     memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
 

@@ -8,14 +8,12 @@ only tells DDS what they are called. `sortie_msgs/msg/ContextDescriptor` is `sor
 from __future__ import annotations
 
 import re
-import struct
 from functools import cache
 from typing import Any
 
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import array, float32, int32, sequence, uint8, uint16, uint32
 
-from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram
 from sortie.fleet.messages.wire import DESCRIPTOR_MSG, DESCRIPTOR_NAME, DIRECTIVE_MSG, DIRECTIVE_NAME
 from sortie.sim.export.topics import BYTES_NAME
 
@@ -31,9 +29,6 @@ DEFINITIONS = {
 
 _PRIMITIVES = {"uint8": uint8, "uint16": uint16, "uint32": uint32, "int32": int32, "float32": float32, "string": str}
 _FIELD = re.compile(r"(?P<type>[A-Za-z0-9_/]+)(?:\[(?P<length>\d*)\])?\s+(?P<name>[a-z][a-z0-9_]*)")
-_BYTES = struct.Struct("<4s3I")  # an empty layout (no dimensions, offset 0), then the count of bytes
-BYTES_OVERHEAD = _BYTES.size
-"""What a `UInt8MultiArray` puts in front of its bytes, encapsulation included."""
 
 
 class Cdr:
@@ -100,22 +95,3 @@ def _field_type(package: str, text: str, length: str | None) -> Any:
     if length is None:
         return base
     return array[base, int(length)] if length else sequence[base]  # type: ignore[misc]
-
-
-def pack_bytes(content: bytes) -> bytes:
-    """Bytes as CDR of `std_msgs/msg/UInt8MultiArray`."""
-    return _BYTES.pack(ENCAPSULATION, 0, 0, len(content)) + content
-
-
-def unpack_bytes(cdr: bytes) -> bytes:
-    """The bytes of a `UInt8MultiArray` with an empty layout.
-
-    Raises:
-        MalformedDatagram: for anything else.
-    """
-    if len(cdr) < BYTES_OVERHEAD:
-        raise MalformedDatagram(f"{len(cdr)} B, must be at least {BYTES_OVERHEAD}")
-    header, dimensions, offset, count = _BYTES.unpack_from(cdr)
-    if header != ENCAPSULATION or dimensions or offset or not 0 <= len(cdr) - BYTES_OVERHEAD - count < 4:
-        raise MalformedDatagram("no UInt8MultiArray with an empty layout")
-    return cdr[BYTES_OVERHEAD : BYTES_OVERHEAD + count]

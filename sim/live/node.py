@@ -11,10 +11,12 @@ opened where it is read (`sortie.sim.live.seals`). What is refused is counted by
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from enum import Flag, auto
 
 import numpy as np
 
@@ -32,12 +34,12 @@ from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
-from sortie.sim.live.bus import MAX_DEPTH, Bus, Reader, Writer
 from sortie.sim.live.clock import WallClock
-from sortie.sim.live.messages import pack_bytes, unpack_bytes
+from sortie.sim.live.payload_message import pack_bytes, unpack_bytes
 from sortie.sim.live.policy_process import Decision
 from sortie.sim.live.reports import Count, HealthChange, NewDirective, Notice, Report, SinceLastReport
 from sortie.sim.live.seals import Seals
+from sortie.sim.live.transport import MAX_DEPTH, Bus, Reader, Writer
 
 _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
@@ -45,20 +47,35 @@ DIRECTIVE_DEPTH, PAYLOAD_DEPTH = 16, 4
 """Samples that a reader stores until they are read. With one, a stranger's sample would push a genuine one out."""
 
 
+class Role(Flag):
+    """What a process does for its drone. In `sortie live` one process does all; in ROS 2 each role is a node."""
+
+    PUBLISHER = auto()
+    POLICY = auto()
+    GATE = auto()
+
+
+EVERY_ROLE = Role.PUBLISHER | Role.POLICY | Role.GATE
+
+
 class PeerTopics:
     """One drone's readers and writers for one peer."""
 
-    def __init__(self, bus: Bus, me: int, peer: int) -> None:
+    def __init__(self, bus: Bus, me: int, peer: int, role: Role) -> None:
         self.peer = peer
-        self.directive = bus.writer(Topic(TopicKind.DIRECTIVE, me, peer))
-        self.payload = {kind: bus.writer(Topic(kind, me, peer)) for kind in PAYLOADS}
-        self.ordered = bus.reader(Topic(TopicKind.DIRECTIVE, me, peer), DIRECTIVE_DEPTH)
-        self.incoming = [bus.reader(Topic(kind, peer, me), PAYLOAD_DEPTH) for kind in PAYLOADS]
+        self.directive = bus.writer(Topic(TopicKind.DIRECTIVE, me, peer)) if Role.POLICY in role else None
+        self.payload: dict[TopicKind, Writer] = {}
+        self.readers: list[Reader] = []
+        """Of directives to the gate, then of payloads from the peer."""
+        if Role.GATE in role:
+            self.payload = {kind: bus.writer(Topic(kind, me, peer)) for kind in PAYLOADS}
+            self.readers = [bus.reader(Topic(TopicKind.DIRECTIVE, me, peer), DIRECTIVE_DEPTH)]
+            self.readers += [bus.reader(Topic(kind, peer, me), PAYLOAD_DEPTH) for kind in PAYLOADS]
 
     @property
     def writers(self) -> list[Writer]:
         """The writers."""
-        return [self.directive, *self.payload.values()]
+        return [*([] if self.directive is None else [self.directive]), *self.payload.values()]
 
 
 class BusGate(Gate):
@@ -86,12 +103,14 @@ class BusGate(Gate):
 class LiveNode:
     """The nodes of one drone. It is the agent's modem and log."""
 
-    def __init__(self, bus: Bus, seals: Seals, drone: int, drones: int, *, seed: int, loss: float) -> None:
+    def __init__(
+        self, bus: Bus, seals: Seals, drone: int, drones: int, *, seed: int, loss: float = 0.0, role: Role = EVERY_ROLE
+    ) -> None:
         """Args: `loss` is the share of others' descriptors that is dropped on arrival, 0 … 1, drawn by link."""
-        self.drone = drone
+        self.drone, self._role = drone, role
         self._seals = seals
         self._bus, self._seed, self._loss = bus, seed, loss
-        self._context = bus.writer(CONTEXT)
+        self._context = bus.writer(CONTEXT) if Role.PUBLISHER in role else None
         self._fleet = bus.reader(CONTEXT, MAX_DEPTH)
         self._links: dict[int, PeerTopics] = {}
         for peer in range(drones):
@@ -107,13 +126,19 @@ class LiveNode:
         self._received = dict.fromkeys(PAYLOADS, Count())
         self._new = SinceLastReport()
         self._began_cpu_s = 0.0
+        self.own: Descriptor | None = None
+        """The drone's latest descriptor, if another of its nodes publishes."""
+        self._own_counter = 0
+        self.ordered_at_s = -math.inf
+        """When the latest directive was accepted."""
         self.is_muted: Callable[[], bool] = lambda: False
         """Whether the drone does not know where it is, and says nothing."""
 
     def all_found(self, present: Collection[int]) -> bool:
         """Whether every writer has found its readers: those of the drones that are present, and the bench's."""
         others = [w for peer, link in self._links.items() if peer in present for w in link.writers]
-        return self._context.listeners > len(present) and all(w.listeners >= 2 for w in others)
+        heard = self._context is None or self._context.listeners > len(present)
+        return heard and all(w.listeners >= 2 for w in others)
 
     def fly(
         self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]
@@ -139,11 +164,12 @@ class LiveNode:
     def take(self) -> None:
         """Handle the samples that have arrived, directives first, because the gate may need them at once."""
         for link in list(self._links.values()):
-            for cdr in link.ordered.take():
-                self._on_directive(cdr, link.ordered.topic)
-            for reader in link.incoming:
+            for reader in link.readers:
                 for cdr in reader.take():
-                    self._on_payload(cdr, reader)
+                    if reader.topic.kind == TopicKind.DIRECTIVE:
+                        self._on_directive(cdr, reader.topic)
+                    else:
+                        self._on_payload(cdr, reader)
         for cdr in self._fleet.take():
             self._on_descriptor(cdr)
 
@@ -160,7 +186,7 @@ class LiveNode:
     goodput_mbps: Callable[[], tuple[float, ...]]
 
     def broadcast(self, datagram: bytes) -> None:
-        if self.is_muted():
+        if self.is_muted() or self._context is None:
             return
         self._published += 1
         self._context.write(self._seals.seal(CONTEXT, datagram))
@@ -204,6 +230,9 @@ class LiveNode:
         heard = self._seals.open_descriptor(cdr)
         if isinstance(heard, Opened):
             sender = heard.descriptor.agent_id
+            if sender == self.drone and self._context is None:
+                self._on_own(heard)
+                return
             if sender == self.drone:
                 if self._seals.is_forged_self(heard):
                     self._refuse("descriptor", "in this drone's name", f"counter {heard.counter}")
@@ -219,6 +248,15 @@ class LiveNode:
         else:
             self._heard += 1
 
+    def _on_own(self, heard: Opened) -> None:
+        """Keep the drone's own descriptor, which another of its nodes published."""
+        if heard.key_id is not None and heard.counter <= self._own_counter:
+            self._refuse("descriptor", DropReason.REPLAYED, "its counter was used")
+            return
+        self._own_counter = heard.counter
+        self.own = heard.descriptor
+        self._memory.hold(heard.descriptor, self._clock.now)
+
     def _on_directive(self, cdr: bytes, topic: Topic) -> None:
         opened = self._seals.open(topic, cdr)
         if isinstance(opened, Dropped):
@@ -232,6 +270,7 @@ class LiveNode:
         if (directive.source, directive.destination) != (topic.source, topic.destination):
             self._refuse("directive", "of another link", f"{directive.source}→{directive.destination}")
             return
+        self.ordered_at_s = self._clock.now
         self.gate.apply(directive)
 
     def _on_payload(self, cdr: bytes, reader: Reader) -> None:
@@ -285,10 +324,12 @@ class LiveNode:
     # --- helpers ---------------------------------------------------------------------------------
 
     def _add_peer(self, peer: int) -> None:
-        self._links[peer] = PeerTopics(self._bus, self.drone, peer)
+        self._links[peer] = PeerTopics(self._bus, self.drone, peer, self._role)
 
     def _publish_directive(self, directive: Directive) -> None:
         writer = self._links[directive.destination].directive
+        if writer is None:
+            return
         sealed = self._seals.seal(writer.topic, encode_directive(directive))
         self._sent[TopicKind.DIRECTIVE] = self._sent[TopicKind.DIRECTIVE].plus(len(sealed))
         writer.write(sealed)

@@ -60,12 +60,7 @@ def find_key(path: Path | None) -> bytes:
         RunError: a file that others may read, or a key that is none.
     """
     if path is not None:
-        try:
-            mode = path.stat().st_mode
-        except OSError as error:
-            raise RunError(f"{path}: {error.strerror}") from error
-        if stat.S_IMODE(mode) & 0o077:
-            raise RunError(f"{path}: its mode is {stat.S_IMODE(mode):o}, must be 600: others may read or write the key")
+        _check_mode(path)
         return read_key(path)
     text = os.environ.get(KEY_VARIABLE)
     if text is None:
@@ -77,6 +72,44 @@ def find_key(path: Path | None) -> bytes:
     if len(key) != 32:
         raise RunError(f"{KEY_VARIABLE} has {len(text)} characters, must be 64 hexadecimal digits")
     return key
+
+
+def _check_mode(path: Path) -> None:
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from error
+    if stat.S_IMODE(mode) & 0o077:
+        raise RunError(f"{path}: its mode is {stat.S_IMODE(mode):o}, must be 600: others may read or write the key")
+
+
+def read_secrets(path: Path) -> Secrets:
+    """A drone's secrets from a file that only its owner may read: 128 hexadecimal digits, as `write_secrets` writes.
+
+    Raises:
+        RunError: a file that others may read, or one that holds no secrets.
+    """
+    _check_mode(path)
+    try:
+        both = bytes.fromhex(path.read_text("ascii"))
+    except ValueError:
+        both = b""
+    if len(both) != 64:
+        raise RunError(f"{path}: no secrets of a drone, must hold 128 hexadecimal digits")
+    return Secrets(both[:32], both[32:])
+
+
+def write_secrets(path: Path, held: Secrets) -> None:
+    """Write a drone's secrets to a new file that only its owner may read.
+
+    Raises:
+        RunError: the file exists or cannot be written.
+    """
+    try:
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write((held.fleet + held.own).hex())
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from error
 
 
 class Seals:

@@ -19,6 +19,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.export.telemetry import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.bench import Bench, FleetReports
+from sortie.sim.live.bus import Bus
 from sortie.sim.live.context import traces
 from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
@@ -101,7 +102,7 @@ def fly_live(
         start = start[0], round(start[1] / scenario.frame_s) * scenario.frame_s
     drones, master = scenario.fleet.drones, key or os.urandom(32)
     authentic = scenario.context.authentication
-    bench, fleet = Bench(domain, drones), FleetReports()
+    bench, fleet = Bench(Bus(domain), drones), FleetReports()
     flown: list[_Drone] = []
     lost: list[Lost] = []
     t_s = begin_s

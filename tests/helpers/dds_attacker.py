@@ -11,7 +11,7 @@ from dds_peer import Directive, say
 
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.live.bus import Bus
-from sortie.sim.live.messages import pack_bytes, unpack_bytes
+from sortie.sim.live.payload_message import pack_bytes, unpack_bytes
 
 SILENCE = Directive(0, 1, 0, 100, [0.0, 0.0, 0.0], 0.0, 0.0, 0.1, 1.0).serialize(use_version_2=False)
 """Drone 0 is to send nothing to drone 1; written by hand as rosidl writes it."""

@@ -21,8 +21,8 @@ from sortie.sim.export.telemetry import ORIGIN
 from sortie.sim.folders import RunError
 from sortie.sim.live import platform
 from sortie.sim.live.context import ReplaySenses, traces
-from sortie.sim.live.drone import rules_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
+from sortie.sim.live.rules import rules_of
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 from sortie.sim.live.vehicle import CirclingVehicle, circle

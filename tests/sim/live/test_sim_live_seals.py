@@ -23,10 +23,10 @@ from sortie.sim.cli.app import app
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import RunError
 from sortie.sim.live.bus import LOOPBACK, Bus
-from sortie.sim.live.drone import rules_of
-from sortie.sim.live.messages import pack_bytes
 from sortie.sim.live.node import _HEADER, LiveNode
+from sortie.sim.live.payload_message import pack_bytes
 from sortie.sim.live.result import LiveResult
+from sortie.sim.live.rules import rules_of
 from sortie.sim.live.seals import KEY_ID, KEY_VARIABLE, Seals, find_key, secrets_of
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
@@ -131,8 +131,9 @@ def test_a_stranger_does_not_silence_a_drone(attacked: LiveResult) -> None:
     assert receiver.refused["payload forged"] > 5
     assert receiver.refused["payload replayed"] > 5
     assert receiver.refused["descriptor replayed"] > 5
-    assert gate.payloads_arrived > 15  # of about 25 each way
-    assert abs(gate.payloads_arrived - receiver.payloads_arrived) < 10  # it was not thinned out either
+    each_way = [d.payloads_arrived + d.refused.get("payload late", 0) for d in attacked.each]  # a busy host is late
+    assert min(each_way) > 15  # of about 25
+    assert max(each_way) - min(each_way) < 10  # it was not thinned out either
     text = "\n".join(describe_changes(attacked))
     assert "drone 0: refused a directive unknown key: for drone 1, key id" in text
 
@@ -166,7 +167,7 @@ def payload(sender: Seals, stamp_s: float, deadline_s: float = 0.1, source: int 
 def test_a_payload_after_its_deadline_is_dropped_and_counted() -> None:
     node, clock, _ = node_of(1)
     sender = seals(0)
-    reader = node._links[0].incoming[0]
+    reader = node._links[0].readers[1]
     ready_s = 0.03 + 0.01  # compute delay, and the moment within the frame
     for age_s, deadline_s, refused in (
         (0.05, 0.1, 0),
@@ -202,7 +203,7 @@ def test_a_descriptor_in_the_drone_s_own_name_is_refused() -> None:
 def test_a_member_that_lies_loses_trust_and_its_payloads_are_dropped() -> None:
     """It sees nothing from 60 m, and its charge comes back."""
     node, clock, memory = node_of(1)
-    liar, reader = seals(0), node._links[0].incoming[0]
+    liar, reader = seals(0), node._links[0].readers[1]
     told = []
     for second in range(9):
         clock.now = 10.0 + second
