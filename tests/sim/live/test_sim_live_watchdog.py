@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -199,3 +200,33 @@ def test_a_drone_flies_on_as_its_policy_dies(tmp_path: Path) -> None:
     text = "\n".join(describe_changes(result))
     assert "drone 0: fallback to detections at 2 Hz: the policy's process ended with exit code -6" in text
     assert "drone 0: the policy decides again after " in text
+
+
+def test_a_policy_that_hangs_ends_with_its_drone(tmp_path: Path) -> None:
+    """The drone's process is killed, and can end nothing by itself."""
+    (tmp_path / "mine.py").write_text(POLICY)
+    drone = multiprocessing.get_context("spawn").Process(target=ask_for_ever, args=(tmp_path,))
+    drone.start()
+    end_s = time.monotonic() + 60
+    while not (tmp_path / "pid").exists():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+    pid = int((tmp_path / "pid").read_text())
+    drone.kill()
+    drone.join()
+    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def ask_for_ever(folder: Path) -> None:
+    """A drone's process, its policy hanging."""
+    dog = Watchdog(
+        PolicyOrders(PolicySection(name=f"{folder}/mine.py:decide"), 0, 0.1), fallback=DETECTIONS, deadline_s=60
+    )
+    dog.wait_until_loaded()
+    dog.begin(Begin(0.0, time.monotonic()), str, lambda _: None)
+    (folder / "mode").write_text("hang")
+    (folder / "part").write_text(str(dog.pid))
+    (folder / "part").rename(folder / "pid")
+    dog(VIEW)
