@@ -30,12 +30,14 @@ from sortie.policies.contract import (
     Descriptor,
     Directive,
     Disc,
+    FleetView,
     Policy,
     TaskPhase,
     check_directives,
     nothing,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.policies.verification.enforced import Cap, Steps
 
 _FRESH = LinkHealth.FRESH
 
@@ -86,13 +88,18 @@ class AgentLog(Protocol):
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None: ...
 
 
-class _OutgoingLink:
-    """An outgoing link: what its gate enforces, and what was last asked of it while its peer was fresh."""
+Guard = Callable[[FleetView, Sequence[Steps], Cap], Sequence[Directive]]
+"""Judges what staleness and damping left of every link's directive, and returns what the gates are to enforce."""
 
-    __slots__ = ("asked", "by_clock", "state")
+
+class _OutgoingLink:
+    """An outgoing link: its state of damping, what its gate enforces, and what was last asked while its peer was fresh."""
+
+    __slots__ = ("asked", "by_clock", "enforced", "state")
 
     def __init__(self, me: int, peer: int) -> None:
         self.state = DampedLink(nothing(me, peer, ""))
+        self.enforced = self.state.enforced  # before the wire rounds it
         self.asked: Directive | None = None
         self.by_clock = False
         """Whether it is reduced for a descriptor that has just come and looks old by its stamp."""
@@ -115,6 +122,7 @@ class Agent:
         sealer: Sealer | None,
         phase_s: float,
         handshake_bytes: Callable[[], int],
+        guard: Guard | None = None,
     ) -> None:
         """Put a drone together; `start` begins its process.
 
@@ -130,6 +138,7 @@ class Agent:
             sealer: signs descriptors; None publishes them unauthenticated.
             phase_s: when in each frame this drone acts.
             handshake_bytes: what its sharing method puts on every link and frame before payloads, at the moment.
+            guard: has the last word before the gates; None where there are no invariants.
         """
         self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
@@ -146,6 +155,7 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._handshake_bytes = handshake_bytes
+        self._guard = guard
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
@@ -287,22 +297,49 @@ class Agent:
             changed = asked is not link.asked and asked != link.asked
             if changed or age_s > fresh_s or link.state.proposals:
                 self._enforce(link, asked, age_s, now_s)
+        if self._guard is not None:
+            self._keep_invariants(self._guard, view, asked_of)
         self.status.work.decisions += 1
         self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
 
     def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
-        rules, before = self._rules, link.state
+        before = link.state
         fidelity, link.asked, capped = _FRESH, asked, asked
         if age_s > self._fresh_s:
-            fidelity = health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            fidelity = self._health(age_s)
             link.asked, capped = None, cap_by_age(asked, fidelity, age_s)
         self._blame_clock(link, asked.destination, fidelity, age_s, now_s)
-        link.state = after = damp(before, capped, now_s, rules.dwell_s)
-        if after.enforced is not before.enforced and after.enforced != before.enforced:
-            enforced = decode_directive(encode_directive(after.enforced))
+        link.state = after = damp(before, capped, now_s, self._rules.dwell_s)
+        if self._guard is None and after.enforced is not before.enforced:
+            self._put_in_force(link, asked, after.enforced, fidelity)
+
+    def _put_in_force(self, link: _OutgoingLink, asked: Directive, directive: Directive, fidelity: LinkHealth) -> None:
+        """Hand a link's gate its directive as the wire rounds it; nothing if it is in force already."""
+        before, link.enforced = link.enforced, directive
+        if directive != before:
+            enforced = decode_directive(encode_directive(directive))
             self._gate.enforce(enforced)
-            self._log.directive(now_s, asked, enforced, fidelity, after.enforced.reason)
+            self._log.directive(self._env.now, asked, enforced, fidelity, directive.reason)
+
+    def _keep_invariants(self, guard: Guard, view: FleetView, asked_of: dict[int, Directive]) -> None:
+        """What the guard leaves of all links' directives goes to the gates, also where the policy asked nothing new."""
+        me = self.drone
+        fidelity = {peer: self._health(age_s) for peer, age_s in view.age_s.items() if peer != me}
+
+        def cap(directive: Directive) -> Directive:
+            peer = directive.destination
+            return cap_by_age(directive, fidelity[peer], view.age_s[peer])
+
+        asked = [asked_of.get(peer) or nothing(me, peer, "the policy gave no directive") for peer in fidelity]
+        steps = [Steps(d, cap(d), self._links[d.destination].state.enforced) for d in asked]
+        for step, directive in zip(steps, guard(view, steps, cap), strict=True):
+            peer = directive.destination
+            self._put_in_force(self._links[peer], step.asked, directive, fidelity[peer])
+
+    def _health(self, age_s: float) -> LinkHealth:
+        rules = self._rules
+        return health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
 
     def _blame_clock(self, link: _OutgoingLink, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
         """Report a link that begins to be reduced because a descriptor was too old when it came."""

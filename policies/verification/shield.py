@@ -4,15 +4,17 @@
 
 A directive that breaks an invariant is replaced by the nearest one that keeps them all. Its reason then begins with
 "shield:", so the record shows each intervention and `interventions` counts them. Nearest means: fewest fields changed,
-then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds. The staleness
-rules and damping come after the shield. They may lower what it raised, and damping delays a raise by the dwell time.
+then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds.
+
+In flight the shield acts twice: here, on the policy's output, and at the gate, on what the staleness rules and damping
+left of it (`policies.verification.enforced`). There a limit keeps it from giving a link more than its age allows.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
@@ -31,6 +33,8 @@ from sortie.policies.verification.invariants import (
 from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
+LEAST_RATE_HZ = 2.0
+"""The rate of a link that a shield makes carry something, if no line names a rate: the bottom rung of the paper's table."""
 _HIGHEST: dict[str, float] = {
     **{name: bound.high for name, bound in DIRECTIVE_BOUNDS.items() if name != "duty_percent"},
     "duty": 1.0,
@@ -84,7 +88,11 @@ def interventions(directives: Iterable[Directive]) -> int:
 
 
 def enforce(
-    rules: Sequence[Invariant], view: FleetView, decided: Sequence[Directive], fresh: Sequence[Directive] = ()
+    rules: Sequence[Invariant],
+    view: FleetView,
+    decided: Sequence[Directive],
+    fresh: Sequence[Directive] = (),
+    allowed: Callable[[Directive], bool] = lambda _: True,
 ) -> list[Directive]:
     """The directives; those that break a rule are replaced by the nearest ones that keep all rules.
 
@@ -93,6 +101,7 @@ def enforce(
         view: the policy's input.
         decided: its output.
         fresh: its output at age 0, if a rule needs it.
+        allowed: which directives may replace others.
     """
     me, directives = view.me, list(decided)
     if me is None:
@@ -102,10 +111,10 @@ def enforce(
     for k, directive in enumerate(directives):
         broken = [r for r in of_link if not _satisfies(r, scope, directive)]
         if broken:
-            directives[k] = _nearest_valid(scope, k, of_link, broken)
+            directives[k] = _nearest_valid(scope, k, of_link, broken, allowed)
     for rule in rules:
         if not rule.of_link and not _satisfies(rule, scope, None):
-            _replace_one_link(scope, directives, rule, of_link)
+            _replace_one_link(scope, directives, rule, of_link, allowed)
     return directives
 
 
@@ -114,16 +123,28 @@ def _satisfies(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
     return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
 
 
-def _nearest_valid(scope: Scope, k: int, rules: Sequence[Invariant], broken: Sequence[Invariant]) -> Directive:
+def _nearest_valid(
+    scope: Scope,
+    k: int,
+    rules: Sequence[Invariant],
+    broken: Sequence[Invariant],
+    allowed: Callable[[Directive], bool],
+) -> Directive:
     """The nearest directive for this link that keeps every rule about links."""
     before = scope.directives[k]
     for _, after in _candidates(before, rules, scope):
-        if all(_satisfies(r, scope, after) for r in rules):
+        if allowed(after) and all(_satisfies(r, scope, after) for r in rules):
             return _replaced(before, after, broken)
     return _not_replaced(before, broken)
 
 
-def _replace_one_link(scope: Scope, directives: list[Directive], rule: Invariant, of_link: Sequence[Invariant]) -> None:
+def _replace_one_link(
+    scope: Scope,
+    directives: list[Directive],
+    rule: Invariant,
+    of_link: Sequence[Invariant],
+    allowed: Callable[[Directive], bool],
+) -> None:
     """Change one link, by the smallest change of any, so that a rule about all links holds.
 
     Args:
@@ -134,6 +155,8 @@ def _replace_one_link(scope: Scope, directives: list[Directive], rule: Invariant
         for far, after in _candidates(before, [*of_link, rule], scope):
             if best is not None and far >= best[0]:
                 break
+            if not allowed(after):
+                continue
             directives[k] = after
             if _satisfies(rule, scope, None) and all(_satisfies(r, scope, after) for r in of_link):
                 best = (far, k, after)
@@ -229,6 +252,8 @@ def _changed(before: Directive, wanted: dict[str, float], region: Disc | None) -
             changed[word] = value
     if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
         changed["rho"] = 0.0  # only features have cells
+    if changed.get("representation", 0) > 0 and before.rate_hz <= 0 and "rate_hz" not in changed:
+        changed["rate_hz"] = LEAST_RATE_HZ  # a link at 0 Hz carries nothing
     return before._replace(**changed)
 
 

@@ -53,10 +53,11 @@ class PolicySection(Section):
     invariants: str = Field(
         "",
         max_length=10000,
-        description="What directives must keep, one line each (policies/verification/invariants.py); counted.",
+        description="What enforced directives must keep, one line each (policies/verification/invariants.py); violations are events.",
     )
     shield: bool = Field(
-        False, description="Directives that break an invariant are replaced by the nearest that keep it."
+        False,
+        description="Directives that break an invariant are replaced by the nearest that keep it, as far as ages allow.",
     )
     replays: tuple[ViewReplay, ...] = Field(
         (), max_length=100, description="Views that a policy is shown instead of what its drone heard."

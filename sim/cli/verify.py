@@ -114,6 +114,12 @@ def _try(
     for verdict in verdicts:
         table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
     out.print(table)
+    if rules:
+        out.print(
+            "This judges what the policy decides. Staleness rules and damping come after it; a flight with the same lines in "
+            "`policy.invariants` judges what the gates enforce.",
+            soft_wrap=True,
+        )
     _keep(kept / slug(policy), _counterexamples(decide, section, checks, verdicts))
     return len(failing(checks)) + sum(v.outcome == "refuted" for v in verdicts)
 

@@ -1,8 +1,9 @@
-"""A drone's policy in flight, which the mission, the clock or a command may change; and the audit of its decisions.
+"""A drone's policy in flight, which the mission, the clock or a command may change, and its guard at the gate.
 
 The agent calls its pilot as its policy. The pilot may change to another policy between two decisions; the agent keeps
 what a link carries, its dwell time and its last sending time. The pilot replays recorded views where the scenario has
-them. It counts directives that break an invariant. With a shield it also replaces such directives where it can.
+them. As the agent's guard it judges what the gates enforce against the invariants. With a shield it also replaces
+directives that break one: the policy's at once, and again what the staleness rules and damping left of them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 import simpy
 
+from sortie.fleet.agent import Guard
 from sortie.policies.contract import (
     PHASE_NAMES,
     PHASE_OF,
@@ -28,6 +30,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.enforced import Cap, Steps, judge, put_right
 from sortie.policies.verification.invariants import (
     Invariant,
     InvariantError,
@@ -39,8 +42,8 @@ from sortie.policies.verification.invariants import (
 from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.schema import PolicyChange, PolicySection
+from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.world import at, with_frame
-from sortie.sim.results.record import DECISIONS_OF, Recorder
 
 
 class NamedPolicy(NamedTuple):
@@ -146,38 +149,6 @@ def ask_viewpoint(policy: NamedPolicy, viewpoint: Viewpoint, view: FleetView) ->
     return asked
 
 
-class Audit:
-    """Records each change of policy with its reason, and each directive that breaks an invariant."""
-
-    def __init__(self, env: simpy.Environment, recorder: Recorder) -> None:
-        self._env, self._rows = env, recorder.rows
-        self.counts = {"policy_changes": 0, "shield_interventions": 0, "invariant_violations": 0}
-        self.decisions: dict[str, int] = {}
-        """By policy."""
-
-    def totals(self) -> dict[str, float]:
-        """Counts, and decisions by policy as `decisions_of NAME`."""
-        return {**self.counts, **{f"{DECISIONS_OF}{name}": n for name, n in self.decisions.items()}}
-
-    def took_over(self, drone: int, before: str, after: str, reason: str) -> None:
-        """A drone's policy changed."""
-        self.counts["policy_changes"] += 1
-        self._rows["events"].append((self._env.now, drone, "policy", f"{before} → {after}: {reason}"))
-
-    def stepped_in(self, policy: str, directive: Directive) -> None:
-        """The shield replaced a directive, or could not keep an invariant."""
-        self.counts["shield_interventions"] += 1
-        self._write(directive.source, directive.destination, policy, "shield", directive.reason.removeprefix(MARK))
-
-    def broke(self, drone: int, peer: int, policy: str, what: str) -> None:
-        """A directive that goes to the gate breaks an invariant; peer −1: all of a drone's directives together."""
-        self.counts["invariant_violations"] += 1
-        self._write(drone, peer, policy, "broken", what)
-
-    def _write(self, drone: int, peer: int, policy: str, kind: str, what: str) -> None:
-        self._rows["interventions"].append((self._env.now, drone, peer, policy, kind, what))
-
-
 class Pilot:
     """One drone's policy in flight."""
 
@@ -194,7 +165,7 @@ class Pilot:
         Args:
             drone: whose pilot it is.
             plan: the scenario's policies.
-            audit: counts what breaks invariants.
+            audit: records what breaks invariants, and who decides.
             request_viewpoint: takes the viewpoints that the policy chooses; None where no policy of the plan does.
             keep: takes every decision; None keeps none.
         """
@@ -209,6 +180,8 @@ class Pilot:
         self._phase: TaskPhase | None = None
         self._shown: FleetView | None = None
         self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
+        self._fresh: Sequence[Directive] = ()  # of the latest decision, where an invariant asks for it
+        self._replaced: dict[int, Directive] = {}  # by the shield at the gate, by peer
 
     def take_over(self, policy: NamedPolicy, reason: str, place: int) -> None:
         """From the next decision on, `policy` decides; `place` is the change's in the scenario's list."""
@@ -260,31 +233,49 @@ class Pilot:
     def _within_rules(self, view: FleetView, directives: Sequence[Directive]) -> Sequence[Directive]:
         name, audit = self.policy.name, self._audit
         check_directives(directives, view)  # before the rules read them
-        fresh = ask(self.policy, just_heard(view)) if self._asks_fresh else ()
+        self._fresh = ask(self.policy, just_heard(view)) if self._asks_fresh else ()
         if self._shielded:
-            directives = enforce(self._rules, view, directives, fresh)
+            directives = enforce(self._rules, view, directives, self._fresh)
             for d in directives:
                 if d.reason.startswith(MARK):
-                    audit.stepped_in(name, d)
-        for rule in self._rules:
-            for broken in violations(rule, view, directives, fresh):
-                if broken is None:
-                    audit.broke(self.drone, -1, name, f"{rule.text}: {describe_directives(directives)}")
-                else:
-                    audit.broke(self.drone, broken.destination, name, f"{rule.text}: {describe_directives([broken])}")
+                    audit.stepped_in(name, d, "policy")
         return directives
 
+    @property
+    def guard(self) -> Guard | None:
+        """Has the last word on what the gates enforce; None where there are no invariants."""
+        return self._keep_invariants if self._rules else None
+
+    def _keep_invariants(self, view: FleetView, links: Sequence[Steps], cap: Cap) -> Sequence[Directive]:
+        """Judge what the gates are to enforce. With a shield, links are put right within what their ages allow."""
+        damped = [link.damped for link in links]
+        enforced = put_right(self._rules, view, damped, self._fresh, cap) if self._shielded else damped
+        replaced = {d.destination: d for before, d in zip(damped, enforced, strict=True) if d is not before}
+        for peer, directive in replaced.items():
+            if directive != self._replaced.get(peer):
+                self._audit.stepped_in(self.policy.name, directive, "gate")
+        self._replaced = replaced
+        self._audit.judged(self.drone, self.policy.name, judge(self._rules, view, links, enforced, self._fresh))
+        return enforced
+
     def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:
-        """One directive a link; and where ages alone rose since the last view shown, no directive may have risen."""
+        """The invariants; one directive a link; and where ages alone rose since the last view shown, none may have risen."""
+        failed = partial(self._audit.failed, self.drone)
+        for rule in self._rules:
+            for d in violations(rule, shown, directives, self._fresh):
+                failed(
+                    -1 if d is None else d.destination, self.policy.name, rule.text,
+                    describe_directives(directives if d is None else [d]),
+                )  # fmt: skip
         for peer in set(shown.peers) - {d.destination for d in directives}:
-            self._audit.broke(self.drone, peer, self.policy.name, "one directive a link: none for this one")
+            failed(peer, self.policy.name, "one directive a link", "none for this one")
         before, self._last_shown = self._last_shown, (shown, directives)
         if before is None or before[0].descriptors != shown.descriptors:
             return
         if all(shown.age_s[i] >= age_s for i, age_s in before[0].age_s.items()):
             raised = raised_part(before[1], directives)
             if raised is not None:
-                self._audit.broke(self.drone, -1, self.policy.name, f"age-monotone: {raised}")
+                failed(-1, self.policy.name, "age-monotone", raised)
 
 
 def schedule_policies(env: simpy.Environment, plan: PolicyPlan, pilots: Sequence[Pilot], frame_s: float) -> None:

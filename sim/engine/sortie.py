@@ -30,13 +30,14 @@ from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
-from sortie.sim.engine.pilot import Audit, NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
+from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
@@ -194,6 +195,7 @@ def build(
             sealer=None if key is None else Sealer(key, KEY_ID),
             phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
             handshake_bytes=pilots[i].handshake_bytes,
+            guard=pilots[i].guard,
         )
         for i in drones
     ]
@@ -232,6 +234,7 @@ def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Obser
     parts.env.run(until=parts.scenario.duration_s)
     world.drain()
     parts.transport.finish()
+    parts.audit.finish()
     energy_j = parts.batteries.energy_j
     recorder.rows["energy"].extend((i, cause, j) for cause, each in energy_j.items() for i, j in enumerate(each))
     if scorer is not None:

@@ -12,8 +12,12 @@ from sortie.fleet.agent import Agent
 from sortie.fleet.logs.mavlink import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.plane import DroneStatus
+from sortie.policies.catalogue.baselines import silence
 from sortie.policies.contract import Directive, FleetView, PolicyError
+from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.audit import Audit
+from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan
 from sortie.sim.engine.world import at
 from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
@@ -21,11 +25,12 @@ from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
-from sortie.sim.live.policy_process import Begin, PolicyOrders
+from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Failed, Go, Home, Ready
 from sortie.sim.live.rules import phase_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
+from sortie.sim.results.record import Recorder
 
 POLL_S = 0.02
 """How often a process that waits for others looks at its pipe."""
@@ -129,6 +134,13 @@ def _fly(
     # stamps are nanoseconds since 1970, as in ROS 2
     memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
 
+    recorder = Recorder()
+    # The policy decides in a process of its own, and what the gates enforce is judged here. Invariants about what the
+    # policy would decide on fresh descriptors are left to that process.
+    rules_here = tuple(rule for rule in parse(scenario.policy.invariants) if not rule.needs_fresh)
+    named = NamedPolicy(scenario.policy.name, silence)
+    guard = Pilot(drone, PolicyPlan(named, rules=rules_here, shielded=scenario.policy.shield), Audit(clock, recorder))
+
     def decide(view: FleetView) -> Sequence[Directive]:
         node.note_health(view)
         return policy(view)
@@ -145,6 +157,7 @@ def _fly(
         sealer=None,  # the node seals what it writes
         phase_s=orders.begin_s + phase_s,
         handshake_bytes=lambda: policy.handshake_bytes,
+        guard=guard.guard,
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
     if isinstance(senses, MavlinkSenses):
@@ -158,6 +171,7 @@ def _fly(
 
     def send_report() -> None:
         report = node.report(clock.now)
+        report.new.notices.extend(take_notices(recorder))
         pipe.send(
             replace(
                 report, cpu_s=report.cpu_s + policy.cpu_s, fallbacks=policy.fallbacks, policy_restarts=policy.restarts

@@ -17,7 +17,8 @@ from typing import NamedTuple
 from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation, check_directives
 from sortie.policies.registry import describe_error
 from sortie.scenarios.schema import PolicySection
-from sortie.sim.engine.pilot import Audit, Pilot, plan_of, schedule_policies
+from sortie.sim.engine.audit import Audit
+from sortie.sim.engine.pilot import Pilot, plan_of, schedule_policies
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.reports import Notice
 from sortie.sim.results.record import Recorder
@@ -91,7 +92,7 @@ def serve(orders: PolicyOrders, pipe: Connection) -> None:
                 decision._replace(
                     cpu_s=time.process_time() - began_s,
                     handshake_bytes=pilot.handshake_bytes(),
-                    notices=_take_notices(recorder),
+                    notices=take_notices(recorder),
                 )
             )
     except (EOFError, BrokenPipeError, ConnectionResetError):
@@ -118,7 +119,7 @@ def _plain(d: Directive) -> Directive:
     )  # fmt: skip
 
 
-def _take_notices(recorder: Recorder) -> tuple[Notice, ...]:
+def take_notices(recorder: Recorder) -> tuple[Notice, ...]:
     """What the audit wrote since the last call."""
     rows = recorder.rows
     notices = [Notice(t_s, drone, text) for t_s, drone, _, text in rows["events"]]

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
+from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.transmission import Status
 from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
-from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, SortieRecord
+from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, VIOLATIONS_OF, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.tracking_outcome import tracking_outcome
 
@@ -94,6 +95,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "changes": totals["policy_changes"],
             "shield_interventions": totals["shield_interventions"],
             "invariant_violations": totals["invariant_violations"],
+            "violated_ticks": totals["violated_ticks"],
+            "violations_by_cause": {c.replace(" ", "_"): totals[f"{VIOLATIONS_OF}{c}"] for c in CAUSES},
         },
         "switches": sum(len(c["peers"]) for c in changes) / (links * minutes) if links else None,
         "transitions": changes,

@@ -113,11 +113,26 @@ class Drone(TypedDict):
     energy_j: Annotated[float, "Spent to the very end, all causes."]
 
 
+class Violations(TypedDict):
+    policy: Annotated[int, "The policy's decision, after its shield."]
+    staleness: Annotated[int, "The caps on links to peers with old descriptors."]
+    damping: Annotated[int, "A link that waited for its dwell time."]
+    no_peer: Annotated[int, "No peer was attached, and the line is over all links."]
+
+
 class Policies(TypedDict):
     decisions: Annotated[dict[str, int], "By policy."]
     changes: Annotated[int, "How often a drone's policy was replaced in flight."]
-    shield_interventions: Annotated[int, "Directives that the shield replaced, or could not put right."]
-    invariant_violations: Annotated[int, "Directives that broke an invariant all the same."]
+    shield_interventions: Annotated[
+        int,
+        "Directives of policies that the shield replaced or could not put right, and changes that it made at gates.",
+    ]
+    invariant_violations: Annotated[
+        int,
+        "Violations of invariants by what the gates enforced, after staleness rules and damping; one that lasts counts once.",
+    ]
+    violated_ticks: Annotated[int, "Decisions of all drones at which the enforced directives broke an invariant."]
+    violations_by_cause: Annotated[Violations, "`invariant_violations`, by the step that broke the line."]
 
 
 Transition = TypedDict(

@@ -29,6 +29,8 @@ from sortie.sim.identity import release_of
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
 """Prefix of the totals that count each policy's decisions."""
+VIOLATIONS_OF = "violations_of "
+"""Prefix of the totals that count violations by cause."""
 HANDSHAKE = "handshake"
 """The `representation` of transmissions that carry a method's requests and answers, and no payload."""
 _LINKS = {link: link.name.lower() for link in LinkHealth}
@@ -54,6 +56,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         policy=S,
     ),
     "interventions": dict(t_s=F, drone=I, peer=I, policy=S, kind=S, text=S),
+    "violations": dict(t_s=F, until_s=F, drone=I, peer=I, policy=S, cause=S, line=S, text=S),
     "transmissions": dict(
         t_sent_s=F, drone=I, peer=I, representation=S, captured_s=F, rho=F, cells=I, boxes=I, index_bytes=I,
         payload_bytes=I, wire_bytes=I, deadline_s=F, t_start_s=F, t_done_s=F, status=S, reason=S, fragments=I,
@@ -84,8 +87,11 @@ ABOUT = {
     "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, Mb/s; 0 is unknown, at most 2⁻¹⁰ is silent, at most 2⁻⁹ has no payload lately but descriptors arrive.",
     "drops": "A descriptor refused at a receiver, with the reason.",
     "directives": "A change of what a gate enforces, with the reason that decided it.",
-    "interventions": 'A directive that the shield replaced ("shield"), or that breaks an invariant all the same '
-    '("broken"); peer −1: all of a drone\'s together.',
+    "interventions": "A directive that the shield replaced, or could not put right: `kind` is `policy` for each of the "
+    "policy's output, and `gate` for each change of what the shield makes of the enforced state.",
+    "violations": "A time in which the directives that a drone's gates enforce break an invariant; from the first to the last "
+    "decision at which they did. Peer −1: its links together. `cause` is the step that broke the line: `policy`, `staleness`, "
+    "`damping`, or `no peer` (a line over all links while no peer is attached).",
     "transmissions": "A payload handed to the radio, with its fate. `partial`: some of its tiles arrived, "
     "`arrived_bytes` of it. The reason `other_feature_space`: delivered feature maps that the receiver's network cannot fuse.",
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
