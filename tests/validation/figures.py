@@ -418,6 +418,12 @@ def _coverage() -> Tables:
     return {"coverage": compare_coverage.table()}
 
 
+def _mixed_fleet() -> Tables:
+    import mixed_fleet
+
+    return mixed_fleet.tables(range(1, 21))
+
+
 def _hysteresis() -> Tables:
     from sortie.sim.engine.sortie import run_sortie
     from sortie.sim.results.outcome import outcome
@@ -527,6 +533,7 @@ def speed_table(benchmarks: Sequence[Mapping[str, Any]]) -> Table:
 
 FIGURES: dict[str, Figure] = {
     "hysteresis": Figure(0.2, _hysteresis),
+    "mixed_fleet": Figure(1, _mixed_fleet),
     "overhead": Figure(0.5, _overhead, timed=True),
     "energy": Figure(0.5, _energy),
     "flight": Figure(0.5, _flight),
