@@ -150,6 +150,7 @@ def test_honest_traces_are_not_doubted(tmp_path: Path) -> None:
     asked = [
         "perception.detector=none",
         "duration_s=60",
+        "policy.hysteresis=0",
         "fleet.drones=4",
         f"fleet.trace={drones}",
         f"radio.trace={links}",

@@ -342,7 +342,8 @@ def test_headrooms_are_of_the_work_of_the_last_second_and_not_of_the_radio() -> 
     """From a full map in each direction and frame of four links, by hand; and from silence, perception resting or not."""
 
     def published(policy: Callable[[FleetView], list[Directive]], *sets: str) -> list[tuple[float, float]]:
-        rows = run_sortie(example("duration_s=3", *sets), policy).tables["descriptors"].to_pylist()
+        raw = ("duration_s=3", "policy.hysteresis=0")
+        rows = run_sortie(example(*raw, *sets), policy).tables["descriptors"].to_pylist()
         return [(d["cpu_headroom"], d["gpu_headroom"]) for d in rows if d["drone"] == 0 and d["t_s"] > 1.5]
 
     def saying(**decided: object) -> Callable[[FleetView], list[Directive]]:
