@@ -27,6 +27,7 @@ from sortie.perception.motion import Tracks
 from sortie.perception.types import Capture
 from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import (
+    PERSON_FLAG,
     Descriptor,
     Directive,
     Disc,
@@ -56,6 +57,8 @@ class Task(NamedTuple):
     phase: TaskPhase
     region: Disc | None
     target_ids: tuple[int, ...] = ()
+    person_in_region: bool = False
+    """Whether its own thermal camera found a person in the region lately."""
 
 
 class Senses(Protocol):
@@ -86,6 +89,7 @@ class AgentLog(Protocol):
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None: ...
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None: ...
+    def alert(self, t_s: float, drone: int, known: bool) -> None: ...
 
 
 Guard = Callable[[FleetView, Sequence[Steps], Cap], Sequence[Directive]]
@@ -160,6 +164,7 @@ class Agent:
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
+        self._alert = False  # whether it knows of a person in its region
         self._published: Descriptor | None = None
         self._chart = Chart()
         self._clock_off_s = 0.0
@@ -217,7 +222,7 @@ class Agent:
         capture, velocity_mps, footprint_m, here = sensed
         grid, novel = self._covered(capture.t_s, here, due)
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
-        phase, region, target_ids = self._senses.task()
+        phase, region, target_ids, person = self._senses.task()
         descriptor = Descriptor(
             # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
             stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
@@ -231,7 +236,7 @@ class Agent:
             gpu_headroom=gpu_headroom,
             peer_goodput_mbps=self.memory.probes.fill(self.drone, self._modem.goodput_mbps(), self._env.now),
             coverage_grid=grid,
-            novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids),
+            novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids) + PERSON_FLAG * person,
             task_phase=phase,
             region=region,
             priority_target_ids=target_ids,
@@ -279,6 +284,9 @@ class Agent:
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
         view = self.memory.view(now_s)
+        if self._rules.people and view.human_in_region != self._alert:
+            self._alert = not self._alert
+            self._log.alert(now_s, me, self._alert)
         begin_ns = time.perf_counter_ns()
         directives = self._policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns

@@ -25,6 +25,8 @@ class PlaneRules:
     """Features are sent as tiles of at most this size. None sends them as one sample."""
     trust: bool = False
     """Whether drones check the claims of their peers (`sortie.fleet.trust`)."""
+    people: bool = False
+    """Whether drones have thermal cameras, so that what they know of people is logged."""
     publish_every: int = 1
     """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL

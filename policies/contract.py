@@ -24,6 +24,8 @@ from sortie.scenarios.link_state import LinkState as LinkState
 from sortie.scenarios.link_state import state_of
 from sortie.scenarios.representation import Representation as Representation
 
+PERSON_FLAG = 4
+"""Of a descriptor's `novelty_flags`: the publisher's thermal camera found a person in its region of responsibility."""
 COVERAGE_CELLS = 16
 """The coverage grid is 16 × 16 cells of two bits, north-aligned, centred on the drone."""
 COVERAGE_CELL_M = 12.8
@@ -137,6 +139,17 @@ class FleetView(NamedTuple):
         """Ids of the other drones heard, ascending."""
         ego = self.ego
         return tuple([i for i in sorted(self.descriptors) if i != ego])
+
+    @property
+    def human_in_region(self) -> bool:
+        """Whether the ego has a region and knows of a person there: by its own thermal camera, or by an attached peer's flag.
+
+        A peer's flag is about the peer's region. It counts for the ego too where the two have different regions.
+        """
+        me = self.me
+        if me is None or me.region is None:
+            return False
+        return any(d.novelty_flags & PERSON_FLAG for d in self.attached.descriptors.values())
 
     @property
     def attached(self) -> FleetView:

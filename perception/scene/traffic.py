@@ -115,7 +115,7 @@ def lanes(scene: Scene, rect: tuple[float, float, float, float]) -> Lanes:
 
 @dataclass(frozen=True, slots=True)
 class TargetPath:
-    """The target's path by arc length: `at_s_m` [k] distances of `points_m` [k] (x, y), `yaw_rad` [k − 1] of its legs."""
+    """A target's or a person's path by arc length: `at_s_m` [k] distances of `points_m` [k] (x, y), `yaw_rad` [k − 1] of its legs."""
 
     points_m: list[tuple[float, float]]
     at_s_m: list[float]

@@ -89,8 +89,13 @@ WORDS: dict[str, Word] = {
     "region": _view_word("the ego has a region of responsibility", lambda s: s.me.region is not None, "truth"),
     "targets": _view_word("the ego reports priority targets", lambda s: bool(s.me.priority_target_ids), "truth"),
     "target_in_region": _view_word(
-        "the ego has a region and reports targets; a descriptor does not say what they are, people or cars",
+        "the ego has a region and reports targets, which are cars",
         lambda s: s.me.region is not None and bool(s.me.priority_target_ids),
+        "truth",
+    ),
+    "human_in_region": _view_word(
+        "the ego has a region, and its thermal camera or an attached peer's found a person there",
+        lambda s: s.view.human_in_region,
         "truth",
     ),
     "goodput_mbps": _of_peer("to the link's peer, as the ego measured it", lambda s, p: s.me.goodput_to(p)),

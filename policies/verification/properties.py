@@ -9,6 +9,7 @@ PROMISES: dict[str, str] = {
         when goodput_mbps < 5: representation <= detections and rate_hz <= 2
         when phase == track and region and representation > none: roi
         when target_in_region and peers >= 1: any_link(representation >= detections and rate_hz >= 2)
+        when human_in_region and peers >= 1: any_link(representation >= detections and rate_hz >= 2)
         count_links(representation > none) <= 2
         representation <= features
         rate_hz <= fresh.rate_hz

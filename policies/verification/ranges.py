@@ -15,7 +15,7 @@ from sortie.scenarios.disc import disc_overlap
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8
-"""The bits of a descriptor's novelty flags; the plane uses two of them."""
+"""The bits of a descriptor's novelty flags; the plane uses three of them."""
 _SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
 

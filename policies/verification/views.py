@@ -82,7 +82,7 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
         gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         peer_goodput_mbps=tuple(_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(drones - 1)),
         coverage_grid=rng.bytes(COVERAGE_BYTES) if rng.random() < 0.7 else bytes(COVERAGE_BYTES),
-        novelty_flags=int(rng.integers(4)),
+        novelty_flags=int(rng.integers(8)),
         task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
         region=region,
         priority_target_ids=tuple(rng.integers(0, 1000, int(rng.choice([0, 0, 1, 5]))).tolist()),

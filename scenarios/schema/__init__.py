@@ -37,7 +37,7 @@ from sortie.scenarios.schema.fleet import (
     Viewpoints,
 )
 from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
-from sortie.scenarios.schema.perception import Perception, Scene
+from sortie.scenarios.schema.perception import Perception, Person, Scene, Thermal
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import MIN_TILE_BYTES, Bursts, Radio
 from sortie.scenarios.schema.record import RecordSection
@@ -75,6 +75,7 @@ __all__ = [
     "Mission",
     "Motion",
     "Perception",
+    "Person",
     "Phase",
     "PhaseName",
     "PointM",
@@ -92,6 +93,7 @@ __all__ = [
     "Soc",
     "Spoof",
     "Target",
+    "Thermal",
     "Viewpoints",
     "ViewReplay",
 ]

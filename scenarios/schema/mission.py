@@ -11,9 +11,7 @@ from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, So
 
 
 class Target(Section):
-    waypoints_m: tuple[PointM, ...] = Field(
-        min_length=1, max_length=1000, description="Path of the target car, ENU (x, y)."
-    )
+    waypoints_m: tuple[PointM, ...] = Field(min_length=1, max_length=1000, description="Path, ENU (x, y).")
     speed_mps: float = Field(5.0, gt=0, le=40, description="Speed of the target car.")
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from sortie.scenarios.schema.base import Section, inconsistent
+from sortie.scenarios.schema.mission import Target
 
 
 class Scene(Section):
@@ -26,6 +27,29 @@ class Scene(Section):
     sun_elevation_deg: float = Field(56.9, ge=20, le=90, description="How high it stands; low suns cast long shadows.")
     overcast: float = Field(0.0, ge=0, le=1, description="Cloud: 0 casts dark shadows, 1 casts none.")
     brightness: float = Field(1.0, ge=0.1, le=1.5, description="Exposure: a factor on every image.")
+
+
+class Person(Target):
+    """Walks from `begin_s` on; stands before, and at the end of the way."""
+
+    speed_mps: float = Field(1.4, gt=0, le=10, description="Walking speed.")
+    begin_s: float = Field(0.0, ge=0, description="When the person begins to walk.")
+
+
+class Thermal(Section):
+    """A declared sensor model (`perception/thermal.py`); its defaults are assumptions, not measurements."""
+
+    field_of_view_deg: float = Field(70.0, gt=0, lt=170, description="Full angle of its cone, straight down.")
+    near_probability: float = Field(0.9, ge=0, le=1, description="Probability of finding a near person in one frame.")
+    half_range_m: float = Field(90.0, gt=0, le=2000, description="Distance at which that probability is halved.")
+    range_width_m: float = Field(12.0, gt=0, le=500, description="Over which distance the probability falls.")
+    false_alarms_per_min: float = Field(0.05, ge=0, le=600, description="False alarms of a drone a minute.")
+    position_error_m: float = Field(
+        1.0, ge=0, le=50, description="Standard deviation of a person's place, along each axis."
+    )
+    remembers_s: float = Field(
+        3.0, gt=0, le=600, description="So long after a detection a drone takes the person to be there."
+    )
 
 
 class Perception(Section):
@@ -84,6 +108,10 @@ class Perception(Section):
     unsent_cells: Literal["masked", "zero"] = Field(
         "masked",
         description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
+    )
+    people: tuple[Person, ...] = Field((), max_length=100, description="People who walk about.")
+    thermal: Thermal | None = Field(
+        None, description="A thermal camera on every drone, which finds people; left out, nobody finds them."
     )
     scene: Scene = Scene()
 

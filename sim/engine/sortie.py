@@ -37,6 +37,7 @@ from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
+from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
@@ -158,7 +159,8 @@ def build(
     scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
     plan = MissionPlan(mission, len(drones))
     clocks = oscillators(scenario.fleet.clock, len(drones), seed, replication)
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks)
+    people = People(scenario, scene, recorder, (seed, replication))
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks, people)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)
@@ -287,6 +289,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         compute_delay_s=scenario.perception.compute_delay_s,
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=context.trust,
+        people=scenario.perception.thermal is not None,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
     )

@@ -34,6 +34,7 @@ from sortie.radio import Air
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.people import People
 from sortie.sim.engine.tracking import FleetTracking
 from sortie.sim.results.record import Recorder
 
@@ -99,6 +100,7 @@ class World:
         plan: MissionPlan,
         recorder: Recorder,
         oscillators: Sequence[Oscillator],
+        people: People,
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
             env, motion, batteries, air, scene, plan,
@@ -107,7 +109,7 @@ class World:
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
         """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
-        self.oscillators = oscillators
+        self.oscillators, self.people = oscillators, people
         self._clocks = [each.at_start(scenario.fleet.clock.gnss) for each in oscillators]
         self._read_clocks()
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
@@ -295,6 +297,7 @@ class World:
                 airborne,
             )
         )
+        self.people.write(now_s)
         for group, (phase, region, target, target_xy) in self.now.items():
             rows["mission"].append((now_s, group, phase, *(region or _NO_DISC), target, *(target_xy or _NOWHERE)))
 
@@ -345,6 +348,7 @@ class OwnSenses:
 
     def sense(self, frame: int) -> Sensed:
         self._sensed = self._world.sensed(self._drone, frame)
+        self._world.people.look(self._sensed.capture, frame)
         return self._sensed
 
     def platform(self) -> Platform:
@@ -355,7 +359,9 @@ class OwnSenses:
         if self._drone in world.homebound:
             return Task(TaskPhase.LANDING, None)
         now = world.now[world.plan.group_of[self._drone]]
-        return now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
+        task = now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
+        person = world.people.known_in(self._drone, task.region, now_s)
+        return task._replace(person_in_region=True) if person else task
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         if self._count_boxes is not None:

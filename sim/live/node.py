@@ -224,6 +224,9 @@ class LiveNode:
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
         self._new.notices.append(Notice(t_s, drone, text))
 
+    def alert(self, t_s: float, drone: int, known: bool) -> None:
+        self._new.notices.append(Notice(t_s, drone, "knows of a person in its region" if known else "knows of nobody"))
+
     # --- what comes in ---------------------------------------------------------------------------
 
     def _on_descriptor(self, cdr: bytes) -> None:

@@ -20,6 +20,7 @@ from sortie.radio.transmission import Status
 from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
+from sortie.sim.results.people_outcome import people_outcome
 from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, VIOLATIONS_OF, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.tracking_outcome import tracking_outcome
@@ -67,6 +68,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         },
         "tracking": tracking_outcome(record),
         "mission": mission_outcome(record),
+        "people": people_outcome(record),
         "bytes": {
             "context_sent": int(context_bytes),
             "context_descriptors": int(totals["context_descriptor_bytes"]),

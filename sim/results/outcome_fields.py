@@ -92,6 +92,29 @@ class MissionOutcome(TypedDict):
     ]
 
 
+class PeopleOutcome(TypedDict):
+    ap_2m: Annotated[
+        float | None,
+        "AP of people, pooled over drones and frames: what a drone's thermal camera reports, against everybody in its cone, "
+        "hidden or not. A detection may be of a person within 2 m of it. `ap50` is the AP of cars.",
+        SHARE,
+    ]
+    in_region_drone_s: Annotated[
+        float | None, "Time in which a person truly was in a flying drone's region, summed over drones, s."
+    ]
+    unknown_share: Annotated[
+        float | None,
+        "Share of that time, 0 … 1, in which the drone did not know it, from its own camera or from attached peers.",
+        SHARE,
+    ]
+    unknown_longest_s: Annotated[float | None, "Longest unbroken time of one drone in which it did not know it, s."]
+    false_alert_share: Annotated[
+        float | None,
+        "Share of the time in which a drone had a region and nobody was there, 0 … 1, in which it took somebody to be there.",
+        SHARE,
+    ]
+
+
 class Bytes(TypedDict):
     context_sent: Annotated[int, "Descriptors and directives."]
     context_descriptors: Annotated[int, "Descriptors as sent, 28 B of authentication included."]
@@ -222,6 +245,7 @@ class Outcome(TypedDict):
     mission: Annotated[
         MissionOutcome, "The mission of the whole fleet; null where there is no region, no target or no detector."
     ]
+    people: Annotated[PeopleOutcome, "People and thermal cameras; null without both, and where nobody was in a region."]
     bytes: Annotated[Bytes, "What was sent."]
     context_share: Annotated[float | None, "Context bytes over all bytes.", SHARE]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]

@@ -71,6 +71,9 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     "mission": dict(
         t_s=F, group=I, phase=S, region_x_m=F, region_y_m=F, region_radius_m=F, target=I, target_x_m=F, target_y_m=F,
     ),
+    "people": dict(t_s=F, person=I, x_m=F, y_m=F),
+    "sightings": dict(t_s=F, drone=I, x_m=F, y_m=F, score=F, person=I),
+    "alerts": dict(t_s=F, drone=I, known=B),
     "medium": dict(t_s=F, busy_fraction=F, connected_drones=I),
     "topology": dict(
         t_s=F, connected=B, cut_drones=pa.list_(I), bottleneck_sender=I, bottleneck_receiver=I, bottleneck_mbps=F,
@@ -101,6 +104,10 @@ ABOUT = {
     "same at all times; −1 where the detector does not know.",
     "mission": "The mission of a group of drones in a frame: 0 are those in no group, k those of `mission.groups[k - 1]`. NaN "
     "where there is no region or target; `target` is the car's id, −1 without one.",
+    "people": "Where a person is in a frame, ENU.",
+    "sightings": "What a drone's thermal camera took for a person, where the drone places it, ENU; `score` is the probability "
+    "of finding a person at that distance, `person` −1 a false alarm.",
+    "alerts": "A drone begins or ceases to know of a person in its region, from its own thermal camera or its peers.",
     "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "
     "drones have a usable link. What follows the last row is in `medium_busy_fraction` alone.",
     "topology": "Once a second where payloads are relayed: whether all drones reach all, who is outside the largest such "
@@ -264,6 +271,10 @@ class AgentNotes:
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
         """Something that a drone found out."""
         self._rows["events"].append((t_s, drone, kind, text))
+
+    def alert(self, t_s: float, drone: int, known: bool) -> None:
+        """A drone begins or ceases to know of a person in its region."""
+        self._rows["alerts"].append((t_s, drone, known))
 
     def totals(self) -> dict[str, float]:
         """Context-plane bytes: descriptors on the air, directives to the gates."""

@@ -98,6 +98,7 @@ def test_units_stand_in_names() -> None:
         "number_bits",
         "confidence",
         "moving_cars_per_km",
+        "near_probability",
         "relay_max_hops",
         "good_to_bad",
         "bad_to_good",

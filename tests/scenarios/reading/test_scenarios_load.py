@@ -69,7 +69,10 @@ def test_a_missing_file_names_what_was_probably_meant(tmp_path: Path) -> None:
         (tmp_path / "valey.yaml", "did you mean valley.yaml?"),
         ("track_targt", "did you mean track_target?"),
         ("link_batery", "did you mean link_battery?"),  # a campaign
-        ("zzz.yaml", "the library has paper_context, paper_replay, search_grid, track_target, two_makes"),
+        (
+            "zzz.yaml",
+            "the library has paper_context, paper_replay, person_crossing, search_grid, track_target, two_makes",
+        ),
     ):
         with pytest.raises(ScenarioError) as caught:
             load(name)
@@ -360,7 +363,14 @@ def test_a_library_scenario_loads_and_comes_back(name: str) -> None:
 
 
 def test_the_library_is_what_the_design_names() -> None:
-    assert sorted(library()) == ["paper_context", "paper_replay", "search_grid", "track_target", "two_makes"]
+    assert sorted(library()) == [
+        "paper_context",
+        "paper_replay",
+        "person_crossing",
+        "search_grid",
+        "track_target",
+        "two_makes",
+    ]
 
 
 @pytest.mark.parametrize("name", ["track_target", "paper_replay"])

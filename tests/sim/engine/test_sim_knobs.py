@@ -47,6 +47,8 @@ FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radi
 OTHER = "mission.more_targets=[{waypoints_m: [[0, 0], [60, 0]], speed_mps: 3}]"
 GROUP = "mission.groups=[{drones: [1, 2], phases: [{phase: search}, {at_s: 2, phase: track, target: 1, region: {radius_m: 32}}]}]"
 TRACK = "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]"
+CROSSES = "perception.people=[{waypoints_m: [[0, -8], [0, 0]]}]"
+WARM = "perception.thermal={remembers_s: 1}"
 HOVER = "fleet.route.waypoints_m=[[0, 0]]"
 TURN = "fleet.route.waypoints_m=[[-20, 0], [0, 0], [0, 60]]"
 
@@ -227,6 +229,16 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.detector": ("torch", ("duration_s=4",)),
     "perception.compute_delay_s": ("0.05", ()),
     "perception.tracking_rate_hz": ("5", (TRACK,)),
+    "perception.people.waypoints_m": ("[[3, -8], [3, 0]]", (CROSSES,)),
+    "perception.people.speed_mps": ("2", (CROSSES,)),
+    "perception.people.begin_s": ("2", (CROSSES,)),
+    "perception.thermal.field_of_view_deg": ("10", (CROSSES, WARM)),
+    "perception.thermal.near_probability": ("0.2", (CROSSES, WARM)),
+    "perception.thermal.half_range_m": ("60", (CROSSES, WARM)),
+    "perception.thermal.range_width_m": ("40", (CROSSES, WARM)),
+    "perception.thermal.false_alarms_per_min": ("60", (CROSSES, WARM)),
+    "perception.thermal.position_error_m": ("4", (CROSSES, WARM)),
+    "perception.thermal.remembers_s": ("0.2", (CROSSES, WARM)),
     "policy.name": ("deputies", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),
@@ -324,6 +336,7 @@ def place(field: str, shared: tuple[str, ...]) -> str:
     return (
         field.replace("fleet.overrides.", "fleet.overrides.0.")
         .replace("fleet.makes.", "fleet.makes.0.")
+        .replace("perception.people.", "perception.people.0.")
         .replace("mission.groups.phases.", "mission.groups.phases.1.")
         .replace("mission.groups.", "mission.groups.0.")
         .replace("mission.more_targets.", "mission.more_targets.0.")

@@ -1,0 +1,114 @@
+"""Figures about people: what the thermal cameras found, and how well drones knew of people in their regions.
+
+`sortie.sim.results.outcome_fields.PeopleOutcome` defines each of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from sortie.perception.metrics.ap import Matched, average_precision, hits
+from sortie.perception.thermal import in_cone
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.regions import Regions
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+NEAR_M = 2.0
+"""A detection within this distance of a person may be of that person: a box half a metre wide has no useful overlap."""
+_INSTANT_S = 1e-6
+
+
+def people_outcome(record: SortieRecord) -> dict[str, float | None]:
+    """The section `people` of the outcome."""
+    perception = record.scenario.perception
+    if not perception.people and perception.thermal is None:
+        return dict.fromkeys(("ap_2m", "in_region_drone_s", "unknown_share", "unknown_longest_s", "false_alert_share"))
+    n, frame_s = record.scenario.fleet.drones, record.scenario.frame_s
+    states = record.tables["states"]
+    t_s = states["t_s"].to_numpy()[::n]
+    flying = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
+    people_m = _people(record.tables["people"], len(t_s), len(perception.people))
+    discs = Regions(record.tables["mission"], record.scenario.mission).at(
+        np.repeat(t_s, n), np.tile(range(n), len(t_s))
+    )
+    discs = discs.reshape(-1, n, 3)
+    away_m = np.linalg.norm(people_m[:, None] - discs[:, :, None, :2], axis=-1)  # [T, N, people]
+    present = (away_m <= discs[:, :, None, 2]).any(axis=-1) & flying
+    known = _known(record.tables["alerts"], t_s, n, frame_s) & flying
+    without = flying & ~np.isnan(discs[..., 2]) & ~present
+    return {
+        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
+        "in_region_drone_s": float(present.sum()) * frame_s,
+        "unknown_share": _share(present & ~known, present),
+        "unknown_longest_s": _longest(present & ~known) * frame_s if present.any() else None,
+        "false_alert_share": _share(without & known, without),
+    }
+
+
+def _share(part: Bools, whole: Bools) -> float | None:
+    return float(part.sum() / whole.sum()) if whole.any() else None
+
+
+def _longest(what: Bools) -> int:
+    """The longest unbroken run of frames of any drone; `what` [T, N]."""
+    run, longest = np.zeros(what.shape[1], np.int64), 0
+    for row in what:
+        run = np.where(row, run + 1, 0)
+        longest = max(longest, int(run.max()))
+    return longest
+
+
+def _people(table: pa.Table, frames: int, people: int) -> Floats:
+    """[T, people, 2]"""
+    xy = np.column_stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()])
+    return xy.reshape(frames, people, 2)
+
+
+def _known(alerts: pa.Table, t_s: Floats, drones: int, frame_s: float) -> Bools:
+    """Whether each drone knew of a person at its decision in each frame, [T, N]."""
+    out = np.zeros((len(t_s), drones), bool)
+    at_s, whose, known = (alerts[c].to_numpy(zero_copy_only=False) for c in ("t_s", "drone", "known"))
+    for drone in range(drones):
+        mine = whose == drone
+        # a drone decides within the frame
+        last = np.searchsorted(at_s[mine], t_s + frame_s - _INSTANT_S, side="right") - 1
+        out[:, drone] = np.concatenate([known[mine].astype(bool), [False]])[last]  # −1: none yet
+    return out
+
+
+def _average_precision(record: SortieRecord, t_s: Floats, flying: Bools, people_m: Floats) -> float | None:
+    """AP of the sightings of each drone and frame, by distance on the ground."""
+    camera = record.scenario.perception.thermal
+    assert camera is not None  # noqa: S101 (the caller asks for a camera's)
+    n = flying.shape[1]
+    states, table = record.tables["states"], record.tables["sightings"]
+    position = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m")], axis=-1).reshape(-1, n, 3)
+    frame = np.searchsorted(t_s, table["t_s"].to_numpy() - _INSTANT_S)
+    image = frame * n + table["drone"].to_numpy()
+    spots = np.column_stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()])
+    score: Any = table["score"].to_numpy()
+    of_image: dict[int, list[int]] = {}
+    for k, key in enumerate(image.tolist()):
+        of_image.setdefault(key, []).append(k)
+    matched = []
+    for key in range(len(t_s) * n):
+        at, drone = divmod(key, n)
+        found = np.array(of_image.get(key, []), np.int64)
+        truth = (
+            people_m[at][in_cone(people_m[at], position[at, drone], camera)] if flying[at, drone] else people_m[:0, 0]
+        )
+        if not len(found) and not len(truth):
+            continue
+        found = found[np.argsort(-score[found], kind="stable")]
+        away_m = np.linalg.norm(spots[found][:, None] - truth[None], axis=-1)
+        i, j = np.nonzero(away_m <= NEAR_M)
+        matched.append(Matched(score[found], hits(len(found), i, j, -away_m[i, j]), len(truth)))
+    if not any(m.truths for m in matched):
+        return None
+    return average_precision(matched)
