@@ -73,7 +73,7 @@ def test_the_worked_policy_passes_and_leaves_nothing(tmp_path: Path, capsys: pyt
     assert command("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
     assert "when battery < 0.6: rate_hz <= 5" in printed
-    assert printed.count("proved") == 10
+    assert printed.count("proved") == 11
     assert list(tmp_path.iterdir()) == []
 
 
