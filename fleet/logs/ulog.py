@@ -131,4 +131,5 @@ def _dtype(formats: Mapping[str, str], name: str, nested: bool = False) -> np.dt
             if binary is None:
                 return None
         fields.append((field, binary, (int(count),)) if count else (field, binary))
-    return np.dtype(fields) if fields else None
+    names = {field for field, *_ in fields}
+    return np.dtype(fields) if fields and len(names) == len(fields) else None

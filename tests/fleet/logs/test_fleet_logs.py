@@ -246,6 +246,13 @@ def test_a_charge_that_rises_is_held(tmp_path: Path) -> None:
     assert any(problem.startswith("the charge rises by up to 17.9%") for problem in log.problems)
 
 
+def test_a_format_with_two_fields_of_one_name_describes_no_topic() -> None:
+    damaged = WHOLE["ulg"].replace(b"float x;", b"float y;")
+    assert damaged != WHOLE["ulg"]
+    found = read_ulog(damaged)
+    assert any("of topics that the log does not describe" in problem for problem in found.problems)
+
+
 @settings(max_examples=60)
 @given(st.sampled_from(sorted(WHOLE)), st.data())
 def test_no_damage_stops_a_reader(kind: str, data: st.DataObject) -> None:
