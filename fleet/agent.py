@@ -224,7 +224,6 @@ class Agent:
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids, person = self._senses.task()
         descriptor = Descriptor(
-            # A clock may be skewed below zero at the very begin; the wire's nanoseconds are unsigned.
             stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
             agent_id=self.drone,
             position_m=capture.est_position_m,

@@ -219,6 +219,8 @@ class FleetBatteries:
 
     def take_off(self, drone: int) -> None:
         """Put a drone into the air, unless its charge would land it at once."""
+        if drone in self._traces:
+            self._spend_recorded(drone)
         self.landed[drone] = self.soc[drone] <= self._packs[drone].landing_soc
         self.landing_reason[drone] = self._charge(drone) if self.landed[drone] else ""
 
@@ -249,12 +251,7 @@ class FleetBatteries:
     def _follow(self, drone: int, dt_s: float) -> None:
         """Charge, voltage and current as the trace has them; what was spent is one cause of the ledger."""
         trace, now_s = self._traces[drone], self._now_s
-        left_j = self._full_j[drone] * self._kept[drone] * trace.energy_fraction_at(now_s)
-        spent_j = max(0.0, self.energy_left_j[drone] - left_j)
-        self.energy_left_j[drone] -= spent_j
-        self.energy_j[RECORDED][drone] += spent_j
-        self.current_a[drone] = 0.0
-        self._read_off(drone)
+        spent_j = self._spend_recorded(drone)
         voltage_v = trace.voltage_at(now_s)
         if voltage_v is not None:
             self.voltage_v[drone] = voltage_v
@@ -262,6 +259,16 @@ class FleetBatteries:
         self.current_a[drone] = spent_j / dt_s / self.voltage_v[drone] if current is None else current
         if self.soc[drone] <= self._packs[drone].landing_soc:
             self.land(drone)
+
+    def _spend_recorded(self, drone: int) -> float:
+        """Take what the trace says was spent by now, J, since the last call."""
+        left_j = self._full_j[drone] * self._kept[drone] * self._traces[drone].energy_fraction_at(self._now_s)
+        spent_j = max(0.0, self.energy_left_j[drone] - left_j)
+        self.energy_left_j[drone] -= spent_j
+        self.energy_j[RECORDED][drone] += spent_j
+        self.current_a[drone] = 0.0
+        self._read_off(drone)
+        return spent_j
 
     def _read_off(self, drone: int) -> None:
         """Charge, and the voltage at the present current, from the energy left."""

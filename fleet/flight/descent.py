@@ -1,4 +1,4 @@
-"""A drone that goes home: it follows the formation's way and descends to the ground."""
+"""A drone that goes home follows the formation's way and descends to the ground; one that comes back flies level again."""
 
 from __future__ import annotations
 
@@ -17,14 +17,32 @@ def descending(flown: Trajectories, drone: int, frame: int, descent_mps: float) 
         descent_mps: rate of descent, down to the ground at height 0.
     """
     time_s, rest = flown.time_s, slice(frame, None)
-    lower_m = descent_mps * (time_s[rest] - time_s[frame])
     position, believed, velocity = (
         getattr(flown, name).copy() for name in ("position_m", "est_position_m", "velocity_mps")
     )
-    for place in (position, believed):
-        place[rest, drone, 2] = np.maximum(0.0, place[rest, drone, 2] - lower_m)
-    velocity[rest, drone, 2] = np.where(position[rest, drone, 2] > 0.0, velocity[rest, drone, 2] - descent_mps, 0.0)
-    after = replace(flown, position_m=position, est_position_m=believed, velocity_mps=velocity)
+    level_m = flown.position_m[rest, drone, 2]
+    height_m = np.maximum(0.0, level_m[0] - descent_mps * (time_s[rest] - time_s[frame]))
+    position[rest, drone, 2] = height_m
+    believed[rest, drone, 2] += height_m - level_m  # keeps its error
+    velocity[rest, drone, 2] = np.where(height_m > 0.0, -descent_mps, 0.0)
+    return _frozen(replace(flown, position_m=position, est_position_m=believed, velocity_mps=velocity))
+
+
+def level_again(flown: Trajectories, level: Trajectories, drone: int, frame: int) -> Trajectories:
+    """The flight in which a drone is at its height in the formation from a frame on; all else stays bit for bit.
+
+    Args:
+        flown: the flight so far.
+        level: a flight in which nobody descends.
+    """
+    heights = {}
+    for name in ("position_m", "est_position_m", "velocity_mps"):
+        heights[name] = getattr(flown, name).copy()
+        heights[name][frame:, drone, 2] = getattr(level, name)[frame:, drone, 2]
+    return _frozen(replace(flown, **heights))
+
+
+def _frozen(after: Trajectories) -> Trajectories:
     for each in fields(after):
         getattr(after, each.name).setflags(write=False)
     return after

@@ -50,6 +50,7 @@ def displaced(
         orientation *= _signs(np.concatenate([flown.orientation_xyzw[max(frame - 1, 0), drone][None], orientation]))
         yaw = yaw_rad(orientation)
         believed = yaw + base.est_yaw_rad[rest, drone] - base.yaw_rad[rest, drone]
+        velocity[:, 2] = flown.velocity_mps[rest, drone, 2]  # it may descend
         new["velocity_mps"][rest, drone], new["acceleration_mps2"][rest, drone] = velocity, acceleration
         new["orientation_xyzw"][rest, drone], new["yaw_rad"][rest, drone] = orientation, yaw
         new["est_yaw_rad"][rest, drone] = np.mod(believed + np.pi, 2 * np.pi) - np.pi

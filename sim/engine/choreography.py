@@ -11,7 +11,7 @@ import numpy as np
 from sortie.fleet.flight.displaced import displaced
 from sortie.fleet.flight.viewpoints import Move, Plan, bounds_of, course_of, grant
 from sortie.policies.contract import Reposition
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.sim.engine.world import World
 
 RETRY_S = 1.0
@@ -34,6 +34,10 @@ class Choreography:
         self._bounds = bounds_of(scenario.fleet)
         self._fixed = posed_by_trace
         self._frame = 0
+        self._comes = {e.drone for e in scenario.events if isinstance(e, DroneJoins)}.union(
+            *(group.reserve for group in scenario.mission.groups)
+        )
+        """Drones whose slots stay free while they are on the ground: they may yet appear there."""
         self._requests: dict[int, tuple[float, float, str]] = {}
         self._reported: dict[int, str] = {}
         self._again_at: dict[int, int] = {}
@@ -53,8 +57,8 @@ class Choreography:
     def renew(self, frame: int) -> None:
         """Decide the open requests; granted moves begin with this frame. Call it first in a frame."""
         self._frame = frame
-        drones, again_at = self._world.drones, self._again_at
-        requesting = [i for i in sorted(self._requests) if drones[i].airborne and frame >= again_at.get(i, 0)]
+        flies = [d.airborne and i not in self._world.homebound for i, d in enumerate(self._world.drones)]
+        requesting = [i for i in sorted(self._requests) if flies[i] and frame >= self._again_at.get(i, 0)]
         if self._fixed:
             for drone in requesting:
                 self._report_once(drone, "holds its slot: a drone of the fleet flies a recorded pose")
@@ -74,7 +78,7 @@ class Choreography:
     def _granted(self, drone: int) -> Move | str | None:
         """The answer to a request: a move, which is then part of the plan, or the reason for refusal."""
         x_m, y_m, _ = self._requests[drone]
-        gone = [i for i, status in enumerate(self._world.drones) if not status.airborne]
+        gone = [i for i, d in enumerate(self._world.drones) if not (d.airborne or i in self._comes)]
         answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame, gone)
         if isinstance(answer, Move):
             self.plans[drone] = (*self.plans[drone], answer)

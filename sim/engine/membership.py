@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
-from sortie.fleet.flight.descent import descending
+from sortie.fleet.flight.descent import descending, level_again
 from sortie.scenarios.schema import DroneJoins, DroneLeaves, DroneLost, Scenario
 from sortie.sim.engine.world import World, at, with_frame
 
@@ -18,15 +19,18 @@ class Membership:
 
     def __init__(self, scenario: Scenario, world: World) -> None:
         self._world, self._mission, self._frame_s = world, scenario.mission, scenario.frame_s
-        self._homebound: set[int] = set()
+        self._level = world.motion
+        self._homebound: dict[int, float] = {}
+        """By drone that went home and did not come back: when it touches down."""
         self._replaced: set[int] = set()
         self._reserves = [list(group.reserve) for group in self._mission.groups]
         first: dict[int, object] = {}
         for event in sorted(scenario.events, key=lambda e: e.at_s):
             if isinstance(event, DroneJoins | DroneLeaves | DroneLost):
                 first.setdefault(event.drone, event)
-        waiting = {drone for drone, event in first.items() if isinstance(event, DroneJoins)}
-        for drone in sorted(waiting.union(*self._reserves)):
+        self._awaited = {drone for drone, event in first.items() if isinstance(event, DroneJoins)}
+        """Drones that are yet to join for the first time; nobody takes over from them."""
+        for drone in sorted(self._awaited.union(*self._reserves)):
             world.ground(drone)
 
     def renew(self, frame: int) -> None:
@@ -36,7 +40,7 @@ class Membership:
             if not group.reserve:
                 continue
             for drone in group.drones:
-                if drone in self._replaced or drone in reserves:
+                if drone in self._replaced or drone in reserves or drone in self._awaited:
                     continue
                 flies = world.drones[drone].airborne
                 if flies and drone not in self._homebound and limit is not None and world.batteries.soc[drone] <= limit:
@@ -47,16 +51,22 @@ class Membership:
 
     def join(self, drone: int, text: str = "takes off") -> None:
         """A drone on the ground joins the fleet; nothing happens to one that flies."""
-        if not self._world.drones[drone].airborne:
-            self._homebound.discard(drone)
-            self._world.join(drone, text)
+        world, frame = self._world, self._world.next_frame
+        self._awaited.discard(drone)
+        if world.drones[drone].airborne:
+            return
+        world.join(drone, text)
+        if world.drones[drone].airborne:
+            self._replaced.discard(drone)
+            if self._homebound.pop(drone, None) is not None and frame < len(world.motion.time_s):
+                world.reroute(level_again(world.motion, self._level, drone, frame))
 
     def go_home(self, drone: int, text: str = "told to") -> None:
         """A drone that flies goes home; nothing happens to one on the ground or on its way."""
         world = self._world
         if drone in self._homebound or not world.drones[drone].airborne:
             return
-        self._homebound.add(drone)
+        self._homebound[drone] = math.inf
         world.homebound.add(drone)
         world.note(drone, "drone_leaves", f"goes home: {text}")
         frame = world.next_frame
@@ -65,11 +75,12 @@ class Membership:
         world.reroute(descending(world.motion, drone, frame, self._mission.descent_mps))
         height_m = float(world.motion.position_m[frame, drone, 2])
         down_s = frame * self._frame_s + height_m / self._mission.descent_mps
-        at(world.env, with_frame(down_s, self._frame_s), partial(self._touch_down, drone))
+        self._homebound[drone] = down_s
+        at(world.env, with_frame(down_s, self._frame_s), partial(self._touch_down, drone, down_s))
 
-    def _touch_down(self, drone: int) -> None:
+    def _touch_down(self, drone: int, down_s: float) -> None:
         world = self._world
-        if drone in self._homebound and world.drones[drone].airborne:
+        if self._homebound.get(drone) == down_s and world.drones[drone].airborne:
             world.drain()
             if world.drones[drone].airborne:
                 world.remove(drone, "landed", "went home")

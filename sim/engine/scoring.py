@@ -98,8 +98,10 @@ class Scorer:
     def _score(self, frame: int) -> None:
         now_s = self._env.now
         moment: Moment = now_s, []
+        since_s = (frame - 1.5) * self._scenario.frame_s
         for agent in self._agents:
-            if not agent.status.airborne:
+            came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
+            if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
             elif agent.here is not None and agent.latest is not None:
                 moment[1].append(Ego(agent.here, self._job(agent, agent.here, agent.latest, now_s)))

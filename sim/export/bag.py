@@ -31,7 +31,6 @@ from sortie.fleet.messages.wire import (
     encode_descriptor,
     encode_directive,
 )
-from sortie.perception.scene.traffic import TARGET_ID
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
@@ -67,8 +66,14 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
     rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.fleet.feature_spaces
+    mission, group_of = record.tables["mission"], record.scenario.mission.group_of
+    targets = {
+        (int(t_s * rate_hz + 1e-6), group): target
+        for t_s, group, target in zip(*(mission[name].to_pylist() for name in ("t_s", "group", "target")), strict=True)
+    }
     for row in rows:
-        k = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1) * n + row["drone"]
+        frame = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1)
+        k = frame * n + row["drone"]
         region = (
             None
             if math.isnan(row["region_radius_m"])
@@ -90,7 +95,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             task_phase=PHASE_OF[row["phase"]],
             region=region,
             feature_space=spaces[row["drone"]],
-            priority_target_ids=(TARGET_ID,) if row["novelty_flags"] & TARGET_FLAG else (),
+            priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,63 @@ def test_an_empty_drone_stays_down() -> None:
 def test_it_is_the_same_record_again() -> None:
     events = "events=[{kind: drone_leaves, at_s: 1, drone: 2}, {kind: drone_joins, at_s: 3, drone: 3}]"
     assert flown(events).fingerprint == flown(events).fingerprint
+
+
+def test_a_drone_that_came_home_flies_at_the_formations_height_when_it_joins_again() -> None:
+    leaves, joins = ("{{kind: drone_{}, at_s: {}, drone: 2}}".format(*e) for e in (("leaves", 1), ("joins", 5)))
+    record, stayed = flown(f"events=[{leaves}, {joins}]", "mission.descent_mps=10"), flown()
+    height_m, level_m = ([r["z_m"] for r in rows(each, "states", drone=2)] for each in (record, stayed))
+    assert max(height_m[42:50]) < 1.0
+    assert height_m[50:] == level_m[50:]
+    assert {r["phase"] for r in rows(record, "descriptors", drone=2) if r["t_s"] > 5.0} == {"track"}
+
+
+def test_a_descent_that_was_cut_short_does_not_end_a_later_one() -> None:
+    events = [("leaves", 0.5), ("lost", 1), ("joins", 2), ("leaves", 2.5)]
+    text = ", ".join(f"{{kind: drone_{kind}, at_s: {at_s}, drone: 2}}" for kind, at_s in events)
+    record = flown(f"events=[{text}]", "mission.descent_mps=10")
+    assert rows(record, "events", drone=2, kind="landed")[0]["t_s"] == pytest.approx(5.5, abs=0.3)
+
+
+def test_a_recorded_drone_descends_to_the_ground_and_takes_off_with_its_recorded_charge(tmp_path: Path) -> None:
+    """Its trace climbs 3 m/s and says nothing about going home."""
+    lines = [f"{k},2,{5 * k},5,{30 + 3 * k},{0.9 - 0.02 * k}" for k in range(11)]
+    (tmp_path / "flight.csv").write_text("\n".join(["t_s,drone,x_m,y_m,z_m,soc", *lines]))
+    trace = f"fleet.trace={tmp_path / 'flight.csv'}"
+    home = flown("events=[{kind: drone_leaves, at_s: 1, drone: 2}]", "mission.descent_mps=10", trace)
+    assert rows(home, "states", drone=2)[-1]["z_m"] <= 1.0
+    late = rows(flown("events=[{kind: drone_joins, at_s: 3, drone: 2}]", trace), "states", drone=2)
+    current_a = [r["current_a"] for r in late if r["airborne"]]
+    assert max(current_a[1:]) < 1.1 * min(current_a[1:])
+
+
+def test_a_drone_that_descends_keeps_its_slot_and_its_rate_of_descent() -> None:
+    """Its policy would rather look from elsewhere; moves that were granted before go on, level ones only."""
+    record = flown(
+        "policy={name: vantage}",
+        "mission.target.waypoints_m=[[-60, 60], [200, 60]]",
+        "mission.phases=[{phase: track, region: {radius_m: 32}}]",
+        "events=[{kind: drone_leaves, at_s: 1, drone: 2}, {kind: drone_joins, at_s: 2, drone: 3}]",
+    )
+    states = [r for r in rows(record, "states", drone=2) if r["t_s"] > 1.2]
+    assert rows(record, "events", kind="viewpoint", drone=3), "the fleet's flight is computed again during the descent"
+    assert {r["vz_mps"] for r in states} == {-3.0}
+
+
+def test_nobody_takes_over_from_a_drone_that_is_yet_to_join() -> None:
+    record = flown(
+        "mission.groups=[{drones: [1, 3, 4], reserve: [4], phases: [{phase: search}]}]",
+        "events=[{kind: drone_joins, at_s: 2, drone: 3}, {kind: drone_lost, at_s: 4, drone: 3}]",
+    )
+    joined = rows(record, "events", kind="drone_joins")
+    assert [(r["t_s"], r["drone"], r["text"]) for r in joined] == [
+        (2.0, 3, "takes off"),
+        (4.0, 4, "takes over from drone 3"),
+    ]
+
+
+def test_a_drone_that_came_back_is_not_scored_where_it_was_lost() -> None:
+    events = "events=[{kind: drone_lost, at_s: 1, drone: 1}, {kind: drone_joins, at_s: 3.07, drone: 1}]"
+    record = flown(events, "perception={detector: surrogate, sample_rate_hz: 10}")
+    scored = [r["t_s"] for r in rows(record, "fusions", drone=1)]
+    assert min(t for t in scored if t > 2.0) == pytest.approx(3.2, abs=0.02)

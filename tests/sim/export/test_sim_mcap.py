@@ -231,3 +231,14 @@ def test_what_a_user_gets_wrong_is_named(
     said = CliRunner().invoke(app, ["export", "run", *arguments])
     assert re.search(message, str(said.exception))
     assert CliRunner().invoke(app, ["export", "run"]).exit_code == 2  # no format named
+
+
+def test_a_descriptor_names_the_target_of_its_drones_group() -> None:
+    record = run_sortie(
+        example(
+            "mission.more_targets=[{waypoints_m: [[-60, 8], [200, 8]]}]",
+            "mission.groups=[{drones: [1, 2], phases: [{phase: track, target: 1, region: {radius_m: 30}}]}]",
+        )
+    )
+    named = {(d.agent_id in (1, 2), d.priority_target_ids) for _, d in descriptors(record) if d.priority_target_ids}
+    assert named == {(True, (1,)), (False, (0,))}
