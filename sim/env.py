@@ -25,7 +25,7 @@ from pettingzoo import ParallelEnv
 
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, LinkState, Representation, TaskPhase
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
 from sortie.sim.results.outcome import matched
@@ -53,7 +53,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
 
     | | |
     |---|---|
-    | agents | `drone_0` …; one that lands or is lost terminates, at the scenario's end all are truncated |
+    | agents | `drone_0` …; one that lands or is lost terminates unless it may join again, at the scenario's end all are truncated |
     | observation | float32 [N, 25]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
     | action | for each other drone by ascending id: rung, ρ, rate, region (`CHOICES`) |
     | reward | AP@0.5 of the drone's own fusions in the step (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
@@ -119,7 +119,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         flight.advance()
         flying = self.agents
         rewards = {a: flight.reward(int(a.removeprefix("drone_"))) for a in flying}
-        landed = {a: not flight.airborne(int(a.removeprefix("drone_"))) for a in flying}
+        landed = {a: flight.is_out(int(a.removeprefix("drone_"))) for a in flying}
         over = dict.fromkeys(flying, flight.done)
         observations = {a: self._observe(a) for a in flying}
         self.agents = [] if flight.done else [a for a in flying if not landed[a]]
@@ -190,7 +190,10 @@ class _Flight:
         self.actions: dict[int, np.ndarray[Any, Any]] = {}
         self.views: dict[int, FleetView] = {}
         self.done = False
-        self._scenario = scenario
+        self._scenario, self._t_s = scenario, 0.0
+        joins = [e for e in scenario.events if isinstance(e, DroneJoins)]
+        self._joins_s = {e.drone: e.at_s for e in sorted(joins, key=lambda e: e.at_s)}  # the last time
+        self._waiting = {drone for group in scenario.mission.groups for drone in group.reserve}
         self._error: Exception | None = None
         self._new: dict[str, pa.Table] = {}
         self._mission: pa.Table | None = None
@@ -240,7 +243,7 @@ class _Flight:
 
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None:
         """A second is over: hand over, and wait for the next actions."""
-        self._new = new
+        self._new, self._t_s = new, t_s
         mission = new["mission"]
         self._mission = mission if self._mission is None else pa.concat_tables([self._mission, mission])
         if t_s >= self._scenario.duration_s - 1e-9:
@@ -267,11 +270,14 @@ class _Flight:
 
     # --- results of the last second ------------------------------------------------------------
 
-    def airborne(self, drone: int) -> bool:
-        """Whether the drone still flew at the last frame."""
+    def is_out(self, drone: int) -> bool:
+        """Whether the drone was on the ground at the last frame, and neither the scenario nor its group calls it again."""
         states = self._new["states"]
         rows = states.filter(pc.equal(states["drone"], drone))
-        return rows.num_rows == 0 or bool(rows["airborne"][-1].as_py())
+        if rows.num_rows == 0 or rows["airborne"][-1].as_py():
+            self._waiting.discard(drone)
+            return False
+        return drone not in self._waiting and self._t_s >= self._joins_s.get(drone, 0.0)
 
     def reward(self, drone: int) -> float:
         """AP of its fusions in the second, less what it sent and spent."""

@@ -20,4 +20,5 @@ def policy_overrides(text: str, own: str) -> list[str]:
         overrides.append("policy.params={}")
     if name != own:
         overrides += ["policy.commands=[]", "policy.changes=[]"]  # it flies to the end
+        overrides.append("policy.of_makes=false")  # and on every drone
     return overrides + [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]

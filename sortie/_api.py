@@ -271,14 +271,14 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
         >>> sortie.replay(run, "silence").table.column_names[:5]
         ['t_s', 'drone', 'decision', 'peer', 'fields']
     """
-    from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, plan_of
+    from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, plan_for
     from sortie.sim.identity import name_of
     from sortie.sim.studies.replay import replay as decide_again
 
     if not isinstance(run, Run):
         raise RunError(f"run: {run!r}, must be a Run, as sortie.open_run gives it")
     chosen, function = _with_policy(run.scenario, policy)
-    plan = plan_of(chosen.policy) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
+    plan = plan_for(chosen) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
     return decide_again(run.record, plan, as_flown=policy is None, disagreement=disagreement)
 
 

@@ -228,7 +228,9 @@ class Make(Section):
     computer: Computer | None = Field(None, description="In place of fleet.computer, as a whole.")
     tx_power_dbm: float | None = Field(None, ge=-20, le=36, description="In place of radio.tx_power_dbm.")
     policy: str | None = Field(
-        None, min_length=1, description="A policy of its own: a registered one, or path/to/file.py:function."
+        None,
+        min_length=1,
+        description="A policy of its own: a registered one, or path/to/file.py:function.",
     )
     policy_params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of that policy.")
     weights: str | None = Field(

@@ -55,6 +55,10 @@ class PolicySection(Section):
         max_length=10000,
         description="What enforced directives must keep, one line each (policies/verification/invariants.py); violations are events.",
     )
+    of_makes: bool = Field(
+        True,
+        description="Whether makes with a policy of their own fly it; false lets this policy decide for all drones.",
+    )
     shield: bool = Field(
         False,
         description="Directives that break an invariant are replaced by the nearest that keep it, as far as ages allow.",

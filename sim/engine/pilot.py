@@ -41,7 +41,7 @@ from sortie.policies.verification.invariants import (
 )
 from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
-from sortie.scenarios.schema import PolicyChange, PolicySection
+from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.world import at, with_frame
 
@@ -108,6 +108,17 @@ def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyP
     return PolicyPlan(
         first or named_policy(section.name, section.params), changes, commands, rules, section.shield, replays
     )
+
+
+def plan_for(scenario: Scenario) -> PolicyPlan:
+    """The policies of a scenario and of its makes.
+
+    Raises:
+        PolicyError: as `plan_of`.
+    """
+    makes = scenario.fleet.makes if scenario.policy.of_makes else ()
+    own = {i: named_policy(m.policy, m.policy_params) for m in makes if m.policy for i in m.drones}
+    return plan_of(scenario.policy)._replace(of_makes=own)
 
 
 def named_policy(name: str, params: Mapping[str, object]) -> NamedPolicy:

@@ -38,7 +38,7 @@ from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.people import People
-from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_of, schedule_policies
+from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
@@ -309,7 +309,6 @@ def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Polic
     """
     section = scenario.policy
     if policy is None or policy == section.name:
-        own = {i: named_policy(m.policy, m.policy_params) for m in scenario.fleet.makes if m.policy for i in m.drones}
-        return section.name, plan_of(section)._replace(of_makes=own)
+        return section.name, plan_for(scenario)
     first = named_policy(policy, {}) if isinstance(policy, str) else NamedPolicy(name_of(policy), policy)
     return first.name, plan_of(section, first)

@@ -78,6 +78,19 @@ def test_a_lost_drone_terminates_and_the_others_fly_on() -> None:
     assert gone == [[], ["drone_1"], [], []]
 
 
+def test_a_drone_that_may_yet_join_stays_an_agent() -> None:
+    """An agent that terminated may not come back."""
+    events = "{kind: drone_joins, drone: 1, at_s: 2.5}, {kind: drone_lost, drone: 1, at_s: 3.5}"
+    group = "mission.groups=[{drones: [0, 2], reserve: [2], phases: [{phase: search}]}]"
+    e = env(*SHORT, f"events=[{events}]", group)
+    e.reset()
+    gone = []
+    while e.agents:
+        _, _, landed, _, _ = e.step(all_share(e))
+        gone.append([a for a, terminated in landed.items() if terminated])
+    assert gone == [[], [], [], ["drone_1"]]
+
+
 def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     def flight(e: SortieEnv, seed: int | None) -> np.ndarray:
         e.reset(seed=seed)

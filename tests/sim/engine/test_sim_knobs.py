@@ -242,6 +242,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "policy.name": ("deputies", ()),
     "policy.params": ("{rho: 0.1}", ()),
     "policy.dwell_s": ("0.6", ()),
+    "policy.of_makes": ("false", (MADE,)),
     "policy.hysteresis": ("3", ("policy.name=adaptive", "policy.params={}", FAR)),
     "policy.changes.at_s": ("3", (AT_2,)),
     "policy.changes.phase": ("search", (IN_TRACK,)),

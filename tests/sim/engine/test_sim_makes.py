@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sortie
 from sortie.perception.surrogate.model import SHIPPED, load, save
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, FleetView
@@ -246,3 +247,12 @@ def test_makes_that_do_not_fit(makes: str, more: tuple[str, ...], message: str) 
     with pytest.raises(ScenarioError) as caught:
         loads(BASE, overrides=[f"fleet.makes=[{makes}]", *more])
     assert message in str(caught.value)
+
+
+def test_a_policy_that_is_asked_for_by_name_decides_for_makes_with_their_own_too() -> None:
+    """As `sortie fly --policy`, `sortie compare` and campaigns ask for it."""
+    make = {"name": "a", "drones": [1], "policy": "all-4", "policy_params": {"received_budget": 0.1}}
+    own = {"duration_s": 2, "perception.detector": "none", "fleet.makes": [make]}
+    for policy, of_make in ((None, "all-4(received_budget=0.1)"), ("best-2", "best-2")):
+        run = sortie.fly("track_target", own, policy=policy)
+        assert set(column(run.record, "directives", "policy", 1)) == {of_make}

@@ -51,6 +51,24 @@ def test_each_policy_of_a_flight_decides_where_it_did() -> None:
     assert "vantage" in again.policy
 
 
+def test_the_policies_of_makes_decide_again_for_their_drones() -> None:
+    """In a fleet that meets most of what membership and clocks have to offer."""
+    make = {"name": "other", "drones": [1, 3], "policy": "best-2", "policy_params": {"received_budget": 0.1}}
+    events = [
+        {"kind": "clock_skew", "at_s": 0.5, "drone": 3, "skew_s": 1.5},
+        {"kind": "drone_joins", "at_s": 1, "drone": 3},
+        {"kind": "drone_lost", "at_s": 1, "drone": 1},
+        {"kind": "drone_joins", "at_s": 2.05, "drone": 1},
+        {"kind": "drone_leaves", "at_s": 3, "drone": 1},
+    ]
+    shield = {"policy.invariants": "any_link(representation >= detections and rate_hz >= 2)", "policy.shield": True}
+    run = fly(**{"fleet.makes": [make], "events": events, **shield})
+    again = sortie.replay(run)
+    assert again.same
+    assert "best-2" in again.policy
+    assert not sortie.replay(run, "silence").same
+
+
 def counting() -> Callable[[FleetView], list[Directive]]:
     """A policy with a memory: the number of its calls decides, over all drones."""
     calls = 0
