@@ -20,7 +20,7 @@ after the last place a drone stands there, without velocity. A drone without a p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -157,10 +157,7 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
         new["orientation_xyzw"][:, drone], new["yaw_rad"][:, drone] = orientation, yaw
         new["acceleration_mps2"][:, drone] = acceleration
         new["body_rates_radps"][:, drone] = body_rates(orientation[:, None], frame_s)[:, 0]
-    flown = replace(motion, **new)
-    for each in fields(flown):
-        getattr(flown, each.name).setflags(write=False)
-    return flown
+    return replace(motion, **new)
 
 
 # --- reading -------------------------------------------------------------------------------------

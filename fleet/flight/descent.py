@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def descending(flown: Trajectories, drone: int, frame: int, descent_mps: float) 
     position[rest, drone, 2] = height_m
     believed[rest, drone, 2] += height_m - level_m  # keeps its error
     velocity[rest, drone, 2] = np.where(height_m > 0.0, -descent_mps, 0.0)
-    return _frozen(replace(flown, position_m=position, est_position_m=believed, velocity_mps=velocity))
+    return replace(flown, position_m=position, est_position_m=believed, velocity_mps=velocity)
 
 
 def level_again(flown: Trajectories, level: Trajectories, drone: int, frame: int) -> Trajectories:
@@ -39,10 +39,4 @@ def level_again(flown: Trajectories, level: Trajectories, drone: int, frame: int
     for name in ("position_m", "est_position_m", "velocity_mps"):
         heights[name] = getattr(flown, name).copy()
         heights[name][frame:, drone, 2] = getattr(level, name)[frame:, drone, 2]
-    return _frozen(replace(flown, **heights))
-
-
-def _frozen(after: Trajectories) -> Trajectories:
-    for each in fields(after):
-        getattr(after, each.name).setflags(write=False)
-    return after
+    return replace(flown, **heights)

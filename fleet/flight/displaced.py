@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -56,10 +56,7 @@ def displaced(
         new["est_yaw_rad"][rest, drone] = np.mod(believed + np.pi, 2 * np.pi) - np.pi
         step_s = float(course.time_s[1] - course.time_s[0])
         new["body_rates_radps"][rest, drone] = body_rates(orientation[:, None], step_s)[:, 0]
-    after = replace(flown, **new)
-    for each in fields(after):
-        getattr(after, each.name).setflags(write=False)
-    return after
+    return replace(flown, **new)
 
 
 def _turned(values: Array, cos: Array, sin: Array) -> Array:

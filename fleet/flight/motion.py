@@ -54,6 +54,10 @@ class Trajectories:
     frame_position_m: Array  # [T, 3] the formation's reference point
     frame_yaw_rad: Array  # [T] the formation's heading
 
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            getattr(self, each.name).setflags(write=False)
+
     @property
     def air_speed_mps(self) -> Array:
         """Horizontal speed through the air [T, N]."""
@@ -153,7 +157,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     est_yaw = yaw + gauss_markov(
         draws("heading_error"), math.radians(config.heading_error_deg), ESTIMATE_TIME_S, frame_s
     )
-    motion = Trajectories(
+    return Trajectories(
         time_s=time_s,
         position_m=position,
         orientation_xyzw=quaternion,
@@ -167,9 +171,6 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
         frame_position_m=_raise(path.position_m, fleet.formation.altitude_m),
         frame_yaw_rad=path.yaw_rad,
     )
-    for each in fields(motion):
-        getattr(motion, each.name).setflags(write=False)
-    return motion
 
 
 def body_rates(quaternion_xyzw: Array, step_s: float) -> Array:

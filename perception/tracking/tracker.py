@@ -20,8 +20,8 @@ from sortie.perception.tracking.association import assigned
 from sortie.perception.types import Boxes
 
 BOX_VARIANCE_M2 = 0.8**2
-"""Variance of a box's place along each axis. Boxes of the surrogate are off by 0.55 m, and a car's boxes in a row lean to
-one side."""
+"""Variance of a box's place along each axis. It is larger than that of a box alone (`lateness.SIGMA0_M`), because a car's
+boxes in a row lean to one side."""
 SPEED_VARIANCE = 6.0**2
 """Variance of each component of an unseen car's velocity, m²/s²."""
 BEGIN_SCORE = 0.3

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-FRESH_PERIODS, GONE_PERIODS = 3.0, 10.0
-"""The plane's two thresholds: degraded after three periods, detached after ten."""
+from sortie.policies.contract import DETACHED_AFTER_PERIODS
+
+FRESH_PERIODS = 3.0
+"""The plane's first threshold: degraded after three periods."""
 AGEING = 0.5
 """The weight between the thresholds. It is one step and no slope, so that each frame of age does not change the directive."""
 
@@ -16,4 +18,4 @@ def freshness(age_s: float, period_s: float) -> float:
     """
     if age_s <= FRESH_PERIODS * period_s:
         return 1.0
-    return AGEING if age_s <= GONE_PERIODS * period_s else 0.0
+    return AGEING if age_s <= DETACHED_AFTER_PERIODS * period_s else 0.0

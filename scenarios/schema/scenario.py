@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import Field, model_validator
@@ -48,11 +48,10 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
         n = self.fleet.drones
+        for where, who in self._drones_named():
+            if who >= n:
+                raise inconsistent(where, f"{who}", f"below fleet.drones = {n}")
         for i, event in enumerate(self.events):
-            for end in ("drone", "peer"):
-                who = getattr(event, end, None)
-                if who is not None and who >= n:
-                    raise inconsistent(("events", i, end), f"{who}", f"below fleet.drones = {n}")
             if isinstance(event, LinkDrop) and event.peer == event.drone:
                 raise inconsistent(("events", i, "peer"), f"{event.peer}", "another drone than drone")
             until_s = getattr(event, "until_s", None)
@@ -67,29 +66,11 @@ class Scenario(Section):
             ("policy", "commands"): policy.commands,
             ("policy", "replays"): policy.replays,
         }
-        for where, each in instants.items():
+        for section, each in instants.items():
             for i, one in enumerate(each):
                 if one.at_s is not None and one.at_s >= self.duration_s:
                     bound = f"below duration_s = {self.duration_s:g}"
-                    raise inconsistent((*where, i, "at_s"), f"{one.at_s:g}", bound)
-        for i, command in enumerate(self.policy.commands):
-            for k, who in enumerate(command.drones):
-                if who >= n:
-                    at = ("policy", "commands", i, "drones", k)
-                    raise inconsistent(at, f"{who}", f"below fleet.drones = {n}")
-        for i, replay in enumerate(self.policy.replays):
-            if replay.drone >= n:
-                raise inconsistent(("policy", "replays", i, "drone"), f"{replay.drone}", f"below fleet.drones = {n}")
-        for i, decision in enumerate(self.expect_decisions):
-            for end in ("drone", "peer"):
-                who = getattr(decision, end)
-                if who is not None and who >= n:
-                    raise inconsistent(("expect_decisions", i, end), f"{who}", f"below fleet.drones = {n}")
-        for k, group in enumerate(self.mission.groups):
-            for i, who in enumerate(group.drones):
-                if who >= n:
-                    at = ("mission", "groups", k, "drones", i)
-                    raise inconsistent(at, f"{who}", f"below fleet.drones = {n}")
+                    raise inconsistent((*section, i, "at_s"), f"{one.at_s:g}", bound)
         for i, make in enumerate(self.fleet.makes):
             detector = self.perception.detector
             if make.weights is not None and detector not in ("torch", "surrogate"):
@@ -102,6 +83,28 @@ class Scenario(Section):
             bound = f"above degraded_after_periods = {degraded:g}"
             raise inconsistent(("context", "detached_after_periods"), f"{detached:g}", bound)
         return self
+
+    def _drones_named(self) -> Iterator[tuple[tuple[str | int, ...], int]]:
+        """Every drone that a section outside of `fleet` names, and where."""
+        ends: dict[str, Sequence[BaseEvent | DecisionExpectation]] = {
+            "events": self.events, "expect_decisions": self.expect_decisions,
+        }  # fmt: skip
+        for section, each in ends.items():
+            for i, one in enumerate(each):
+                for end in ("drone", "peer"):
+                    who = getattr(one, end, None)
+                    if who is not None:
+                        yield (section, i, end), who
+        for i, replay in enumerate(self.policy.replays):
+            yield ("policy", "replays", i, "drone"), replay.drone
+        several = {
+            ("policy", "commands"): [command.drones for command in self.policy.commands],
+            ("mission", "groups"): [group.drones for group in self.mission.groups],
+        }
+        for where, lists in several.items():
+            for i, drones in enumerate(lists):
+                for k, who in enumerate(drones):
+                    yield (*where, i, "drones", k), who
 
     @property
     def frame_s(self) -> float:

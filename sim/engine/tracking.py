@@ -97,8 +97,8 @@ class FleetTracking:
         tracks, before = self.tracks(drone), self._followed[drone]
         if tracks is not before.judged_by or target != before.target or now_s >= before.at_s + CUE_S - _INSTANT_S:
             cue = (*cue_m, (cue_m[0] - x_m) / lasts_s, (cue_m[1] - y_m) / lasts_s)
-            is_ = followed(tracks, {target: cue}, before.tracks, now_s)
-            before = self._followed[drone] = _Followed(target, is_, tracks, now_s)
+            following = followed(tracks, {target: cue}, before.tracks, now_s)
+            before = self._followed[drone] = _Followed(target, following, tracks, now_s)
         return target in before.tracks
 
     def _catch_up(self) -> None:
