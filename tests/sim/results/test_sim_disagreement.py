@@ -222,7 +222,7 @@ def test_disagreement_ends_a_period_and_a_delay_after_the_last_change(policy: st
         assert last_s > CHANGES_UNTIL * PERIOD_S - 0.5
 
 
-@pytest.mark.parametrize("policy", ["worked", "deputies", "learned"])
+@pytest.mark.parametrize("policy", ["worked", "deputies", "adaptive"])
 def test_packets_lost_before_leave_no_disagreement_behind(policy: str) -> None:
     """Once every drone has heard a packet of every other one, what each missed before decides nothing."""
     for seed in range(8):
