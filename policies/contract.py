@@ -10,6 +10,8 @@ creates tens of thousands a minute. `d._replace(rate_hz=5.0)` is a changed copy.
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -262,6 +264,34 @@ def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPoli
         return policy
 
     return mark
+
+
+OTHER_NETWORK = "another network: it cannot fuse this drone's maps"
+_FEATURES, _DETECTIONS = Representation.FEATURES, Representation.DETECTIONS  # slow to look up, each time
+
+
+def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
+    """Let a policy send detections where it would send features to a drone with another network.
+
+    Region, rate, deadline, weight and duty stay as the policy decided. A peer of the same feature space gets what the
+    policy decided.
+    """
+
+    @functools.wraps(policy)
+    def decide(view: FleetView, **params: object) -> Sequence[Directive]:
+        directives = policy(view, **params)
+        foreign = [
+            d.representation == _FEATURES and not view.shares_features_with(d.destination) for d in directives
+        ]  # fmt: skip
+        if not any(foreign):
+            return directives
+        return [
+            d._replace(representation=_DETECTIONS, rho=0.0, reason=OTHER_NETWORK) if other else d
+            for d, other in zip(directives, foreign, strict=True)
+        ]
+
+    decide.__signature__ = inspect.signature(policy)  # type: ignore[attr-defined]
+    return decide  # type: ignore[return-value]
 
 
 class PolicyError(SortieError):

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Reposition,
         Representation,
         TaskPhase,
+        boxes_across_networks,
         looks_from,
     )
     from sortie.scenarios.errors import SortieError
@@ -42,7 +43,7 @@ __all__ = [
     "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run",
     "Run", "Comparison", "Replay", "CampaignResult", "Scenario",
     "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
-    "Reposition", "looks_from", "SortieError", "ScenarioError", "PolicyError", "RunError",
+    "Reposition", "looks_from", "boxes_across_networks", "SortieError", "ScenarioError", "PolicyError", "RunError",
     "__version__",
 ]  # fmt: skip
 
@@ -53,7 +54,7 @@ _HOMES = {
     "sortie._run": ("Run",),
     "sortie.policies.contract": (
         "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
-        "Reposition", "looks_from", "PolicyError",
+        "Reposition", "looks_from", "boxes_across_networks", "PolicyError",
     ),
     "sortie.scenarios.errors": ("SortieError",),
     "sortie.scenarios.reading.nodes": ("ScenarioError",),

@@ -28,6 +28,7 @@ from sortie.policies.contract import (
     LinkState,
     Representation,
     TaskPhase,
+    boxes_across_networks,
     nothing,
 )
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
@@ -108,6 +109,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
 
 
 @among_attached
+@boxes_across_networks
 def arm(view: FleetView, *, index: int = 0, sent_budget: float = 0.25) -> list[Directive]:
     """Always the same arm, for `sortie learn` and comparisons."""
     return spend(view, ARMS[index % len(ARMS)], sent_budget, "fixed arm")
@@ -135,6 +137,7 @@ def boxes(view: FleetView) -> list[Directive]:
 
 
 @among_attached
+@boxes_across_networks
 def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """Rules over mission, coverage, budget and links: feature cells of a tracked region that it sees, otherwise boxes.
 
@@ -157,6 +160,7 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
 
 
 @among_attached
+@boxes_across_networks
 def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
     seen = features(view, sent_budget)

@@ -20,7 +20,7 @@ from math import floor
 
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, nothing
+from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, boxes_across_networks, nothing
 from sortie.policies.geometry import peers_by_overlap
 
 RESHUFFLE_S = 10
@@ -31,6 +31,7 @@ RESHUFFLE_S = 10
 
 
 @among_attached
+@boxes_across_networks
 def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive]:
     """Features to every peer (all-4 at N = 5), whatever the context.
 
@@ -49,6 +50,7 @@ def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive
 
 
 @among_attached
+@boxes_across_networks
 def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover most of its footprint; the budget is as for `everyone`."""
     return _serve(
@@ -57,6 +59,7 @@ def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list
 
 
 @among_attached
+@boxes_across_networks
 def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
     """Each receiver gets features from the k peers that cover least of its footprint; the budget is as for `everyone`."""
     what = f"the {k} that cover least of the receiver's footprint"
@@ -64,6 +67,7 @@ def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> lis
 
 
 @among_attached
+@boxes_across_networks
 def random_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0, salt: int = 0) -> list[Directive]:
     """Each receiver gets features from k peers drawn anew every `RESHUFFLE_S`; the budget is as for `everyone`.
 
@@ -112,6 +116,7 @@ def _rho(received_budget: float, maps: int, place: int, k: int) -> float:
 
 
 @among_attached
+@boxes_across_networks
 def best_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -> list[Directive]:
     """Each drone sends features to the k peers that cover most of its own footprint.
 
@@ -124,6 +129,7 @@ def best_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -
 
 
 @among_attached
+@boxes_across_networks
 def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -> list[Directive]:
     """Each drone sends features to the k peers that cover least of its own footprint; as `best_k_receivers`."""
     return _send_to(
@@ -132,6 +138,7 @@ def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) 
 
 
 @among_attached
+@boxes_across_networks
 def random_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0, salt: int = 0) -> list[Directive]:
     """Each drone sends features to k peers drawn anew every `RESHUFFLE_S`; as `best_k_receivers`."""
     return _send_to(view, _draw(view, salt, view.ego, view.peers, k), sent_budget, f"{k} drawn at random")

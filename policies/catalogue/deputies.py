@@ -19,7 +19,16 @@ from sortie.policies.catalogue.worked import (
     NO_GOODPUT,
     SLOW_RATE_HZ,
 )
-from sortie.policies.contract import AGENT_IDS, Descriptor, Directive, FleetView, Representation, TaskPhase, nothing
+from sortie.policies.contract import (
+    AGENT_IDS,
+    Descriptor,
+    Directive,
+    FleetView,
+    Representation,
+    TaskPhase,
+    boxes_across_networks,
+    nothing,
+)
 from sortie.policies.geometry import footprint_overlap
 
 GOOD_GOODPUT_MBPS = 20.0
@@ -28,6 +37,7 @@ SLOW_DEADLINE_S = 0.5
 
 
 @among_attached
+@boxes_across_networks
 def deputies(view: FleetView, *, k: int = 2, rho: float = 0.25) -> list[Directive]:
     """Each receiver is served by the k drones that add most: unseen cells × link × battery, nearer ones first on ties."""
     me = view.me

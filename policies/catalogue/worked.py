@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from sortie.policies.catalogue.attached import among_attached
-from sortie.policies.contract import Directive, FleetView, LinkState, Representation, TaskPhase, nothing
+from sortie.policies.contract import (
+    Directive,
+    FleetView,
+    LinkState,
+    Representation,
+    TaskPhase,
+    boxes_across_networks,
+    nothing,
+)
 from sortie.policies.geometry import peers_by_overlap
 
 HIGH_BATTERY = 0.60
@@ -19,11 +27,11 @@ NO_GOODPUT = {
     LinkState.SILENT: "goodput: link silent, nothing got through",
 }
 """Reasons for links without a goodput to name."""
-OTHER_NETWORK = "another network: it cannot fuse this drone's maps"
 NOT_CHOSEN = f"not among the {TOP_PEERS} most overlapping peers"
 
 
 @among_attached
+@boxes_across_networks
 def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     """Battery picks representation and rate, the link may lower both, the phase the ROI, overlap the peers.
 
@@ -58,8 +66,6 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
             weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
             low = min(rung, DETECTIONS)
             directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
-        elif rung == FEATURES and not view.shares_features_with(peer):
-            directives.append(Directive(ego, peer, DETECTIONS, 0.0, roi, rate_hz, reason=OTHER_NETWORK))
         else:
             directives.append(Directive(ego, peer, rung, link_rho, roi, rate_hz, reason=why))
     return directives

@@ -74,13 +74,17 @@ class _WatchedDescriptor:
 
 
 def observe(policy: Callable[..., Sequence[Directive]], views: Iterable[FleetView]) -> Observed:
-    """Run a policy on views that record what is read. That it leaves out detached peers is the plane's rule, no decision."""
+    """Run a policy on views that record what is read.
+
+    That it leaves out detached peers, and sends no maps to other networks, is the plane's rule, no decision.
+    """
     read: set[str] = set()
     decided: set[str] = set()
     for view in (v.attached for v in views):
         watched = {i: cast(Descriptor, _WatchedDescriptor(d, read)) for i, d in view.descriptors.items()}
         for directive in policy(view._replace(descriptors=watched)):
-            decided |= decisions_of(directive)
+            if view.shares_features_with(directive.destination):
+                decided |= decisions_of(directive)
     return Observed(frozenset(a for f in read if (a := FIELDS[f]) is not None), frozenset(decided))
 
 

@@ -25,6 +25,7 @@ from sortie.policies.contract import (
     FleetView,
     Policy,
     PolicyError,
+    Representation,
     check_directives,
     check_reposition,
     find_wrong_type,
@@ -286,6 +287,14 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
     return None
 
 
+def _sends_maps_where_they_are_fused(policy: Policy, view: FleetView) -> str | None:
+    """A drone with another network cannot fuse the ego's feature maps, so their bytes would be spent in vain."""
+    for d in _decide(policy, view):
+        if d.representation == Representation.FEATURES and not view.shares_features_with(d.destination):
+            return f"directive {d.source}→{d.destination}: features, must be boxes: the peer has another network"
+    return None
+
+
 def _keeps_budget(policy: Policy, view: FleetView) -> str | None:
     """The fleet keeps every budget that the policy takes (`_SPENT`), if each drone decides on this one view.
 
@@ -366,6 +375,7 @@ RULES: dict[str, Rule] = {
     "one drone and empty views": _accepts_small_views,
     "stale views": _accepts_stale_views,
     "age-monotone": age_monotone,
+    "maps within one network": _sends_maps_where_they_are_fused,
     "budget kept": _keeps_budget,
     "viewpoint kept": _viewpoint_keeps_rules,
 }

@@ -10,13 +10,14 @@ from __future__ import annotations
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around, seen_well
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.contract import Directive, FleetView, Representation, boxes_across_networks
 
 AGREEMENT = 0.3
 """Cells of both over cells of either."""
 
 
 @among_attached
+@boxes_across_networks
 def hydracollab(view: FleetView, *, rho: float = 1.0, threshold: float = AGREEMENT) -> list[Directive]:
     """HydraCollab-style: features of what both ends see well where they agree, otherwise detections of what one sees."""
     me = view.me

@@ -12,7 +12,7 @@ from math import exp
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import NO_GOODPUT
-from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView
+from sortie.policies.contract import FEATURE_MAP_MEGABITS, Directive, FleetView, boxes_across_networks
 
 TRUSTED_FOR_S = 0.5
 """The delay at which a map's weight is 1/e."""
@@ -21,6 +21,7 @@ STEPS = 4
 
 
 @among_attached
+@boxes_across_networks
 def syncnet(view: FleetView, *, rho: float = 1.0, trusted_for_s: float = TRUSTED_FOR_S) -> list[Directive]:
     """SyncNet-style: full maps to every peer, weighted by the delay that follows from the link's goodput."""
     me = view.me

@@ -12,7 +12,7 @@ from math import exp
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
-from sortie.policies.contract import Directive, FleetView, nothing
+from sortie.policies.contract import Directive, FleetView, boxes_across_networks, nothing
 
 KEPT_ABOVE = 0.2
 """A link with more attention than this is kept; the method's value in tests."""
@@ -23,6 +23,7 @@ MATCH_BYTES = 32 * 4 + 4
 
 
 @among_attached
+@boxes_across_networks
 def when2com(
     view: FleetView, *, rho: float = 1.0, threshold: float = KEPT_ABOVE, sharpness: float = SHARPNESS
 ) -> list[Directive]:

@@ -14,13 +14,14 @@ from collections.abc import Mapping
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around, seen_well
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView
+from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, boxes_across_networks
 
 REQUEST_MAP_BYTES = FEATURE_CELLS * 2
 """R = 1 − C as one float16 a feature cell (`sortie.perception.network.fusion.traffic`)."""
 
 
 @among_attached
+@boxes_across_networks
 def where2comm(view: FleetView, *, rho: float = 1.0, rounds: int = 1) -> list[Directive]:
     """Where2comm-style: features of where the ego is confident, from round 2 on of what the peer lacks there; to every peer."""
     me = view.me

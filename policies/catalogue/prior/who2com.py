@@ -9,10 +9,11 @@ from __future__ import annotations
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
-from sortie.policies.contract import AGENT_IDS, Directive, FleetView, nothing
+from sortie.policies.contract import AGENT_IDS, Directive, FleetView, boxes_across_networks, nothing
 
 
 @among_attached
+@boxes_across_networks
 def who2com(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     """Who2com-style: full maps to the peers for which the ego is the best of all drones; ties are broken by id."""
     if view.me is None:

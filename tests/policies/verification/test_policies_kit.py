@@ -14,7 +14,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, boxes_across_networks
 from sortie.policies.verification import conformance
 from sortie.policies.verification.conformance import RULES, Check, conform, failing
 from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, shrink, to_json
@@ -23,8 +23,13 @@ FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
 calls = itertools.count()
 
 
+@boxes_across_networks
 def share(view: FleetView, **fields: object) -> list[Directive]:
     return [Directive(view.ego, p, FEATURES, 0.5, None, 5.0, reason="shares")._replace(**fields) for p in view.peers]
+
+
+def forgets_networks(view: FleetView) -> list[Directive]:
+    return [Directive(view.ego, p, FEATURES, 0.5, None, 5.0, reason="shares") for p in view.peers]
 
 
 def mutates(view: FleetView) -> list[Directive]:
@@ -160,6 +165,7 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (rung_as_text, "bounds kept", "representation is 'features', must be in [0, 4], a Representation"),
     (weighs_by_none, "bounds kept", "fusion_weight is None, must be in [0, 1], a number"),
     (links_in_lists, "bounds kept", "must be a drone's id, a whole number"),
+    (forgets_networks, "maps within one network", "features, must be boxes: the peer has another network"),
     (gives_reasons_as_numbers, "bounds kept", "reason is 5, must be text"),
 ]
 

@@ -10,8 +10,9 @@ import pytest
 
 import sortie
 from sortie.perception.surrogate.model import SHIPPED, load, save
+from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Descriptor, FleetView
+from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
@@ -53,8 +54,13 @@ def column(record: SortieRecord, table: str, name: str, drone: int) -> list[floa
 OTHER = ", feature_space: net-b"
 
 
+def maps_to_all(view: FleetView) -> list[Directive]:
+    """A policy that does not know of networks."""
+    return [full_sharing(view.ego, p, 1.0, "everyone") for p in view.peers]
+
+
 def test_maps_of_another_network_take_the_air_and_are_refused() -> None:
-    record = run_sortie(fleet(OTHER), "all-4")
+    record = run_sortie(fleet(OTHER), maps_to_all)
     delivered = {(i, j, why) for i, j, what, status, why in sent(record) if (what, status) == ("features", "delivered")}
     own = {(0, 1, ""), (1, 0, "")}
     foreign = {(i, j, "other_feature_space") for i, j in ((0, 2), (1, 2), (2, 0), (2, 1))}
@@ -62,7 +68,7 @@ def test_maps_of_another_network_take_the_air_and_are_refused() -> None:
     assert fused(record) == {(0, 1, "features"), (1, 0, "features")}
     fates = outcome(record)["payload_fates"]
     assert fates["delivered/other_feature_space"] == sum(why != "" for *_, s, why in sent(record) if s == "delivered")
-    together = run_sortie(fleet(), "all-4")
+    together = run_sortie(fleet(), maps_to_all)
     assert (0, 2, "features") in fused(together), "one network: the same fleet fuses them"
 
 
