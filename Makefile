@@ -24,7 +24,7 @@ sortie: $(STAMP) ## fly the main scenario and print its outcome (SCENARIO=... fo
 	$(BIN)/sortie fly $(SCENARIO)
 
 screenshot: $(STAMP) ## fly the paper's replay and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
-	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot
+	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot --replace
 	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 
 test: $(STAMP) ## run the whole test suite, a worker a core

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import os
+import secrets
 import shutil
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.report_text import replace_section
+
+_PARTIAL, _ASIDE = ".partial", ".old"
 
 
 class RunError(SortieError):
@@ -64,23 +69,26 @@ def ensure_between(path: Path | None, begin: str, end: str) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[Path]:
     """A new temporary folder beside `path` that takes its place at the end; where the block fails, nothing changes.
+
+    Args:
+        path: the folder to be.
+        check: called at the end, while no other process can replace the folder; what it raises leaves the folder as it was.
 
     Raises:
         RunError: the disk refuses.
     """
     place = path.resolve()  # where a link leads: the link stays
-    partial = partial_file(place)
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        yield partial
-        _replace(partial, place)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with partial_path(place, Path.mkdir) as partial:
+            yield partial
+            with _alone(place):
+                check()
+                _replace(partial, place)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -113,21 +121,40 @@ def writing_durably(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: the disk refuses.
     """
-    partial = partial_file(path)
-    try:
+    with partial_path(path, Path.touch) as partial:
         with partial.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
-def partial_file(path: Path) -> Path:
-    """Where a file or folder is written before it is renamed."""
-    return path.with_name(f".{path.name}.partial")
+@contextmanager
+def partial_path(path: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """A file or folder beside `path` under a name that nobody else has, to be written and then renamed.
+
+    What is still there at the end is removed. So is what a process left that was killed: the operating system locks each
+    of them for as long as its process lives.
+
+    Args:
+        path: what it will be.
+        make: makes it, empty: `Path.touch` or `Path.mkdir`.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
+    with _alone(path):
+        _tidy(path)
+        make(partial)
+        handle = os.open(partial, os.O_RDONLY)
+        fcntl.flock(handle, fcntl.LOCK_SH)  # a network disk has no other lock for a folder
+    try:
+        yield partial
+    finally:
+        _remove(partial)
+        os.close(handle)
 
 
 def sync_folder(folder: Path) -> None:
@@ -183,8 +210,50 @@ def _replace(new: Path, path: Path) -> None:
     if not path.exists():
         new.rename(path)
         return
-    aside = path.with_name(f".{path.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)
+    aside = new.with_suffix(_ASIDE)
     path.rename(aside)
     new.rename(path)
     shutil.rmtree(aside)
+
+
+def _tidy(path: Path) -> None:
+    """Remove what killed processes left beside a path. An older folder that had stepped aside comes back."""
+    own = f".{glob.escape(path.name)}.????????"
+    for aside in path.parent.glob(own + _ASIDE):
+        if path.exists():
+            shutil.rmtree(aside)
+        else:
+            aside.rename(path)
+    for left in path.parent.glob(own + _PARTIAL):
+        with suppress(OSError):  # its process lives, or has just removed it
+            handle = os.open(left, os.O_RDONLY)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _remove(left)
+            finally:
+                os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, a folder, or nothing."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Only one block at a time runs for a path, in all threads and processes. A process that is killed leaves no lock."""
+    lock = path.with_name(f".{path.name}.lock")
+    while True:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        if os.fstat(handle).st_nlink:
+            break
+        os.close(handle)  # the one who had the lock has removed its file
+    try:
+        yield
+    finally:
+        lock.unlink()
+        os.close(handle)

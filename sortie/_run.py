@@ -147,13 +147,14 @@ class Run:
 
         return Summary(transitions_table(self.outcome))
 
-    def save(self, path: str | Path, *, recording: bool = True) -> Path:
+    def save(self, path: str | Path, *, recording: bool = True, replace: bool = False) -> Path:
         """Write the run's folder: outcome, tables as Parquet, scenario and, unless `recording` is False, `sortie.rrd`.
 
-        The folder is written whole or not at all. An older run there is replaced.
+        The folder is written whole or not at all. The same run may be there already, with the same fingerprint. Another
+        run is replaced only where `replace` is True.
 
         Raises:
-            RunError: the folder holds something that is no run, or the disk refuses.
+            RunError: the folder holds another run, or something that is no run; or the disk refuses.
         """
 
         def add_recording(folder: Path) -> None:
@@ -162,7 +163,7 @@ class Run:
             save_rrd(self.record, folder / run_folder.RECORDING)
 
         place = as_path("path", path)
-        run_folder.save(self.record, place, add_recording if recording else None)
+        run_folder.save(self.record, place, add_recording if recording else None, replace=replace)
         return place
 
     def report(self, path: str | Path) -> Path:

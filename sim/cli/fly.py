@@ -20,6 +20,7 @@ from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
+from sortie.sim.identity import own_files
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results import run_folder
 
@@ -37,6 +38,9 @@ def fly(
         typer.Option(help="Number of the repetition; each has other random draws under the same seed.", min=0),
     ] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; default: below runs/.")] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the run in the folder, even if it is another one.")
+    ] = False,
     live: Annotated[bool, typer.Option("--live", help="Show the sortie in a Rerun viewer while it flies.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Open the recording in the viewer afterwards.")] = False,
     mavlink: Annotated[
@@ -73,23 +77,34 @@ def fly(
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
         own = _as_filed(_named(scenario), flown.policy.name)
-    path = out_dir or run_folder.default_path(flown, flown.seed if seed is None else seed, number, own)
+    drawn, files = flown.seed if seed is None else seed, _own_files(flown)
+    path = out_dir or run_folder.default_path(flown, drawn, number, own, files)
+    place = path.absolute()  # as it is now: a policy may change the working folder
     run_folder.ensure_writable(path)
+    if not replace:
+        run_folder.ensure_same(path, flown, drawn, number, files)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
-    instead = run_folder.in_place_of(path, flight.fingerprint)
-    flight.save(path, recording=recording)
+    other, note = run_folder.in_place_of(place, flight.fingerprint), ""
+    try:
+        flight.save(place, recording=recording, replace=replace)
+        if other:
+            note = f", in place of {other}"
+    except run_folder.OtherRunError:  # it came meanwhile, or other code flew it: what was flown now is kept too
+        note = f", as {path} holds {other or 'another run'}"
+        path, place = (run_folder.beside(p, flight.fingerprint) for p in (path, place))
+        flight.save(place, recording=recording)
     out.print(flight.summary())
     out.print(flight.decisions())
     report(flight.outcome)
     see = f", see it with: sortie view {path}" if recording else ""
-    out.print(f"kept in [bold]{path}[/bold]{escape(instead)}{see}", soft_wrap=True)
+    out.print(f"kept in [bold]{path}[/bold]{escape(note)}{see}", soft_wrap=True)
     if expected is not None:
         same = "is" if flight.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")
     if view_:
-        view(path)
+        view(place)
 
 
 def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) -> Watchers:
@@ -125,6 +140,14 @@ def _as_filed(scenario: str, policy: str) -> Scenario | None:
         return own if policy == own.policy.name else load(scenario, policy_overrides(policy, own.policy.name))
     except ScenarioError:
         return None
+
+
+def _own_files(scenario: Scenario) -> dict[str, str]:
+    """Digests of the scenario's own files; none where one cannot be read, as the flight then says which."""
+    try:
+        return own_files(scenario)
+    except OSError:
+        return {}
 
 
 @contextmanager

@@ -7,7 +7,7 @@ Entity paths and colours: `sortie.sim.playback.scene`, `sortie.sim.playback.char
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.folders import RunError, partial_file
+from sortie.sim.folders import RunError, partial_path
 from sortie.sim.playback.canvas import Canvas
 from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
@@ -94,21 +94,18 @@ def new_file(path: Path, layout: rrb.Blueprint, application: str = APPLICATION) 
     Raises:
         RunError: the file cannot be written.
     """
-    partial = partial_file(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
-        recording = rr.RecordingStream(application)
-        recording.save(partial, default_blueprint=layout)
-        yield recording
-        recording.flush()
-        recording.disconnect()
-        partial.rename(path)
+        with partial_path(path, Path.touch) as partial:
+            partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
+            recording = rr.RecordingStream(application)
+            recording.save(partial, default_blueprint=layout)
+            yield recording
+            recording.flush()
+            recording.disconnect()
+            partial.rename(path)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def scene_of(record: SortieRecord) -> SceneModel:

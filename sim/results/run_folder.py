@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,25 +31,34 @@ WRITTEN = frozenset(
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
+_INSTEAD = "choose another folder, or replace it with --replace (replace=True)"
 
 
-def default_path(scenario: Scenario, seed: int, replication: int, own: Scenario | None) -> Path:
+class OtherRunError(RunError):
+    """A folder that holds another run, which would be lost."""
+
+
+def default_path(
+    scenario: Scenario, seed: int, replication: int, own: Scenario | None, files: Mapping[str, str] | None = None
+) -> Path:
     """The run's folder, named after what flies: `runs/SCENARIO-sSEED-POLICY`, then `-rN` for a replication.
 
     Six hex digits follow where the scenario is not one of the library as it is shipped. They are a digest of all that
-    flies but the seed, so that other settings, other parameters of the policy, and other files with the same `name`
-    have folders of their own. The same sortie flown again has the same folder.
+    flies but the seed, so that other settings, other parameters of the policy, other files with the same `name`, and
+    an edited policy have folders of their own. The same sortie flown again has the same folder.
 
     Args:
         scenario: what flies.
         seed, replication: of the random draws.
         own: the library's scenario as it is shipped, under the same policy; None for a file of the user's.
+        files: digests of the files that fly with it (`sortie.sim.identity.own_files`).
     """
     policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
     parts = [scenario.name, f"s{seed}", policy, *([f"r{replication}"] if replication else [])]
     flown, filed = (None if s is None else _sorted_json(s) for s in (scenario, own))
     if flown != filed or policy != scenario.policy.name:  # p/a.py and p_a.py read alike here
-        parts.append(hashlib.sha256(str(flown).encode()).hexdigest()[:6])
+        with_files = f"{flown}{json.dumps(dict(files), sort_keys=True)}" if files else str(flown)
+        parts.append(hashlib.sha256(with_files.encode()).hexdigest()[:6])
     return Path("runs") / "-".join(parts)
 
 
@@ -69,20 +78,51 @@ def ensure_writable(path: Path) -> None:
         raise RunError(f"{path}: holds {PAGE}, which is not of the run there; choose another folder or move it")
 
 
-def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None = None) -> dict[str, Any]:
+def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, files: Mapping[str, str]) -> None:
+    """Refuse a folder with a run that was flown from something else, before the sortie is flown; no folder is fine.
+
+    Raises:
+        OtherRunError: naming the first field that differs.
+    """
+    if not (path / OUTCOME).is_file():
+        return
+    new: dict[str, Any] = {"seed": seed, "replication": replication, "own_files": dict(files)}
+    try:
+        about = json.loads((path / RECORD).read_text())
+        old = {name: about[name] for name in new}
+        there = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO)).model_dump(mode="json")
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
+    found = _difference(old, new) or _difference(there, scenario.model_dump(mode="json"))
+    if found is not None:
+        raise OtherRunError(f"{path}: holds another run: {found}; {_INSTEAD}")
+
+
+def save(
+    record: SortieRecord, path: Path, also: Callable[[Path], None] | None = None, *, replace: bool = False
+) -> dict[str, Any]:
     """Write a run to a temporary folder beside `path`, then rename it; returns the outcome.
 
     Args:
         record: what to write.
-        path: the run's folder; an older run there is replaced, with the page and the exports made of it.
+        path: the run's folder. The same record may be there already: it is written anew, and the page and the exports
+            made of it go.
         also: writes further files into the temporary folder (the recording).
+        replace: whether a run with another record may be replaced.
 
     Raises:
+        OtherRunError: a run with another record is there.
         RunError: as `ensure_writable`, or the disk refuses.
     """
+
+    def check() -> None:
+        if not replace and (other := in_place_of(path, record.fingerprint)):
+            raise OtherRunError(f"{path}: holds {other}; {_INSTEAD}")
+
     ensure_writable(path)
+    check()
     result = outcome(record)
-    with replacing(path) as partial:
+    with replacing(path, check) as partial:
         (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
         (partial / SCENARIO).write_text(dump(record.scenario))
         about = {
@@ -104,14 +144,33 @@ def save(record: SortieRecord, path: Path, also: Callable[[Path], None] | None =
     return result
 
 
+def beside(path: Path, fingerprint: str) -> Path:
+    """The folder for a run that found another one in its place."""
+    return path.with_name(f"{path.name}-{fingerprint[:8]}")
+
+
 def in_place_of(path: Path, fingerprint: str) -> str:
-    """What to say of the run that another one with this fingerprint is about to replace; empty where nothing is lost."""
+    """The run in a folder, in words, where its fingerprint is another; empty where there is none."""
+    if not (path / OUTCOME).is_file():
+        return ""
     try:
         old = json.loads((path / OUTCOME).read_text())
-        replaced = f", in place of a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
-        return "" if old["fingerprint"] == fingerprint else replaced
+        there = f"a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
+        return "" if old["fingerprint"] == fingerprint else there
     except (OSError, ValueError, TypeError, LookupError):
-        return ""  # none, or one that nobody can read
+        return "a run that cannot be read"
+
+
+def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = "") -> str | None:
+    """The first field that differs, with both values."""
+    for name in {**new, **old}:
+        there, here = old.get(name), new.get(name)
+        if isinstance(there, Mapping) and isinstance(here, Mapping):
+            if inner := _difference(there, here, f"{within}{name}."):
+                return inner
+        elif there != here:
+            return f"{within}{name} is {there!r} there and {here!r} here"
+    return None
 
 
 def _is_of_the_run(page: Path) -> bool:

@@ -132,7 +132,7 @@ def test_what_was_made_of_a_run_goes_with_it(tmp_path: Path) -> None:
     (path / ".DS_Store").write_text("")
     assert {p.name for p in path.iterdir()} - alone == {"report.html", "bag", "sortie.tlog", ".DS_Store"}
     page = (path / "report.html").read_text()
-    run_folder.save(run_sortie(example("duration_s=0.5")), path)
+    run_folder.save(run_sortie(example("duration_s=0.5")), path, replace=True)
     assert {p.name for p in path.iterdir()} == alone - {"sortie.rrd"}
     (path / "report.html").write_text(page)
     with pytest.raises(
@@ -262,14 +262,61 @@ def test_a_scenario_that_lacks_a_field_in_its_file_flies_with_it_set(
     assert re.fullmatch("open-s1-worked-[0-9a-f]{6}", made.name)
 
 
-def test_a_run_that_another_replaces_is_told(
+def test_another_run_is_replaced_with_replace_alone(
     scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    fly = ("fly", scenario, "--no-recording", "--out", tmp_path / "run", "--set", "duration_s=0.5")
-    for more, told in (((), False), ((), False), (("--seed", 7), True), (("--set", "name=other"), True)):
-        assert command(*fly, *more) == 0
-        assert ("in place of a run of example under worked, seed" in capsys.readouterr().out) is told
+    path = tmp_path / "run"
+    fly = ("fly", scenario, "--no-recording", "--out", path, "--set", "duration_s=0.5")
+    for _ in range(2):  # the same run again loses nothing
+        assert command(*fly) == 0
+        assert "in place of" not in capsys.readouterr().out
+    first = (path / "outcome.json").read_text()
+    advice = "choose another folder, or replace it with --replace (replace=True)"
+    for more, differs in (
+        (("--seed", 7), "seed is 1 there and 7 here"),
+        (("--set", "fleet.drones=3"), "fleet.drones is 5 there and 3 here"),
+        (("--policy", "silence"), "policy.name is 'worked' there and 'silence' here"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr("sortie.fly", lambda *_, **__: pytest.fail("flown"))
+            assert command(*fly, *more) == 2
+        assert capsys.readouterr().err == f"error: {path}: holds another run: {differs}; {advice}\n"
+    assert (path / "outcome.json").read_text() == first
+    assert command(*fly, "--seed", 7, "--replace") == 0
+    assert "in place of a run of example under worked, seed 1" in capsys.readouterr().out
+    assert json.loads((path / "outcome.json").read_text())["seed"] == 7
+
+
+def test_what_other_code_flew_is_kept_beside(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same scenario and seed can have another record then. Neither the older run nor the new one is lost."""
+    monkeypatch.setenv("COLUMNS", "300")
+    path = tmp_path / "run"
+    fly = ("fly", scenario, "--no-recording", "--out", path, "--set", "duration_s=0.5")
+    assert command(*fly) == 0
+    older = json.loads((path / "outcome.json").read_text())
+    (path / "outcome.json").write_text(json.dumps(older | {"fingerprint": "0" * 64}))
+    capsys.readouterr()
+    assert command(*fly) == 0
+    beside = tmp_path / f"run-{older['fingerprint'][:8]}"
+    said = f"kept in {beside}, as {path} holds a run of example under worked, seed 1"
+    assert said in capsys.readouterr().out
+    assert json.loads((path / "outcome.json").read_text())["fingerprint"] == "0" * 64
+    assert run_folder.load(beside).fingerprint == older["fingerprint"]
+
+
+def test_an_edited_policy_has_a_folder_of_its_own(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    policy = "def decide(view):\n    return []\n"
+    fly = ("fly", scenario, "--no-recording", "--policy", "mine.py:decide", "--set", "duration_s=0.5")
+    for text in (policy, f"# edited\n{policy}", policy):
+        Path("mine.py").write_text(text)
+        assert command(*fly) == 0
+    assert len(list(Path("runs").iterdir())) == 2
 
 
 @pytest.mark.parametrize(
@@ -395,7 +442,16 @@ def test_profile_tells_the_rooms_apart(scenario: Path, tmp_path: Path) -> None:
 
 def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: Path) -> None:
     scenario.write_text(BASE.replace("dwell_s: 0.3", "dwell_s: 0.3, changes: [{at_s: 0.5, name: silence}]"))
-    asked = ("fly", str(scenario), "--set", "duration_s=1", "--no-recording", "--out", str(tmp_path / "run"))
+    asked = (
+        "fly",
+        str(scenario),
+        "--replace",
+        "--set",
+        "duration_s=1",
+        "--no-recording",
+        "--out",
+        str(tmp_path / "run"),
+    )
     other = CliRunner().invoke(app, [*asked, "--policy", "boxes"])
     assert "boxes flies to the end: the changes and commands of example are its own policy's" in other.stderr
     assert run_folder.load(tmp_path / "run").totals["policy_changes"] == 0

@@ -1,0 +1,129 @@
+"""Folders and files that several processes write at once, and processes that are killed while they write."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from sim_examples import BASE, example
+
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError, replacing, write_durably
+from sortie.sim.results import run_folder
+
+FLY = "from sortie.sim.cli.app import main; main()"
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from sortie.sim.folders import replacing, writing_durably
+place = Path(sys.argv[2])
+with (replacing if sys.argv[1] == "folder" else writing_durably)(place) as partial:
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_flights_into_one_folder_are_all_kept(tmp_path: Path) -> None:
+    """Those with other draws lie beside it, those with the same record in one folder; nothing else is left."""
+    scenario = tmp_path / "example.yaml"
+    scenario.write_text(BASE)
+    seeds = [1, 1, 2, 3]
+    fly = [sys.executable, "-c", FLY, "fly", scenario, "--set", "duration_s=0.5", "--no-recording", "--out", "runs/one"]
+    flights = [
+        subprocess.Popen(
+            [*map(str, fly), "--seed", str(s)], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for s in seeds
+    ]
+    said = [flight.communicate() for flight in flights]
+    kept = {json.loads(outcome.read_text())["seed"] for outcome in (tmp_path / "runs").glob("*/outcome.json")}
+    for seed, flight, (printed, error) in zip(seeds, flights, said, strict=True):
+        if flight.returncode == 0:
+            assert seed in kept
+            assert "kept in runs/one" in printed
+        else:
+            assert "holds another run: seed is" in error
+            assert flight.returncode == 2
+    folders = sorted((tmp_path / "runs").iterdir())
+    assert len(folders) == len(kept)
+    for folder in folders:
+        assert run_folder.load(folder).seed in kept
+
+
+def test_of_many_writers_each_writes_whole(tmp_path: Path) -> None:
+    """The same record saved by many threads at once: each succeeds, and one whole run is there."""
+    record, path = run_sortie(example("duration_s=0.1")), tmp_path / "run"
+    failed: list[Exception] = []
+    together = threading.Barrier(4)
+
+    def save() -> None:
+        together.wait()
+        try:
+            for _ in range(3):
+                run_folder.save(record, path)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=save) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert list(tmp_path.iterdir()) == [path]
+    assert run_folder.load(path).fingerprint == record.fingerprint
+
+
+def test_a_run_that_came_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    one, other = (run_sortie(example("duration_s=0.1"), seed=seed) for seed in (1, 2))
+    path = tmp_path / "run"
+    refusal = r"run: holds a run of example under worked, seed 1; choose another folder, or replace it with --replace"
+    with pytest.raises(run_folder.OtherRunError, match=refusal):
+        run_folder.save(other, path, also=lambda _: run_folder.save(one, path) and None)
+    assert run_folder.load(path).fingerprint == one.fingerprint
+    run_folder.save(other, path, replace=True)
+    assert run_folder.load(path).fingerprint == other.fingerprint
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_a_killed_writer_left_is_gone_with_the_next_one(kind: str, tmp_path: Path) -> None:
+    place = tmp_path / "made"
+    killed = subprocess.run([sys.executable, "-c", KILLED, kind, str(place)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1, "what it had begun"
+    if kind == "folder":
+        with replacing(place) as partial:
+            (partial / "a").write_text("b")
+    else:
+        write_durably(place, b"b")
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_what_another_writer_is_at_is_left_alone(tmp_path: Path) -> None:
+    place = tmp_path / "made"
+    with replacing(place) as one:
+        (one / "a").write_text("1")
+        with replacing(place) as other:
+            (other / "a").write_text("2")
+        assert (place / "a").read_text() == "2"
+    assert (place / "a").read_text() == "1"
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_a_folder_that_had_stepped_aside_for_a_killed_writer_comes_back(tmp_path: Path) -> None:
+    (tmp_path / ".made.0123abcd.old").mkdir()
+    (tmp_path / ".made.0123abcd.old" / "a").write_text("a day's work")
+
+    def fails() -> None:
+        with replacing(tmp_path / "made"):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(RunError, match="made: cannot be written: No space left on device"):
+        fails()
+    assert (tmp_path / "made" / "a").read_text() == "a day's work"
+    assert list(tmp_path.iterdir()) == [tmp_path / "made"]
