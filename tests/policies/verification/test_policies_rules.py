@@ -1,4 +1,4 @@
-"""The six rules of the plane, each tried to be broken; policies/README.md says where each is enforced."""
+"""The rules of the plane: a test tries to break each of them; policies/README.md says where each is enforced."""
 
 from __future__ import annotations
 
