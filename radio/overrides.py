@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sortie.radio.channel.bursts import PairNumbers, PairStates
 from sortie.radio.channel.traces import Given, LinkTrace
-from sortie.radio.rates import group_mcs, rate_table
+from sortie.radio.rates import mean_group_per, snr_index
 from sortie.radio.settings import AirSettings
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Overrides:
         self._draws: FloatArray = np.zeros((n, n))
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
         self._group_gain_db = 10.0 * float(np.log10(settings.bandwidth_mhz / 20.0))
-        self._group_mcs = group_mcs(settings.group_rate_mbps)
+        self._group_rate_mbps = settings.group_rate_mbps
         self._k_db = settings.rician_k_db
         self._snr_rows: list[list[float]] | None = None
         self._known_rows: list[list[float]] | None = None
@@ -145,9 +145,9 @@ class Overrides:
         for i in np.flatnonzero(traced).tolist():
             missed = float(loss[i])
             if isnan(missed):
-                table = rate_table(20, self._k_db, mpdu_bytes)  # kept: frames come in few lengths
-                per = table.all_per[self._group_mcs][table.index(float(snr_db[i]) + self._group_gain_db)]
-                missed = 1.0 - (1.0 - per) * (1.0 - float(on_top[i]))
+                per = mean_group_per(self._group_rate_mbps, self._k_db, mpdu_bytes)  # kept: frames come in few lengths
+                missed = per[snr_index(float(snr_db[i]) + self._group_gain_db)]
+                missed = 1.0 - (1.0 - missed) * (1.0 - float(on_top[i]))
             if i != sender and draws[i] >= missed:
                 reached.append(i)
         return sorted(reached)

@@ -1,17 +1,20 @@
 """802.11n, ac and ax rates, packet error rates and the rate that an ideal sender picks.
 
-One spatial stream. The packet error rate (PER) of a 1458 B LDPC frame over white noise is a logistic
-in dB, 1 / (1 + e^{a (SNR − s50)}), fitted per MCS (error ≤ 0.036); a frame of L bytes fails with
-1 − (1 − PER)^{L/1458}. On a fading link the *mean* PER is the average of that over the Rician power gain.
-The fits were made for 802.11ax; n and ac use the same modulations and codes, and are given the same curves.
+One spatial stream. Over white noise a frame of L bytes fails with the packet error rate (PER)
+1 − (1 + e^{−a (SNR − s)})^{−w L / 1458}: a, s and w were fitted for each MCS to the error tables of ns-3 3.44, which come
+from link simulations (`tests/validation/ns3/per_fit.py`; largest error 0.022, SNR in dB). On a fading link the *mean* PER
+is the average of that over the Rician power gain. The fits were made for 802.11ax (LDPC); n and ac use the same modulations
+and codes, and are given the same curves. Group-addressed frames go at the rates of 802.11a, whose convolutional code has
+curves of its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import exp, expm1, log1p
-from typing import Literal
+from math import exp, expm1, log, log1p
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,26 +69,66 @@ STANDARDS: dict[StandardName, Standard] = {
 }  # fmt: skip
 """One spatial stream, guard interval 0.8 µs. 802.11n has no 80 MHz, 802.11ac no MCS 9 at 20 MHz."""
 
-S50_DB = (-0.94, 2.07, 4.56, 7.55, 10.61, 14.78, 16.15, 17.66, 21.29, 23.10, 26.39, 28.45)
-SLOPE_PER_DB = (9.3, 9.1, 10.1, 7.8, 9.1, 7.9, 7.9, 7.4, 7.0, 6.8, 6.4, 5.8)
+
+class PerCurve(NamedTuple):
+    """PER over SNR of one modulation and code over white noise."""
+
+    centre_db: float
+    slope_per_db: float
+    weight: float
+    """Exponent for a frame of 1458 B."""
+
+    def per(self, snr_db: float, length_bytes: float = 1458) -> float:
+        """PER of one frame, 0 … 1."""
+        x = self.slope_per_db * (snr_db - self.centre_db)
+        # log(1 + e^{−x}) without overflow
+        softplus = log1p(exp(-x)) if x > 0 else log1p(exp(x)) - x
+        return -expm1(-self.weight * softplus * length_bytes / REFERENCE_BYTES)
+
+    def snr_db(self, per: float, length_bytes: float = 1458) -> float:
+        """The SNR at which a frame has this PER, 0 < PER < 1."""
+        softplus = -log1p(-per) / self.weight * REFERENCE_BYTES / length_bytes
+        return self.centre_db - log(expm1(softplus)) / self.slope_per_db
+
+
+CURVES = (
+    PerCurve(-1.159, 6.018, 2.792),
+    PerCurve(1.907, 6.2, 2.133),
+    PerCurve(4.417, 6.657, 2.089),
+    PerCurve(7.364, 5.554, 2.247),
+    PerCurve(10.452, 6.269, 2.116),
+    PerCurve(14.569, 5.748, 2.522),
+    PerCurve(16.03, 5.87, 1.67),
+    PerCurve(17.488, 5.473, 1.956),
+    PerCurve(21.094, 5.21, 2.216),
+    PerCurve(22.857, 4.914, 2.466),
+    PerCurve(25.941, 4.325, 4.799),
+    PerCurve(28.195, 4.441, 2.294),
+)
+"""HE MCS 0 … 11, LDPC."""
+LEGACY_CURVES = {
+    6.0: PerCurve(-0.61, 3.061, 12.283),
+    12.0: PerCurve(2.266, 2.722, 14.485),
+    18.0: PerCurve(4.74, 2.821, 15.656),
+    24.0: PerCurve(7.791, 2.462, 11.744),
+    36.0: PerCurve(10.684, 2.495, 22.048),
+    48.0: PerCurve(14.854, 2.147, 14.348),
+    54.0: PerCurve(16.132, 2.147, 15.536),
+}
+"""802.11a by rate in Mb/s, convolutional code, fitted for frames below 400 B. 9 Mb/s has no table."""
 REFERENCE_BYTES = 1458
 NO_LINK_PER = 0.9
 """Above this mean PER at MCS 0 there is no link."""
 
 _STEP_DB = 0.05
 _LOW_DB, _HIGH_DB = -20.0, 60.0
+_GRID_DB = np.arange(_LOW_DB, _HIGH_DB + _STEP_DB / 2, _STEP_DB)
 _FADE_LOW_DB, _FADE_HIGH_DB = -40.0, 15.0
-
-LEGACY_RATES_MBPS = (6.0, 12.0, 18.0, 24.0, 36.0, 48.0, 54.0)
-"""802.11a rates whose modulation and code rate are those of HE MCS 0 … 6 (9 Mb/s has no such twin)."""
 
 
 def per(snr_db: float, mcs: int, length_bytes: float = REFERENCE_BYTES) -> float:
-    """PER of one frame at a fixed SNR (no fading), 0 … 1."""
-    x = SLOPE_PER_DB[mcs] * (snr_db - S50_DB[mcs])
-    # log of the success probability of the reference frame, −log(1 + e^{−x}), without overflow
-    log_success = -log1p(exp(-x)) if x > 0 else x - log1p(exp(x))
-    return -expm1(log_success * length_bytes / REFERENCE_BYTES)
+    """PER of one HE frame at a fixed SNR (no fading), 0 … 1."""
+    return CURVES[mcs].per(snr_db, length_bytes)
 
 
 def rescale(per_at: float, ratio: float) -> float:
@@ -110,6 +153,12 @@ def fading_weights(k_db: float) -> tuple[FloatArray, FloatArray]:
     return centres, np.diff(cdf)
 
 
+def snr_index(mean_snr_db: float) -> int:
+    """Where a mean SNR (dB) stands on the grid of `RateTable`; beyond its ends, the end."""
+    i = int((mean_snr_db - _LOW_DB) / _STEP_DB + 0.5) if mean_snr_db > _LOW_DB else 0
+    return i if i < len(_GRID_DB) else len(_GRID_DB) - 1
+
+
 @dataclass(frozen=True, slots=True)
 class RateTable:
     """What an ideal rate control does at each mean SNR; lists over a 0.05 dB grid, for fast look-up."""
@@ -124,15 +173,25 @@ class RateTable:
     all_per: tuple[tuple[float, ...], ...]
     """Mean PER of each MCS."""
 
-    def index(self, mean_snr_db: float) -> int:
-        """Where a mean SNR (dB) stands on the grid; beyond its ends, the end."""
-        i = int((mean_snr_db - _LOW_DB) / _STEP_DB + 0.5) if mean_snr_db > _LOW_DB else 0
-        return i if i < len(self.mcs) else len(self.mcs) - 1
+    index = staticmethod(snr_index)
 
     def at(self, mean_snr_db: float) -> tuple[int, float, float]:
         """(MCS, rate in Mb/s, mean PER) at a mean SNR in dB; MCS −1 is no link."""
         i = self.index(mean_snr_db)
         return self.mcs[i], self.rate_mbps[i], self.mean_per[i]
+
+
+def _mean_per(curves: Sequence[PerCurve], k_db: float, frame_bytes: int) -> FloatArray:
+    """[curves, grid]: mean PER over Rician fading by quadrature, on the grid of `RateTable`."""
+    _, weights = fading_weights(k_db)
+    wide = np.arange(_LOW_DB + _FADE_LOW_DB, _HIGH_DB + _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
+    centre, slope, weight = (column[:, None] for column in np.array(curves).T)
+    log_success = -weight * np.logaddexp(0.0, -slope * (wide - centre))
+    awgn = -np.expm1(log_success * (frame_bytes / REFERENCE_BYTES))
+    # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities; einsum adds in the
+    # same order on every machine, np.correlate does not
+    windows = np.lib.stride_tricks.sliding_window_view(awgn, len(weights), axis=1)[:, : len(_GRID_DB)]
+    return np.asarray(np.einsum("mgw,w->mg", windows, weights).clip(0.0, 1.0))
 
 
 @lru_cache(maxsize=64)
@@ -148,19 +207,10 @@ def rate_table(
         standard: whose rates; its MCS are the first ones of 802.11ax.
     """
     rates = np.array(STANDARDS[standard].rates_mbps[bandwidth_mhz])
-    _, weights = fading_weights(k_db)
-    grid = np.arange(_LOW_DB, _HIGH_DB + _STEP_DB / 2, _STEP_DB)
-    wide = np.arange(_LOW_DB + _FADE_LOW_DB, _HIGH_DB + _FADE_HIGH_DB + _STEP_DB / 2, _STEP_DB)
-    s50, slope = np.array(S50_DB)[: len(rates), None], np.array(SLOPE_PER_DB)[: len(rates), None]
-    log_success = -np.logaddexp(0.0, -slope * (wide - s50))
-    awgn = -np.expm1(log_success * (frame_bytes / REFERENCE_BYTES))
-    # mean over the gain g of PER(snr + g): a correlation of the PER curve with the bins' probabilities; einsum adds in the
-    # same order on every machine, np.correlate does not
-    windows = np.lib.stride_tricks.sliding_window_view(awgn, len(weights), axis=1)[:, : len(grid)]
-    mean = np.einsum("mgw,w->mg", windows, weights).clip(0.0, 1.0)
+    mean = _mean_per(CURVES[: len(rates)], k_db, frame_bytes)
     best = (rates[:, None] * (1.0 - mean)).argmax(axis=0)
     dead = mean[0] > NO_LINK_PER
-    columns = np.arange(len(grid))
+    columns = np.arange(len(_GRID_DB))
     return RateTable(
         bandwidth_mhz,
         frame_bytes,
@@ -182,6 +232,12 @@ def choose_mcs(
     return rate_table(bandwidth_mhz, k_db, frame_bytes, standard).at(mean_snr_db)
 
 
-def group_mcs(rate_mbps: float) -> int:
-    """The MCS whose PER curve stands for a legacy basic rate (same modulation and code rate, or the next above)."""
-    return next((i for i, r in enumerate(LEGACY_RATES_MBPS) if r >= rate_mbps - 1e-9), len(LEGACY_RATES_MBPS) - 1)
+def group_curve(rate_mbps: float) -> PerCurve:
+    """PER of group-addressed frames at a basic rate, or at the next 802.11a rate above it that has a curve."""
+    return next((c for rate, c in LEGACY_CURVES.items() if rate >= rate_mbps - 1e-9), LEGACY_CURVES[54.0])
+
+
+@lru_cache(maxsize=64)
+def mean_group_per(rate_mbps: float, k_db: float, frame_bytes: int) -> tuple[float, ...]:
+    """Mean PER of group-addressed frames at each mean SNR of `RateTable`'s grid."""
+    return tuple(_mean_per([group_curve(rate_mbps)], k_db, frame_bytes)[0].tolist())

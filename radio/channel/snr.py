@@ -19,7 +19,7 @@ from sortie.radio.channel.earshot import IntArray, LinkList, all_links
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
-from sortie.radio.rates import REFERENCE_BYTES, S50_DB, SLOPE_PER_DB, group_mcs
+from sortie.radio.rates import CURVES, REFERENCE_BYTES, PerCurve, group_curve
 from sortie.radio.settings import AirSettings
 from sortie.scenarios.streams import stream
 
@@ -33,8 +33,8 @@ SQUARE = 32
 """Fleets of up to so many drones work out every link; larger ones those within earshot."""
 OUT_OF_RANGE_DB = -100.0
 """SNR that is reported for a link out of earshot."""
-SAFE_DB = 5.0
-"""Above s50 by this, fewer than one group frame in 10^12 is lost: for large fleets, none."""
+_SURE_PER = 1e-12
+"""In large fleets a link on which fewer group frames than this are lost loses none."""
 _EARSHOT_SIGMA = 5.0
 _BLOCK_NUMBERS = 1 << 18
 
@@ -51,18 +51,18 @@ def earshot_m(settings: AirSettings) -> float:
     half the group frames.
     """
     gain_db = _EARSHOT_SIGMA * settings.shadowing_sigma_db + float(fade_table_db(settings.rician_k_db)[-1])
-    needed_db = min(
-        S50_DB[0], S50_DB[group_mcs(settings.group_rate_mbps)] - 10.0 * log10(settings.bandwidth_mhz / 20.0)
-    )
+    group_db = group_curve(settings.group_rate_mbps).snr_db(0.5) - 10.0 * log10(settings.bandwidth_mhz / 20.0)
+    needed_db = min(CURVES[0].snr_db(0.5), group_db)
     noise = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
     return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
 
 
-def _reach_at_1(draws: AnyFloats) -> AnyFloats:
-    """How long a frame may be, bytes, to arrive with these draws where −log s (see `Channel._reach`) is 1."""
+def _reach_at_1(draws: AnyFloats, curve: PerCurve) -> AnyFloats:
+    """How long a frame may be, bytes, to arrive with these draws where −log s (see `Channel._reach`) is the weight."""
+    scale = -REFERENCE_BYTES / curve.weight
     if draws.dtype == np.float32:  # in steps of 2⁻²⁴, whose difference from 1 is exact
-        return np.asarray(-REFERENCE_BYTES * np.log(1.0 - draws))
-    return np.asarray(-REFERENCE_BYTES * np.log1p(-draws))
+        return np.asarray(scale * np.log(1.0 - draws))
+    return np.asarray(scale * np.log1p(-draws))
 
 
 class FrameLinks:
@@ -139,8 +139,7 @@ class Channel:
         self.noise_dbm = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
         self._group_gain_db = 10.0 * log10(settings.bandwidth_mhz / 20.0)
-        mcs = group_mcs(settings.group_rate_mbps)
-        self._group_s50_db, self._group_slope = S50_DB[mcs], SLOPE_PER_DB[mcs]
+        self._curve = group_curve(settings.group_rate_mbps)
         self._frame_s = frame_s
         self._field: ShadowField | None = None
         if settings.shadowing_distance_m is not None:
@@ -283,14 +282,14 @@ class Channel:
         return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
 
     def _reach(self, faded_db: AnyFloats, draws: AnyFloats) -> AnyFloats:
-        # a frame of L bytes arrives with probability s^(L / 1458), s for the reference length: so while u < s^(L / 1458)
-        x = faded_db + (self._group_gain_db - self._group_s50_db)
-        x *= -self._group_slope
+        # a frame of L bytes arrives with probability s^(w L / 1458), w being the curve's weight: so while u is below that
+        x = faded_db + (self._group_gain_db - self._curve.centre_db)
+        x *= -self._curve.slope_per_db
         is_single = x.dtype == np.float32
         np.minimum(x, 80.0 if is_single else 700.0, out=x)  # keeps the exponential finite
         minus_log_s: AnyFloats = np.log1p(np.exp(x, out=x), out=x)
         np.maximum(minus_log_s, 1e-30 if is_single else 1e-300, out=minus_log_s)
-        minus_log_s = np.divide(_reach_at_1(draws), minus_log_s, out=minus_log_s)
+        minus_log_s = np.divide(_reach_at_1(draws, self._curve), minus_log_s, out=minus_log_s)
         return minus_log_s
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
@@ -317,7 +316,8 @@ class Channel:
         if self._crowd is not None:
             self.links, gain_db, self._shadow_db = self._crowd.block(self.frame, p, up)
             self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
-            safe_db = self._group_s50_db - self._group_gain_db + SAFE_DB - float(fade_table_db(c.rician_k_db)[0])
+            sure_db = self._curve.snr_db(_SURE_PER) - self._group_gain_db
+            safe_db = sure_db - float(fade_table_db(c.rician_k_db)[0])
             risky = np.flatnonzero(self._snr_db.min(axis=0) < safe_db)
             fades_db, draws = self._crowd.chance(0, len(p), risky)
             self._all_ids = self.links.receiver[self.links.by_sender]

@@ -10,14 +10,17 @@ from scipy import integrate, stats
 from sortie.radio.channel.pathloss import free_space_loss_db, log_distance_loss_db
 from sortie.radio.channel.snr import Channel, noise_dbm
 from sortie.radio.rates import (
-    LEGACY_RATES_MBPS,
+    CURVES,
+    LEGACY_CURVES,
     NO_LINK_PER,
     STANDARDS,
     choose_mcs,
-    group_mcs,
+    group_curve,
+    mean_group_per,
     per,
     rate_table,
     rescale,
+    snr_index,
 )
 from sortie.radio.settings import AirSettings
 
@@ -122,8 +125,10 @@ def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None
 def test_group_frames_arrive_as_often_as_their_per_says() -> None:
     config = AirSettings(shadowing_sigma_db=0.0, rician_k_db=40.0)
     channel = Channel(config, still(CROSS_M[:2]), 1, 0, 0.1)
-    loss_db = 20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) + 0.94 - 0.1
-    extra = np.full((2, 2), loss_db)  # leaves 0.1 dB above s50 in the primary 20 MHz
+    curve = group_curve(6.0)
+    left_db = curve.snr_db(0.5, 700)
+    loss_db = 20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) - left_db
+    extra = np.full((2, 2), loss_db)  # leaves so much in the primary 20 MHz that half the frames of 700 B are lost
     fade_db = stats.norm(0, 10 / np.log(10) * np.sqrt(2 / 1e4))  # what K = 40 dB leaves of it
     for length in (304, 1458):
         heard, again = [], []
@@ -132,7 +137,7 @@ def test_group_frames_arrive_as_often_as_their_per_says() -> None:
             heard.append(channel.group_reach_bytes[0, 1] >= length)
             again.append(channel.heard(0, length, 1) == [1])
         expected = integrate.quad(
-            lambda g, n=length, fade_db=fade_db: (1 - per(-0.84 + g, 0, n)) * fade_db.pdf(g), -0.5, 0.5
+            lambda g, n=length, fade_db=fade_db: (1 - curve.per(left_db + g, n)) * fade_db.pdf(g), -0.5, 0.5
         )[0]
         assert np.mean(heard) == pytest.approx(expected, abs=0.025)
         assert np.mean(again) == pytest.approx(expected, abs=0.025)
@@ -199,9 +204,13 @@ def test_wrong_shapes_are_refused() -> None:
 # --- rates -----------------------------------------------------------------------------------------
 
 
-def test_per_is_a_half_at_s50_and_scales_with_length() -> None:
-    assert per(14.78, 5) == pytest.approx(0.5)
-    assert per(14.78, 5, 2 * 1458) == pytest.approx(0.75)
+def test_per_follows_its_curve_and_scales_with_length() -> None:
+    curve = CURVES[5]
+    assert per(curve.centre_db, 5) == pytest.approx(1.0 - 0.5**curve.weight)
+    half_db = curve.snr_db(0.5)
+    assert per(half_db, 5) == pytest.approx(0.5)
+    assert per(half_db, 5, 2 * 1458) == pytest.approx(0.75)
+    assert per(curve.snr_db(1e-9, 300), 5, 300) == pytest.approx(1e-9)
     assert rescale(0.5, 2.0) == pytest.approx(0.75)
     assert per(-500.0, 11) == 1.0
     assert per(500.0, 0) == pytest.approx(0.0, abs=1e-12)
@@ -238,6 +247,16 @@ def test_no_link_below_mcs_zero_and_the_top_rate_above() -> None:
     assert table.all_per[0][edge] <= NO_LINK_PER < table.all_per[0][edge - 1]
 
 
-def test_basic_rates_borrow_the_curve_of_their_modulation() -> None:
-    assert [group_mcs(r) for r in LEGACY_RATES_MBPS] == [0, 1, 2, 3, 4, 5, 6]
-    assert (group_mcs(1.0), group_mcs(9.0)) == (0, 1)
+def test_basic_rates_have_curves_of_their_own() -> None:
+    assert [group_curve(rate) for rate in LEGACY_CURVES] == list(LEGACY_CURVES.values())
+    assert group_curve(1.0) is LEGACY_CURVES[6.0]
+    assert group_curve(9.0) is LEGACY_CURVES[12.0]
+    halves_db = [curve.snr_db(0.5, 334) for curve in LEGACY_CURVES.values()]
+    assert halves_db == sorted(halves_db)
+    assert all(legacy > he.snr_db(0.5, 334) for legacy, he in zip(halves_db, CURVES, strict=False))  # no LDPC
+
+
+def test_mean_per_of_group_frames_without_fading_is_their_curve() -> None:
+    mean = mean_group_per(24.0, 40.0, 334)
+    for snr_db in (4.0, 8.0, 9.0, 10.0, 14.0):
+        assert mean[snr_index(snr_db)] == pytest.approx(group_curve(24.0).per(snr_db, 334), abs=0.02)
