@@ -6,10 +6,10 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
 
-.PHONY: help sortie screenshot test quick lint check format bench figures clean scenarios notebooks
+.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 clean scenarios notebooks
 
 help: ## show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -55,6 +55,12 @@ bench: $(STAMP) ## run the benchmarks
 
 figures: $(STAMP) ## measure the pages' figures again, hours in all (FIGURE=name for one; FIGURE=--list, FIGURE=--render)
 	$(BIN)/python tests/validation/figures.py $(FIGURE)
+
+validate-ns3: ns3 ## run the same plans through ns-3 and through the radio, and write the table of radio/README.md (needs g++)
+	$(BIN)/python tests/validation/figures.py ns3
+
+ns3: $(STAMP) ## install ns-3's wheel (Linux on x86-64; 450 MB)
+	$(BIN)/python -m pip install --quiet --retries 1 -c constraints.txt -e '.[ns3]'
 
 clean: ## remove runs and caches, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info

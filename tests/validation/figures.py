@@ -167,6 +167,13 @@ def _radio_scale() -> Tables:
     return link.scale_tables()
 
 
+def _ns3() -> Tables:
+    sys.path.insert(0, str(ROOT / "tests/validation/ns3"))
+    import wifi_compare
+
+    return wifi_compare.tables()
+
+
 def _transport() -> Tables:
     import transport
 
@@ -590,6 +597,7 @@ FIGURES: dict[str, Figure] = {
     "fusion_age": Figure(4, _fusion_age),
     "late_shares": Figure(2, _late_shares),
     "link": Figure(5, _link),
+    "ns3": Figure(15, _ns3, timed=True),
     "transport": Figure(6, _transport),
     "paper": Figure(8, _paper),
     "conditions_first": Figure(8, _conditions_first),
