@@ -12,7 +12,7 @@ from sortie.sim.cli.console import out
 from sortie.sim.folders import RunError, ensure_folder
 from sortie.sim.results import run_folder
 
-BAG, TLOG = "bag", "sortie.tlog"
+BAG, TLOG, PCAP = "bag", "sortie.tlog", "sortie.pcap"
 BEGIN = "2026-01-01T00:00:00"
 """When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -25,6 +25,9 @@ def export(
     ] = False,
     tlog: Annotated[
         bool, typer.Option("--tlog", help="Write a MAVLink telemetry log: one file, one system id per drone.")
+    ] = False,
+    pcap: Annotated[
+        bool, typer.Option("--pcap", help="Write a packet capture for Wireshark: RTPS over UDP, one file.")
     ] = False,
     out_path: Annotated[Path | None, typer.Option("--out", help="Output path; default: in the run's folder.")] = None,
     begin: Annotated[str, typer.Option(help="Start time of the sortie, ISO 8601; UTC without a zone.")] = BEGIN,
@@ -39,15 +42,15 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, or as a log for ground stations."""
-    if mcap == tlog:
-        raise typer.BadParameter("name one format: --mcap or --tlog")
+    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, as a log for ground stations, or as packets."""
+    if mcap + tlog + pcap != 1:
+        raise typer.BadParameter("name one format: --mcap, --tlog or --pcap")
     if key is not None and not tlog:
         raise typer.BadParameter("--key signs --tlog alone")
     if origin is not None and not tlog:
         raise typer.BadParameter("--origin places --tlog alone")
     # ROS counts seconds in 32 bits, signatures from 2015 on; beyond 2096 a log's stamps are no times
-    first, end = (1970, 2038) if mcap else (2015 if key is not None else 1970, 2096)
+    first, end = (1970, 2038) if mcap or pcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
     if tlog:
         from sortie.sim.export.telemetry import ORIGIN, parse_origin, read_key, save_tlog
@@ -56,6 +59,14 @@ def export(
         where = ORIGIN if origin is None else parse_origin(origin)
         frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
+        return
+    if pcap:
+        from sortie.sim.export.pcap import write_pcap
+
+        path = out_path or run / PCAP
+        sent = write_pcap(run_folder.load(run), path, began_us * 1000)
+        parts = ", ".join(f"{count} {kind}" for kind, count in sent.items())
+        out.print(f"{sum(sent.values())} packets ({parts}), in [bold]{path}[/bold]", soft_wrap=True)
         return
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is

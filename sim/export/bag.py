@@ -14,7 +14,6 @@ record holds no estimated pose, so a descriptor's is the true one here.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.fleet.coverage import TARGET_FLAG, footprint_radius_m
 from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
@@ -31,8 +29,7 @@ from sortie.fleet.messages.wire import (
     encode_descriptor,
     encode_directive,
 )
-from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
-from sortie.scenarios.representation import REPRESENTATION_OF
+from sortie.sim.export.messages import descriptors, directives
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import replacing
 from sortie.sim.results.outcome import transitions
@@ -57,67 +54,6 @@ class Message(NamedTuple):
     topic: str
     type: str
     value: bytes | Any
-
-
-def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
-    """Every published descriptor with its time; position and attitude are the true ones of the capture's frame."""
-    rows = record.tables["descriptors"].to_pylist()
-    n, states = record.scenario.fleet.drones, record.tables["states"]
-    names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
-    x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
-    rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.fleet.feature_spaces
-    mission, group_of = record.tables["mission"], record.scenario.mission.group_of
-    targets = {
-        (int(t_s * rate_hz + 1e-6), group): target
-        for t_s, group, target in zip(*(mission[name].to_pylist() for name in ("t_s", "group", "target")), strict=True)
-    }
-    for row in rows:
-        frame = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1)
-        k = frame * n + row["drone"]
-        region = (
-            None
-            if math.isnan(row["region_radius_m"])
-            else Disc(*(row[f"region_{c}"] for c in ("x_m", "y_m", "radius_m")))
-        )
-        yield row["t_s"], Descriptor(
-            stamp_ns=row["stamp_ns"],
-            agent_id=row["drone"],
-            position_m=(float(x[k]), float(y[k]), float(z[k])),
-            orientation_xyzw=(float(qx[k]), float(qy[k]), float(qz[k]), float(qw[k])),
-            velocity_mps=(float(vx[k]), float(vy[k]), float(vz[k])),
-            footprint_radius_m=footprint_radius_m(float(z[k])),
-            battery_soc=row["soc"],
-            cpu_headroom=row["cpu_headroom"],
-            gpu_headroom=row["gpu_headroom"],
-            peer_goodput_mbps=tuple(row["goodput_mbps"]),
-            coverage_grid=row["coverage_grid"],
-            novelty_flags=row["novelty_flags"],
-            task_phase=PHASE_OF[row["phase"]],
-            region=region,
-            feature_space=spaces[row["drone"]],
-            priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
-        )  # fmt: skip
-
-
-def directives(record: SortieRecord) -> Iterator[tuple[float, Directive]]:
-    """Every directive that a gate took up, with its time."""
-    for row in record.tables["directives"].to_pylist():
-        x, y, radius = (row[f"roi_{c}"] for c in ("x_m", "y_m", "radius_m"))
-        yield (
-            row["t_s"],
-            Directive(
-                source=row["drone"],
-                destination=row["peer"],
-                representation=REPRESENTATION_OF[row["representation"]],
-                rho=row["rho"],
-                roi=None if math.isnan(radius) else Disc(x, y, radius),
-                rate_hz=row["rate_hz"],
-                deadline_s=row["deadline_s"],
-                fusion_weight=row["fusion_weight"],
-                duty_percent=row["duty_percent"],
-                reason=row["reason"],
-            ),
-        )
 
 
 def write_bag(record: SortieRecord, path: Path, begin_ns: int) -> dict[str, int]:

@@ -20,7 +20,8 @@ from sortie.fleet.messages.wire import decode_descriptor, decode_directive
 from sortie.policies.contract import Descriptor
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.export.bag import descriptors, write_bag
+from sortie.sim.export.bag import write_bag
+from sortie.sim.export.messages import descriptors
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
