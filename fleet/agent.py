@@ -33,6 +33,7 @@ from sortie.policies.contract import (
     Disc,
     FleetView,
     Policy,
+    Roster,
     TaskPhase,
     check_directives,
     nothing,
@@ -166,6 +167,7 @@ class Agent:
         self._links: dict[int, _OutgoingLink] = {}
         self._alert = False  # whether it knows of a person in its region
         self._published: Descriptor | None = None
+        self._roster = Roster(0, (self.drone,))
         self._chart = Chart()
         self._clock_off_s = 0.0
         self._look: Sensed | None = None
@@ -223,6 +225,10 @@ class Agent:
         grid, novel = self._covered(capture.t_s, here, due)
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids, person = self._senses.task()
+        roster = self._renew_roster() if self._rules.roster else None
+        measured_mbps = self._modem.goodput_mbps()
+        if roster is not None:  # with room for the probes of drones beyond the scenario's fleet
+            measured_mbps += (0.0,) * (roster.members[-1] - len(measured_mbps))
         descriptor = Descriptor(
             stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
             agent_id=self.drone,
@@ -233,7 +239,7 @@ class Agent:
             battery_soc=soc,
             cpu_headroom=cpu_headroom,
             gpu_headroom=gpu_headroom,
-            peer_goodput_mbps=self.memory.probes.fill(self.drone, self._modem.goodput_mbps(), self._env.now),
+            peer_goodput_mbps=self.memory.probes.fill(self.drone, measured_mbps, self._env.now),
             coverage_grid=grid,
             novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids) + PERSON_FLAG * person,
             task_phase=phase,
@@ -241,6 +247,8 @@ class Agent:
             priority_target_ids=target_ids,
             feature_space=self.status.feature_space,
         )
+        if roster is not None:
+            descriptor = descriptor.with_roster(roster)
         if self._published is not None:
             # by the publisher, not by those who hear it: what they read would depend on which packets they lost
             descriptor = apply_hysteresis(self._published, descriptor, self._rules.hysteresis)
@@ -256,6 +264,13 @@ class Agent:
         self._log.descriptor(self._env.now, claimed, len(datagram))
         # a drone that lies decides by its true state
         return decode_descriptor(payload if claimed is descriptor else self._encode(descriptor))
+
+    def _renew_roster(self) -> Roster:
+        """The drone's roster by what it has heard up to now; a new epoch where that is another set."""
+        members = self.memory.view(self._env.now).members
+        if members != self._roster.members:
+            self._roster = Roster(self._roster.epoch + 1, members)
+        return self._roster
 
     def _covered(self, now_s: float, here: View, told: bool) -> tuple[bytes, bool]:
         """The coverage grid, by the latest look, and whether it shows what the fleet had not seen; nothing without a look."""

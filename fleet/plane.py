@@ -31,6 +31,8 @@ class PlaneRules:
     """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL
     """The resolution of descriptors on the wire."""
+    roster: bool = False
+    """Whether drones publish which members of the fleet they know (`sortie.policies.contract.Roster`)."""
 
     @property
     def descriptor_period_s(self) -> float:

@@ -141,10 +141,11 @@ def judge(
         standing = before[peer]
         doubt = ""
         if peer != ego:
+            came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
             others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
             doubt = (
                 (coverage_doubt(claim, form.blur_m, peer in looking) if math.isfinite(form.blur_m) else "")
-                or goodput_doubt(claim.goodput_to(ego), arrivals.get(peer, ()), form.goodput_step_mbps)
+                or goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
                     standing.least_soc,

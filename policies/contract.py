@@ -14,6 +14,7 @@ import functools
 import inspect
 import math
 import operator
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
@@ -71,6 +72,20 @@ class Coverage(IntEnum):
     NOVEL = 3
 
 
+class Roster(NamedTuple):
+    """The drones that one drone counts as members of the fleet."""
+
+    epoch: int
+    """How often the set has changed since this drone began. Epochs of two drones cannot be compared."""
+    members: tuple[int, ...]
+    """Their ids, ascending, the drone's own among them. Drones that know the same members have equal tuples."""
+
+    def slot(self, drone: int) -> int | None:
+        """A drone's place among the members; None if it is none."""
+        at = bisect_left(self.members, drone)
+        return at if at < len(self.members) and self.members[at] == drone else None
+
+
 class Descriptor(NamedTuple):
     """One drone's context, with the fields of the paper's schema (180 B as CDR with five drones)."""
 
@@ -87,7 +102,8 @@ class Descriptor(NamedTuple):
     gpu_headroom: float
     """The same of its accelerator."""
     peer_goodput_mbps: tuple[float, ...]
-    """To every other drone of the roster by ascending id, as measured by this drone; `link_state` says what 0 means."""
+    """As measured by this drone, to every other drone by ascending id; with a `roster`, to its other members alone. Read
+    it by `goodput_to`; `link_state` says what 0 means."""
     coverage_grid: bytes
     """64 B, four cells a byte, lowest bits first, row by row from south-west."""
     novelty_flags: int
@@ -99,6 +115,10 @@ class Descriptor(NamedTuple):
     """The network that makes this drone's feature maps; only maps of one space can be fused. Empty: the fleet's common one.
 
     An optional field: it is on the wire where it is not empty (`sortie.fleet.messages.extensions`)."""
+    roster: Roster | None = None
+    """The members that this drone knows, and whom its goodputs belong to. None: it publishes no roster.
+
+    An optional field, as `feature_space`."""
 
     @property
     def coverage_corner(self) -> tuple[int, int]:
@@ -113,9 +133,33 @@ class Descriptor(NamedTuple):
 
     def goodput_to(self, peer: int) -> float:
         """Goodput to `peer`, Mb/s, as this drone measured it (0 where unknown and off the roster; `link_state` explains tiny values)."""
-        me, known = self.agent_id, self.peer_goodput_mbps
-        slot = peer - (peer > me)
-        return known[slot] if peer != me and slot < len(known) else 0.0
+        return goodput_in(self.peer_goodput_mbps, self.agent_id, self.roster, peer)
+
+    def counts(self, drone: int) -> bool:
+        """Whether this drone counts another as a member of the fleet; true of all where it publishes no roster."""
+        return self.roster is None or drone in self.roster.members
+
+    def goodput_by_id(self, drones: int) -> tuple[float, ...]:
+        """Goodput to every other of the drones 0 … `drones` − 1, by ascending id; 0 for those off the roster."""
+        if self.roster is None:
+            return self.peer_goodput_mbps
+        return tuple([self.goodput_to(i) for i in range(drones) if i != self.agent_id])
+
+    def with_roster(self, roster: Roster) -> Descriptor:
+        """The same descriptor with this roster, and with goodputs to its members alone."""
+        goodput_mbps = tuple([self.goodput_to(i) for i in roster.members if i != self.agent_id])
+        return self._replace(peer_goodput_mbps=goodput_mbps, roster=roster)
+
+
+def goodput_in(known: tuple[float, ...], me: int, roster: Roster | None, peer: int) -> float:
+    """Goodput to `peer` in the list of drone `me`: the only place that knows which entry belongs to whom."""
+    if peer == me:
+        return 0.0
+    place = peer if roster is None else roster.slot(peer)
+    if place is None:
+        return 0.0
+    slot = place - (peer > me)  # the drone's own place is left out
+    return known[slot] if slot < len(known) else 0.0
 
 
 class FleetView(NamedTuple):
@@ -170,10 +214,22 @@ class FleetView(NamedTuple):
         return self._replace(descriptors={i: descriptors[i] for i in near}, age_s={i: ages_s[i] for i in near})
 
     @property
+    def members(self) -> tuple[int, ...]:
+        """Ids of the ego and its attached peers, ascending."""
+        return tuple(sorted({self.ego, *self.attached.peers}))
+
+    @property
+    def roster(self) -> Roster:
+        """The roster that the ego publishes; where it publishes none, its `members` at epoch 0."""
+        me = self.me
+        return Roster(0, self.members) if me is None or me.roster is None else me.roster
+
+    @property
     def full_sharing_maps(self) -> int:
         """The maps that a drone sends, and receives, under full sharing: N − 1 in a fleet of N, heard or not.
 
-        N counts the ego's roster, and drones that were heard beyond it.
+        N counts the drones that the ego lists goodput to, and drones that were heard beyond them: with a roster, its members
+        in place of the scenario's fleet. Drones with different rosters count differently until those agree.
         """
         me = self.me
         return max(len(self.peers), 0 if me is None else len(me.peer_goodput_mbps))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation
 from sortie.scenarios.link_state import PROBED_MBPS
@@ -43,13 +43,16 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     if not hysteresis:
         return measured
     part = 1.0 / (1.0 + hysteresis)
+    optional: list[Any]
     # unpacked and built again for speed: every drone does this in every frame
     (
         stamp, agent, at, turn, velocity, footprint, own_soc, own_cpu, own_gpu, own_links, grid, flags, phase, region, targets,
         *optional,
     ) = measured  # fmt: skip
     soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
-    if links != last and len(links) == len(last):  # else the roster is another; tiny values are states, not rates
+    if measured.roster is not None and measured.roster != before.roster:
+        last = before.with_roster(measured.roster).peer_goodput_mbps
+    if links != last and len(links) == len(last):  # else the fleet is another; tiny values are states, not rates
         links = tuple(
             [
                 u if u <= v or u <= PROBED_MBPS else (v if v > u * part else u * part)

@@ -21,7 +21,13 @@ import numpy as np
 
 from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.cdr import MalformedDatagram
-from sortie.fleet.messages.extensions import append_extensions, read_extensions, read_phase
+from sortie.fleet.messages.extensions import (
+    MAX_AGENT_ID,
+    append_extensions,
+    listed_goodput,
+    read_phase,
+    with_extensions,
+)
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor, Disc, TaskPhase
 from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
 
@@ -83,7 +89,7 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
         DescriptorTooLarge: more than 1,024 B, naming the part that is too long.
         ValueError: more than 255 peers or targets.
     """
-    goodput, targets, region = d.peer_goodput_mbps, d.priority_target_ids, d.region
+    goodput, targets, region = listed_goodput(d), d.priority_target_ids, d.region
     for name, several in (("peer_goodput", goodput), ("priority_target_ids", targets)):
         if len(several) > MAX_COUNT:
             raise ValueError(f"{name} has {len(several)} entries, must have at most {MAX_COUNT}")
@@ -123,8 +129,8 @@ def decode_compact(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"{len(data)} B, must be at least {size} with {peers} peers and {targets} targets")
     if nanosecond >= 1_000_000_000:
         raise MalformedDatagram(f"stamp.nanosec is {nanosecond}, must be below 10⁹")
-    if agent_id > 254:
-        raise MalformedDatagram(f"agent_id is {agent_id}, must be at most 254")
+    if agent_id > MAX_AGENT_ID:
+        raise MalformedDatagram(f"agent_id is {agent_id}, must be at most {MAX_AGENT_ID}")
     bits = _BitReader(data[_HEAD.size : size])
     values = [_to_float(bits.take(number_bits), bounds, number_bits) for bounds in ranges]
     if not all(map(math.isfinite, values)):
@@ -134,7 +140,7 @@ def decode_compact(data: bytes) -> Descriptor:
     if bits.rest():
         raise MalformedDatagram("the last byte is not filled with zeros")
     said = _checked(second * 1_000_000_000 + nanosecond, agent_id, values, peers, grid, flags, read_phase(phase), ids)
-    return said._replace(**read_extensions(data[size:]))
+    return with_extensions(said, data[size:])
 
 
 def _checked(

@@ -14,6 +14,10 @@ and the bytes are the paper's. Types ascend, so that one content has one form. A
 The whole descriptor has at most 1,024 B, block included, and authentication covers all of it. A reader from before
 version 2 knows no block, and refuses descriptors that have one.
 
+Goodput stays in the descriptor's own list, where every version reads it: by ascending id, 0 for drones off the roster, up
+to the roster's highest id. A reader that knows the roster keeps the members' entries; an older one passes over the
+roster and reads the same goodputs, with the others as unknown.
+
 To add a field: a field with a default in `sortie.policies.contract.Descriptor`, and a line in `FIELDS`.
 """
 
@@ -22,13 +26,15 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from sortie.fleet.messages.cdr import MalformedDatagram
-from sortie.policies.contract import Descriptor, TaskPhase
+from sortie.policies.contract import Descriptor, Roster, TaskPhase
 from sortie.scenarios.errors import SortieError
 
 MAX_DESCRIPTOR_BYTES = 1024
+MAX_AGENT_ID = 254
 VERSION = 2
 """Of the descriptors that this code writes with a block. Descriptors without one are version 1, the paper's."""
 _HEAD = struct.Struct("<BH")
@@ -76,10 +82,72 @@ def _decode_feature_space(value: bytes) -> str:
     return name
 
 
-FIELDS: tuple[ExtensionField, ...] = (ExtensionField("feature_space", 1, _encode_feature_space, _decode_feature_space),)
+def _encode_roster(roster: Roster) -> bytes:
+    """Epoch, 4 B, and a bit for each id, lowest first, up to the highest member's byte."""
+    epoch, members = roster
+    if not 0 <= epoch < 2**32:
+        raise ValueError(f"roster.epoch is {epoch}, must be in [0, 2³²)")
+    if not members or members != tuple(sorted(set(members))) or not 0 <= members[0] <= members[-1] <= MAX_AGENT_ID:
+        raise ValueError(f"roster.members is {members}, must be ascending ids in [0, {MAX_AGENT_ID}], one at least")
+    return epoch.to_bytes(4, "little") + sum(1 << i for i in members).to_bytes(members[-1] // 8 + 1, "little")
+
+
+@lru_cache(maxsize=1024)  # it changes seldom
+def _decode_roster(value: bytes) -> Roster:
+    bits = int.from_bytes(value[4:], "little")
+    if len(value) < 5 or not value[-1] or bits >> MAX_AGENT_ID + 1:
+        wanted = f"an epoch of 4 B and the bits of ids up to {MAX_AGENT_ID}, the last byte not 0"
+        raise MalformedDatagram(f"roster is {value.hex()}, must be {wanted}")
+    return Roster(int.from_bytes(value[:4], "little"), tuple(i for i in range(bits.bit_length()) if bits >> i & 1))
+
+
+FIELDS: tuple[ExtensionField, ...] = (
+    ExtensionField("feature_space", 1, _encode_feature_space, _decode_feature_space),
+    ExtensionField("roster", 2, _encode_roster, _decode_roster),
+)
 """Every optional field that this version knows, by ascending type."""
 _BY_NUMBER = {field.number: field for field in FIELDS}
 _WITH_DEFAULTS = tuple((field, Descriptor._field_defaults[field.name]) for field in FIELDS)
+
+
+def listed_goodput(d: Descriptor) -> tuple[float, ...]:
+    """The goodputs as they are listed on the wire: by ascending id.
+
+    Raises:
+        ValueError: a roster without the drone itself, or another number of goodputs than of other members.
+    """
+    if d.roster is None:
+        return d.peer_goodput_mbps
+    if d.agent_id not in d.roster.members or len(d.peer_goodput_mbps) != len(d.roster.members) - 1:
+        raise ValueError(
+            f"roster.members is {d.roster.members}, must hold agent_id = {d.agent_id} and as many others as "
+            f"peer_goodput has entries, {len(d.peer_goodput_mbps)}"
+        )
+    return d.goodput_by_id(d.roster.members[-1] + 1)
+
+
+def with_extensions(d: Descriptor, block: bytes) -> Descriptor:
+    """A descriptor that was read up to its block, with the block's fields.
+
+    Raises:
+        MalformedDatagram: as `read_extensions`, or a roster that does not fit the goodputs.
+    """
+    if not block:
+        return d
+    found = read_extensions(block)
+    roster = found.pop("roster", None)
+    d = d._replace(**found)
+    if roster is None:
+        return d
+    grown = d.with_roster(roster)
+    if d.agent_id in roster.members and listed_goodput(grown) == d.peer_goodput_mbps:
+        return grown
+    if block[0] > VERSION:
+        return d
+    raise MalformedDatagram(
+        f"roster {roster.members} of drone {d.agent_id} does not fit its peer_goodput of {len(d.peer_goodput_mbps)} entries: "
+        "it must hold the drone, and goodput must end with the highest member and be 0 to others"
+    )
 
 
 def append_extensions(body: bytes, d: Descriptor) -> bytes:
@@ -97,7 +165,7 @@ def append_extensions(body: bytes, d: Descriptor) -> bytes:
             block += _HEAD.pack(field.number, len(encoded)) + encoded
     whole = body + bytes([VERSION]) + block if block else body
     if len(whole) > MAX_DESCRIPTOR_BYTES:
-        peers, targets = len(d.peer_goodput_mbps), len(d.priority_target_ids)
+        peers, targets = len(listed_goodput(d)), len(d.priority_target_ids)
         _, longest = max(
             (len(block), f"the extensions have {len(block)} B"),
             (2 * targets, f"priority_target_ids has {targets} entries"),

@@ -15,7 +15,14 @@ from math import isfinite
 
 from sortie.fleet.messages.cdr import ENCAPSULATION, MalformedDatagram, check_encapsulation, layout
 from sortie.fleet.messages.compact import MARK, decode_compact
-from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES, append_extensions, read_extensions, read_phase
+from sortie.fleet.messages.extensions import (
+    MAX_AGENT_ID,
+    MAX_DESCRIPTOR_BYTES,
+    append_extensions,
+    listed_goodput,
+    read_phase,
+    with_extensions,
+)
 from sortie.policies.contract import (
     COVERAGE_BYTES,
     DIRECTIVE_BOUNDS,
@@ -24,8 +31,6 @@ from sortie.policies.contract import (
     Disc,
     Representation,
 )
-
-MAX_AGENT_ID = 254
 
 _MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"
 DESCRIPTOR_NAME, DIRECTIVE_NAME = "sortie_msgs/msg/ContextDescriptor", "sortie_msgs/msg/DataPlaneDirective"
@@ -64,7 +69,7 @@ def encode_descriptor(d: Descriptor) -> bytes:
         DescriptorTooLarge: more than 1,024 B, naming the part that is too long.
         ValueError: a field that its wire type cannot hold.
     """
-    goodput, targets = d.peer_goodput_mbps, d.priority_target_ids
+    goodput, targets = listed_goodput(d), d.priority_target_ids
     compiled = _descriptor_layout(len(goodput), len(targets))
     if len(d.coverage_grid) != COVERAGE_BYTES:
         raise ValueError(f"coverage_grid has {len(d.coverage_grid)} bytes, must have {COVERAGE_BYTES}")
@@ -149,7 +154,7 @@ def decode_descriptor(data: bytes) -> Descriptor:
         disc = None
     else:
         raise MalformedDatagram(f"region is ({x:g}, {y:g}, {radius:g}, {flag:g}), neither a disc nor none")
-    return Descriptor(
+    found = Descriptor(
         second * 1_000_000_000 + nanosecond,
         agent_id,
         values[4:7],
@@ -165,8 +170,8 @@ def decode_descriptor(data: bytes) -> Descriptor:
         read_phase(phase),
         disc,
         values[after + 8 :],
-        **read_extensions(data[end:]),
     )
+    return with_extensions(found, data[end:])
 
 
 def encode_directive(d: Directive) -> bytes:

@@ -45,6 +45,8 @@ FIELDS: dict[str, Axis | None] = {
     "region": Axis.MISSION,
     "priority_target_ids": Axis.MISSION,
     "feature_space": None,
+    "roster": None,
+    "counts": None,
 }
 """Which axis each field of a descriptor belongs to."""
 

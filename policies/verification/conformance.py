@@ -407,7 +407,8 @@ def full_view(drones: int) -> FleetView:
     drawn = next(v for v in draw_views(2, 10_000) if len(v.descriptors) >= 3)
     some = list(drawn.descriptors.values())
     descriptors = {
-        i: some[i % len(some)]._replace(agent_id=i, peer_goodput_mbps=(100.0,) * (drones - 1)) for i in range(drones)
+        i: some[i % len(some)]._replace(agent_id=i, peer_goodput_mbps=(100.0,) * (drones - 1), roster=None)
+        for i in range(drones)
     }
     return FleetView(0, 0.1, descriptors, dict.fromkeys(descriptors, 0.1))
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NoReturn
 
-from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase, goodput_in
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.scenarios.disc import disc_overlap
@@ -138,8 +138,8 @@ class DescriptorOfRanges:
         return Descriptor.link_state(self, peer)  # type: ignore[arg-type]
 
     def goodput_to(self, peer: int) -> Any:
-        found = Descriptor.goodput_to(self, peer)  # type: ignore[arg-type]
-        return found
+        # a drone off a roster reads 0, which is in the range too
+        return goodput_in(self.peer_goodput_mbps, self.agent_id, None, peer)
 
     @property
     def task_phase(self) -> TaskPhase:

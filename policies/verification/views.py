@@ -17,6 +17,7 @@ from sortie.policies.contract import (
     Descriptor,
     Disc,
     FleetView,
+    Roster,
     TaskPhase,
 )
 from sortie.scenarios.errors import SortieError
@@ -56,6 +57,9 @@ def draw_view(seed: int, number: int) -> FleetView:
     age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
     if rng.random() < 0.25:  # two makes of drone in one fleet
         descriptors = {i: d._replace(feature_space=str(rng.choice(["", "other"]))) for i, d in descriptors.items()}
+    if rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
+        members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
+        descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
     return FleetView(ego, period_s, descriptors, age_s)
 
 
@@ -106,6 +110,7 @@ _PLAIN: dict[str, Any] = {
     "region": None,
     "priority_target_ids": (),
     "feature_space": "",
+    "roster": None,
     "task_phase": TaskPhase.SEARCH,
     "battery_soc": 1.0,
     "footprint_radius_m": 42.0,
@@ -154,6 +159,7 @@ def to_json(view: FleetView) -> str:
             "coverage_grid": d.coverage_grid.hex(),
             "task_phase": PHASE_NAMES[TaskPhase(d.task_phase)],
             "region": None if d.region is None else list(d.region),
+            "roster": None if d.roster is None else d.roster._asdict(),
         }
         drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
     inner = ",\n  ".join(drones)
@@ -229,7 +235,22 @@ def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
         region=None if region is None else Disc(*_numbers(entry, "region", where, 3)),
         priority_target_ids=tuple(int(t) for t in _numbers(entry, "priority_target_ids", where)),
         feature_space=_text(entry, "feature_space", where),
+        roster=_roster(entry, where),
     )
+
+
+def _roster(entry: dict[str, Any], where: str) -> Roster | None:
+    value = entry.get("roster")
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise ViewError(f"{where}.roster is {value!r}, must be an object with epoch and members, or null")
+    members = tuple(int(i) for i in _numbers(value, "members", f"{where}.roster"))
+    ascending = members == tuple(sorted(set(members)))
+    if not ascending or entry["agent_id"] not in members or len(entry["peer_goodput_mbps"]) != len(members) - 1:
+        wanted = "ascending ids, the drone's own among them, one more than peer_goodput_mbps has entries"
+        raise ViewError(f"{where}.roster.members is {list(members)}, must be {wanted}")
+    return Roster(int(_number(value, "epoch", f"{where}.roster", 0)), members)
 
 
 def _number(entry: Mapping[str, Any], name: str, where: str, low: float = -math.inf, high: float = math.inf) -> float:

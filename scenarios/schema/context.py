@@ -55,6 +55,10 @@ class Context(Section):
         description="Form of descriptors on the air: a preset or its values; small is 8 × 8 cells of 1 bit and 16-bit numbers.",
         json_schema_extra=DescriptorForm.names_in_schema,
     )
+    roster: bool = Field(
+        False,
+        description="Drones publish which members of the fleet they know, by id, and goodput to those alone (8 B and a bit for each drone).",
+    )
     trust: bool = Field(
         True,
         description="Drones hold each other's claims against poses, arrivals and the fleet, and discount whom they doubt.",

@@ -44,7 +44,7 @@ from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, ca
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, route_bounds, strongest_dbm
 from sortie.sim.identity import code_version, name_of, own_files
-from sortie.sim.results import disagreement
+from sortie.sim.results import disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.views import TABLES as VIEW_TABLES
 from sortie.sim.results.views import Journal, decisions
@@ -173,7 +173,7 @@ def build(
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
     request = None if choreography is None else choreography.request
     pilots = [Pilot(i, policies, audit, request, None if journal is None else journal.decided) for i in drones]
-    notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name)
+    notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name, scenario.fleet.drones)
     detector = mixed(detector_of, scene, scenario, seed, replication)
     count_boxes = None if detector is None else detector.count_boxes
 
@@ -251,6 +251,8 @@ def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replica
     recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
     if parts.journal is not None:
         tables |= _decided(parts.journal, policies, parts.scenario)
+    if parts.scenario.context.roster:
+        tables[rosters.TABLE] = notes.rosters.table()
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
     return SortieRecord(
         scenario=parts.scenario,
@@ -292,6 +294,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         people=scenario.perception.thermal is not None,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
+        roster=context.roster,
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from sortie.fleet.coverage import TARGET_FLAG, footprint_radius_m
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
 from sortie.scenarios.representation import REPRESENTATION_OF
+from sortie.sim.results import rosters
 from sortie.sim.results.record import SortieRecord
 
 
@@ -23,6 +24,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
         (int(t_s * rate_hz + 1e-6), group): target
         for t_s, group, target in zip(*(mission[name].to_pylist() for name in ("t_s", "group", "target")), strict=True)
     }
+    roster_at = rosters.of(record.tables)
     for row in rows:
         frame = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1)
         k = frame * n + row["drone"]
@@ -31,7 +33,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             if math.isnan(row["region_radius_m"])
             else Disc(*(row[f"region_{c}"] for c in ("x_m", "y_m", "radius_m")))
         )
-        yield row["t_s"], Descriptor(
+        descriptor = Descriptor(
             stamp_ns=row["stamp_ns"],
             agent_id=row["drone"],
             position_m=(float(x[k]), float(y[k]), float(z[k])),
@@ -49,6 +51,8 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             feature_space=spaces[row["drone"]],
             priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
+        roster = roster_at(row["drone"], row["t_s"])
+        yield row["t_s"], descriptor if roster is None else descriptor.with_roster(roster)
 
 
 def directives(record: SortieRecord) -> Iterator[tuple[float, Directive]]:

@@ -25,4 +25,5 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         compute_delay_s=scenario.perception.compute_delay_s,
         publish_every=scenario.context.publish_every,
         trust=scenario.context.trust,
+        roster=scenario.context.roster,
     )

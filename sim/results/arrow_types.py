@@ -49,9 +49,12 @@ def to_table(kind: type[NamedTuple], rows: Sequence[Sequence[Any]]) -> pa.Table:
 
 
 def from_table(kind: type[NamedTuple], table: pa.Table) -> list[Any]:
-    """The named tuples that `to_table` wrote, equal to the last bit."""
-    columns = []
+    """The named tuples that `to_table` wrote, equal to the last bit; a field that a table of before lacks has its default."""
+    columns: list[Iterable[Any]] = []
     for name, (_, _, read) in _forms(kind).items():
+        if name not in table.column_names and name in kind._field_defaults:
+            columns.append([kind._field_defaults[name]] * len(table))
+            continue
         column = table[name].to_pylist()
         columns.append(column if read is None else map(read, column))
     return [kind(*row) for row in zip(*columns, strict=True)]

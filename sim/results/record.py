@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import Any
 
@@ -25,6 +25,7 @@ from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.identity import release_of
+from sortie.sim.results.rosters import RosterLog
 
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
@@ -133,8 +134,9 @@ class SortieRecord:
     detector: str
     """The detector that flew, as `sortie.sim.identity.name_of` names it; `none` without one."""
     tables: Mapping[str, pa.Table]
-    """Those of `TABLES`. Where the scenario keeps views, also those of `sortie.sim.results.views`, which are no part of
-    the fingerprint: what is kept changes nothing that flies."""
+    """Those of `TABLES`. Where the scenario keeps views, also those of `sortie.sim.results.views`; where drones publish
+    rosters, also that of `sortie.sim.results.rosters`. Those are no part of the fingerprint: what is kept changes nothing
+    that flies."""
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""
     calibration: str | None = None
@@ -213,13 +215,13 @@ def _columns(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     return list(zip(*rows, strict=True))
 
 
-def _unfold_descriptors(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+def _unfold_descriptors(rows: Sequence[tuple[Any, ...]], drones: int) -> Sequence[Any]:
     t_s, wire_bytes, descriptors = zip(*rows, strict=True)
     d = dict(zip(Descriptor._fields, zip(*descriptors, strict=True), strict=True))
     region = zip(*(disc or _NO_DISC for disc in d["region"]), strict=True)
     return [
         t_s, d["agent_id"], d["stamp_ns"], wire_bytes, d["battery_soc"], d["cpu_headroom"], d["gpu_headroom"],
-        d["peer_goodput_mbps"], [PHASE_NAMES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
+        [one.goodput_by_id(drones) for one in descriptors], [PHASE_NAMES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
         d["coverage_grid"],
     ]  # fmt: skip
 
@@ -234,10 +236,11 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
 class AgentNotes:
     """Writes agents' acts into a recorder (sortie.fleet.agent.AgentLog)."""
 
-    def __init__(self, recorder: Recorder, deciding: Callable[[int], str]) -> None:
-        """Args: `deciding` names the policy that decides on a drone."""
+    def __init__(self, recorder: Recorder, deciding: Callable[[int], str], drones: int) -> None:
+        """Args: `deciding` names the policy that decides on a drone; `drones` are in the scenario's fleet."""
         self._rows, self._deciding = recorder.rows, deciding
-        recorder.unfold |= {"descriptors": _unfold_descriptors, "ages": _unfold_ages}
+        recorder.unfold |= {"descriptors": partial(_unfold_descriptors, drones=drones), "ages": _unfold_ages}
+        self.rosters = RosterLog()
         self._eval_ns: list[int] = []
         self._descriptor_bytes = self._directives = 0
 
@@ -245,6 +248,8 @@ class AgentNotes:
         """One descriptor was published."""
         self._descriptor_bytes += wire_bytes
         self._rows["descriptors"].append((t_s, wire_bytes, d))
+        if d.roster is not None:
+            self.rosters.published(t_s, d.agent_id, d.roster)
 
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
         """A gate enforces something new."""

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
-from sortie.sim.results import disagreement, views
+from sortie.sim.results import disagreement, rosters, views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
@@ -60,8 +60,8 @@ def page() -> str:
             ((f"`{name}`", ABOUT[name], _columns(columns)) for name, columns in TABLES.items()),
         ),
         "",
-        "With `record.views: true` the first three of these too, with `record.disagreement: true` the last one. They are no "
-        "part of the fingerprint.",
+        "With `record.views: true` the first three of these too, with `record.disagreement: true` the fourth, with "
+        "`context.roster: true` the last one. They are no part of the fingerprint.",
         "",
         *table(
             ("table", "a row is", "columns"),
@@ -70,6 +70,7 @@ def page() -> str:
                 for name, about, columns in (
                     *((name, views.ABOUT[name], columns) for name, columns in views.TABLES.items()),
                     (disagreement.TABLE, disagreement.ABOUT, disagreement.COLUMNS),
+                    (rosters.TABLE, rosters.ABOUT, rosters.COLUMNS),
                 )
             ),
         ),

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, ensure_folder, replacing
-from sortie.sim.results import disagreement, views
+from sortie.sim.results import disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
 
@@ -26,7 +26,7 @@ WRITTEN = frozenset(
         SCENARIO,
         RECORD,
         RECORDING,
-        *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE)),
+        *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE)),
     }
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
@@ -195,9 +195,11 @@ def load(path: Path) -> SortieRecord:
         scenario = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
         expected = dict(TABLES)
         if scenario.record.views:
-            expected |= views.TABLES
+            expected |= views.NEEDED
         if scenario.record.disagreement:
             expected[disagreement.TABLE] = disagreement.COLUMNS
+        if scenario.context.roster:
+            expected[rosters.TABLE] = rosters.COLUMNS
         tables = {name: pq.read_table(path / f"{name}.parquet") for name in expected}
         for name, columns in expected.items():
             if lacking := [c for c in columns if c not in tables[name].column_names]:

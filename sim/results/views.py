@@ -51,6 +51,10 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     DESCRIPTORS: columns_of(Descriptor),
     DIRECTIVES: columns_of(Directive),
 }
+NEEDED = TABLES | {
+    DESCRIPTORS: {c: t for c, t in TABLES[DESCRIPTORS].items() if c not in Descriptor._field_defaults},
+}
+"""The columns that are needed to read them; an optional field is left out by runs from before it came."""
 ABOUT = {
     DECISIONS: "A decision: rows of `view_descriptors` that its view held and their ages in the same order, rows of "
     "`view_directives` that the policy answered before staleness and damping, and the viewpoint that it asked for.",

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from sortie.fleet.coverage import attitude, camera_states, pack_grid
-from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.contract import COVERAGE_CELL_M, Descriptor, Directive, Disc, Representation, Roster, TaskPhase
 
 DESCRIPTOR = Descriptor(
     stamp_ns=61_300_000_001,
@@ -71,11 +71,27 @@ descriptors = st.builds(
     region=st.none() | discs,
     priority_target_ids=st.lists(st.integers(0, 65535), max_size=20).map(tuple),
     feature_space=st.just(""),
+    roster=st.none(),
 )
+rosters = st.builds(
+    Roster, st.integers(0, 2**32 - 1), st.sets(st.integers(0, 60), min_size=1, max_size=12).map(sorted).map(tuple)
+)
+
+
+def with_members(d: Descriptor, roster: Roster | None) -> Descriptor:
+    """The descriptor of a drone of the roster, with its goodputs as those to the other members."""
+    if roster is None:
+        return d
+    links = (*d.peer_goodput_mbps, *[1.5] * len(roster.members))[: len(roster.members) - 1]
+    me = roster.members[d.agent_id % len(roster.members)]
+    return d._replace(agent_id=me, peer_goodput_mbps=links, roster=roster)
+
+
 extended_descriptors = st.builds(
-    lambda d, space: d._replace(feature_space=space),
+    lambda d, space, roster: with_members(d._replace(feature_space=space), roster),
     descriptors,
     st.just("") | st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9_.+-]{0,31}\Z"),
+    st.none() | rosters,
 )
 """With optional fields, or without."""
 directives = (

@@ -102,7 +102,8 @@ def test_one_appended_byte_is_a_version_and_no_fields(encode: Encode) -> None:
 def test_a_reader_passes_over_what_it_does_not_know(encode: Encode, d: Descriptor, more: bytes, version: int) -> None:
     """The same value as without it, and authentication covers it."""
     plain = encode(d)
-    grown = plain + more if d.feature_space else plain + block(more, version=version)
+    has_block = d.feature_space or d.roster
+    grown = plain + more if has_block else plain + block(more, version=version)
     if len(grown) > MAX_DESCRIPTOR_BYTES:
         return
     assert decode_descriptor(grown) == decode_descriptor(plain)
@@ -186,7 +187,8 @@ def test_whatever_follows_is_a_descriptor_or_malformed(
         value = decode_descriptor(bytes(data))
     except MalformedDatagram:
         return
-    assert decode_descriptor(encode_descriptor(value)).feature_space == value.feature_space
+    again = decode_descriptor(encode_descriptor(value))
+    assert (again.feature_space, again.roster) == (value.feature_space, value.roster)
 
 
 def test_a_block_counts_towards_the_kilobyte() -> None:

@@ -225,6 +225,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "context.form.grid_cells": ("8", ()),
     "context.form.grid_bits": ("1", ()),
     "context.form.number_bits": ("16", ()),
+    "context.roster": ("true", ()),
     "context.trust": ("false", (LIE,)),
     "perception.detector": ("torch", ("duration_s=4",)),
     "perception.compute_delay_s": ("0.05", ()),

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import threading
 from typing import Any
 
 import pytest
 from sim_examples import example
 
+from sortie.fleet.messages.auth import Opened
 from sortie.fleet.staleness import LinkHealth
+from sortie.policies.contract import Descriptor
+from sortie.sim.export.topics import CONTEXT
 from sortie.sim.folders import RunError
+from sortie.sim.live.bus import Bus
 from sortie.sim.live.result import LiveResult
+from sortie.sim.live.seals import Seals
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 
@@ -46,6 +52,33 @@ def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
     assert healths(result, 0, 1) == [LinkHealth.FRESH, LinkHealth.DETACHED, LinkHealth.FRESH]
     assert [gone.drone for gone in result.lost] == [1]
     assert result.noticed[0].by == 1
+
+
+def test_rosters_on_the_bus_follow_who_starts_late() -> None:
+    """Read off the bus by somebody else, while the processes fly."""
+    heard: list[Descriptor] = []
+    over = threading.Event()
+
+    def listen() -> None:
+        bus, open_descriptor = Bus(DOMAIN + 2), Seals(None).open_descriptor
+        reader = bus.reader(CONTEXT, depth=10)
+        while not over.is_set():
+            bus.wait(0.1)
+            heard.extend(found.descriptor for cdr in reader.take() if isinstance(found := open_descriptor(cdr), Opened))
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    sets = ("fleet.drones=2", POLICY, "context.roster=true", "context.authentication=false")
+    try:
+        fly_live(example(*sets), duration_s=4.0, start=(1, 2.0), domain=DOMAIN + 2)
+    finally:
+        over.set()
+        listener.join()
+    by_drone = {i: [d.roster for d in heard if d.agent_id == i and d.roster is not None] for i in (0, 1)}
+    assert len(heard) == sum(map(len, by_drone.values())) > 20
+    assert by_drone[0][0].members == (0,)
+    assert by_drone[0][-1].members == by_drone[1][-1].members == (0, 1)
+    assert all((d.goodput_to(1) > 0.0) == d.counts(1) for d in heard if d.agent_id == 0)
 
 
 @pytest.mark.parametrize(

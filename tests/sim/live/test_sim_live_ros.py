@@ -80,7 +80,7 @@ def fleet(nodes: ModuleType, tmp_path: Path) -> Iterator[dict[str, Any]]:
     ros.init()
     for drone in (0, 1):
         ros.PARAMETERS.update(
-            scenario=str(tmp_path / "s.yaml"), set="fleet.drones=2;policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}",
+            scenario=str(tmp_path / "s.yaml"), set="fleet.drones=2;policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3};context.roster=true",
             drone=drone, key_file=str(tmp_path / f"drone_{drone}.key"), begin_unix_s=begin_unix_s,
         )  # fmt: skip
         for role in (Role.PUBLISHER, Role.POLICY, Role.GATE):
@@ -120,6 +120,8 @@ def test_drones_of_three_nodes_share_and_hold_their_links_without_a_policy(fleet
     assert live["PUBLISHER 0"].node._sent[TopicKind.FEATURES].samples == 0
     for node in live.values():
         assert set(node.node._refused) <= {"payload late"}
+    known = live["POLICY 0"]._memory.view(live["POLICY 0"]._clock.now)
+    assert {d.roster.members for d in known.descriptors.values()} == {(0, 1)}
 
     gone, its_node = made.pop("POLICY 0")  # the policy node of drone 0 ends
     gone.close()

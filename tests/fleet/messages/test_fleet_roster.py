@@ -1,0 +1,216 @@
+"""Rosters on the wire: goodput by id whoever is there, and the same goodput for readers that know no rosters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+from fleet_examples import DESCRIPTOR, extended_descriptors
+from hypothesis import given
+
+from sortie.fleet.messages import extensions
+from sortie.fleet.messages.auth import Opened, Sealer, open_datagram
+from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.fleet.messages.compact import FULL, Form, encode_compact
+from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES, VERSION
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.fleet.trust import UNJUDGED, Arrival, judge
+from sortie.policies.contract import Descriptor, FleetView, LinkState, Roster
+from sortie.policies.damping import apply_hysteresis
+
+Encode = Callable[[Descriptor], bytes]
+SMALL = Form(8, 1, 16)
+ENCODERS: list[Encode] = [encode_descriptor, partial(encode_compact, form=FULL), partial(encode_compact, form=SMALL)]
+each_form = pytest.mark.parametrize("encode", ENCODERS, ids=["cdr", "compact", "small"])
+MEMBER = DESCRIPTOR._replace(roster=Roster(7, (1, 3, 9)), peer_goodput_mbps=(80.0, 12.5))
+"""Drone 3: 80 Mb/s to drone 1, 12.5 Mb/s to drone 9."""
+
+
+def read_by_an_older_version(data: bytes) -> Descriptor:
+    """As a version reads it that knows feature spaces and no rosters."""
+    with pytest.MonkeyPatch.context() as then:
+        then.setattr(extensions, "_BY_NUMBER", {1: extensions._BY_NUMBER[1]})
+        return decode_descriptor.__wrapped__(data)
+
+
+# --- the bytes -----------------------------------------------------------------------------------
+
+
+def test_the_roster_by_hand() -> None:
+    """Goodput by ascending id up to drone 9, without drone 3 itself; epoch and a bit for each of 1, 3 and 9 in the block."""
+    plain = DESCRIPTOR._replace(peer_goodput_mbps=(0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 12.5))
+    expected = bytes([2, 2, 6, 0, 7, 0, 0, 0, 0b1010, 0b10])
+    for encode in ENCODERS:
+        assert encode(MEMBER) == encode(plain) + expected
+
+
+@pytest.mark.parametrize("drones", [1, 2, 5, 64, 200])
+def test_any_fleet_fits_a_kilobyte(drones: int) -> None:
+    d = DESCRIPTOR._replace(agent_id=0, roster=Roster(2**32 - 1, tuple(range(drones))))
+    d = d._replace(
+        peer_goodput_mbps=tuple(float(i) for i in range(1, drones)), feature_space="", priority_target_ids=(1,)
+    )
+    data = encode_descriptor(d)
+    assert len(data) == 164 + 4 * (drones - 1) + 2 + 1 + 3 + 4 + -(-drones // 8) <= MAX_DESCRIPTOR_BYTES
+    assert decode_descriptor(data) == d
+
+
+@each_form
+@given(extended_descriptors.filter(lambda d: d.roster is not None))
+def test_goodput_is_read_by_id(encode: Encode, d: Descriptor) -> None:
+    """Each member's own, unknown for all others; exact but for the small form's rounding."""
+    assert d.roster is not None
+    back = decode_descriptor(encode(d))
+    assert back.roster == d.roster
+    others = [i for i in d.roster.members if i != d.agent_id]
+    step_mbps = 0.0 if encode is not ENCODERS[2] else SMALL.goodput_step_mbps
+    for peer, mbps in zip(others, d.peer_goodput_mbps, strict=True):
+        assert d.goodput_to(peer) == mbps
+        assert back.goodput_to(peer) == pytest.approx(min(mbps, 1023.0) if step_mbps else mbps, abs=step_mbps, rel=0)
+    for stranger in set(range(70)) - set(others):
+        assert back.goodput_to(stranger) == d.goodput_to(stranger) == 0.0
+
+
+# --- mixed versions ------------------------------------------------------------------------------
+
+
+@each_form
+@given(extended_descriptors)
+def test_an_older_reader_reads_the_same_goodputs(encode: Encode, d: Descriptor) -> None:
+    """It takes no peer for another. It passes over the roster, and all that follows from ids is as in the newer reader."""
+    data = encode(d)
+    old, new = read_by_an_older_version(data), decode_descriptor(data)
+    assert old.roster is None
+    assert [old.goodput_to(i) for i in range(70)] == [new.goodput_to(i) for i in range(70)]
+    assert old.feature_space == new.feature_space
+    opened = open_datagram(Sealer(bytes(32), 7).seal(data), {7: bytes(32)})
+    assert isinstance(opened, Opened)
+
+
+def test_a_newer_reader_reads_an_older_sender() -> None:
+    """Descriptors without a roster are those of before: every drone is counted, and the list is by ascending id."""
+    heard = decode_descriptor(encode_descriptor(DESCRIPTOR))
+    assert heard.roster is None
+    assert [heard.goodput_to(i) for i in range(6)] == [80.0, 0.0, 12.5, 0.0, 3.0, 0.0]
+    assert heard.counts(77)
+
+
+CAPTURED = (
+    "000100003d00000001a3e11103000000000048c10000a241000070420000003f000000bf0000003f0000003f0000a040000000bf0000003e0000"
+    "28420000403f0000003f0000803e040000000000a042000000000000484100004040000102030405060708090a0b0c0d0e0f1011121314151617"
+    "18191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f303132333435363738393a3b3c3d3e3f05020000000020410000a0c1000000420000"
+    "803f010000000700020105006e65742d62",
+    "c00801103d00000001a3e1110302850401ce7f5080ef80ffbf0040ffbfffbfff89007f3f800015ffbf00800040061400002203c1002780b07f00"
+    "0450555055fafffaff0700020105006e65742d62",
+)
+"""Datagrams of the version before rosters, in CDR and in the small form."""
+
+
+def test_old_captures_are_read_and_written_as_before() -> None:
+    named = DESCRIPTOR._replace(feature_space="net-b", priority_target_ids=(7,))
+    for captured, encode in zip(CAPTURED, (ENCODERS[0], ENCODERS[2]), strict=True):
+        assert encode(named).hex() == captured
+    assert decode_descriptor(bytes.fromhex(CAPTURED[0])) == named
+    small = decode_descriptor(bytes.fromhex(CAPTURED[1]))
+    assert (small.feature_space, small.roster, small.priority_target_ids) == ("net-b", None, (7,))
+    assert [small.goodput_to(i) for i in range(6)] == pytest.approx([80.0, 0.0, 12.5, 0.0, 3.0, 0.0], abs=0.01)
+
+
+def test_a_roster_in_an_unknown_form_is_the_newer_senders_right() -> None:
+    plain = DESCRIPTOR._replace(peer_goodput_mbps=(1.0, 2.0))
+    for value in (b"", bytes(40), (7).to_bytes(4, "little") + bytes([0b1111])):
+        block = bytes([VERSION + 1, 2, len(value), 0]) + value
+        assert decode_descriptor(encode_descriptor(plain) + block) == plain
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+@each_form
+@pytest.mark.parametrize(
+    ("bits", "reason"),
+    [
+        (b"", "roster is 07000000, must be an epoch of 4 B and the bits of ids up to 254, the last byte not 0"),
+        (b"\x0a\x00", "roster is 070000000a00, must be an epoch of 4 B"),
+        (bytes(31) + b"\x80", "must be an epoch of 4 B and the bits of ids up to 254"),
+        (bytes(32) + b"\x01", "must be an epoch of 4 B and the bits of ids up to 254"),
+        (b"\x0a\x01", r"roster \(1, 3, 8\) of drone 3 does not fit its peer_goodput of 9 entries"),
+        (b"\x0a\x04", r"roster \(1, 3, 10\) of drone 3 does not fit its peer_goodput of 9 entries"),
+        (b"\x08\x02", r"roster \(3, 9\) of drone 3 does not fit"),
+        (b"\x02\x02", r"roster \(1, 9\) of drone 3 does not fit .* it must hold the drone"),
+    ],
+    ids=[
+        "no ids",
+        "zero at the end",
+        "id 255",
+        "id 256",
+        "a list too long",
+        "too short",
+        "goodput of no member",
+        "itself",
+    ],
+)
+def test_malformed_rosters(encode: Encode, bits: bytes, reason: str) -> None:
+    body = encode(MEMBER)[:-10]
+    with pytest.raises(MalformedDatagram, match=reason):
+        decode_descriptor(body + bytes([2, 2, 4 + len(bits), 0, 7, 0, 0, 0]) + bits)
+
+
+@pytest.mark.parametrize(
+    ("roster", "links", "reason"),
+    [
+        (Roster(2**32, (3,)), 0, "roster.epoch is 4294967296, must be in"),
+        (Roster(1, (3, 3)), 1, r"roster.members is \(3, 3\), must be ascending ids"),
+        (Roster(1, (9, 3)), 1, r"roster.members is \(9, 3\), must"),
+        (Roster(1, (3, 255)), 1, r"must be ascending ids in \[0, 254\]"),
+        (Roster(1, ()), 0, "must hold agent_id = 3"),
+        (Roster(1, (4,)), 0, "must hold agent_id = 3"),
+        (Roster(1, (1, 3)), 2, "as many others as peer_goodput has entries, 2"),
+    ],
+)
+def test_a_roster_that_the_wire_cannot_hold_is_refused(roster: Roster, links: int, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        encode_descriptor(DESCRIPTOR._replace(roster=roster, peer_goodput_mbps=(1.0,) * links))
+
+
+# --- in the contract -----------------------------------------------------------------------------
+
+
+def test_links_to_drones_off_the_roster_are_unknown() -> None:
+    assert [MEMBER.link_state(i) for i in (1, 9)] == [LinkState.MEASURED] * 2
+    assert MEMBER.link_state(4) == LinkState.UNKNOWN
+    assert [MEMBER.counts(i) for i in (1, 3, 9, 0, 4)] == [True, True, True, False, False]
+
+
+def test_a_list_by_id_for_who_needs_one() -> None:
+    assert MEMBER.goodput_by_id(11) == (0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 12.5, 0.0)
+    assert DESCRIPTOR.goodput_by_id(5) is DESCRIPTOR.peer_goodput_mbps
+
+
+def test_the_views_roster() -> None:
+    heard = {i: DESCRIPTOR._replace(agent_id=i) for i in (1, 3, 4)}
+    view = FleetView(3, 0.1, heard, {1: 0.0, 3: 0.0, 4: 1.5})
+    assert view.roster == Roster(0, (1, 3))
+    assert view._replace(descriptors={**heard, 3: MEMBER}).roster == Roster(7, (1, 3, 9))
+    assert FleetView(2, 0.1, {}, {}).roster == Roster(0, (2,))
+
+
+def test_hysteresis_compares_goodputs_of_the_same_drone() -> None:
+    """Drone 1 leaves and drone 5 joins: what was published of drone 1 says nothing of drone 5."""
+    before = MEMBER._replace(peer_goodput_mbps=(80.0, 10.0))
+    now = MEMBER._replace(roster=Roster(8, (3, 5, 9)), peer_goodput_mbps=(40.0, 11.0))
+    published = apply_hysteresis(before, now, 0.2)
+    assert published.roster == now.roster
+    assert published.goodput_to(9) == 10.0
+    assert published.goodput_to(5) == pytest.approx(40.0 / 1.2)
+
+
+def test_who_leaves_a_drone_out_claims_no_goodput_to_it() -> None:
+    """Payloads of half a second ago do not contradict it."""
+    came = {3: [Arrival(1_000_000, 0.1, 100.0, 10.0)] * 3}
+    own = DESCRIPTOR._replace(agent_id=4, coverage_grid=bytes(64))
+    silent = own._replace(agent_id=3, roster=Roster(2, (3,)), peer_goodput_mbps=())
+    for claim, strikes in ((silent, 0), (silent.with_roster(Roster(2, (3, 4))), 1)):
+        after = judge({3: UNJUDGED, 4: UNJUDGED}, 4, {3: claim, 4: own}, came, FULL, set())
+        assert after[3].strikes == strikes
