@@ -24,7 +24,7 @@ from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.motion import Tracks
-from sortie.perception.types import Capture
+from sortie.perception.types import Boxes, Capture
 from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import (
     PERSON_FLAG,
@@ -71,6 +71,7 @@ class Senses(Protocol):
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int: ...
     def perceived(self, capture: Capture) -> None: ...
     def tracks_in(self, capture: Capture, roi: Disc | None) -> Tracks | None: ...
+    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes: ...
 
 
 class Modem(Protocol):
@@ -386,12 +387,15 @@ class Agent:
         if handshake_bytes:
             self._shake_hands(handshake_bytes, capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)
-        tracks_in = partial(self._senses.tracks_in, capture)
+        tracks_in, rules = partial(self._senses.tracks_in, capture), self._rules
+        people_in = partial(self._senses.people_in, capture) if rules.people else None
         made: dict[tuple[Any, ...], Payload | None] = {}  # what goes to several peers is made once
         for directive in self._gate.due(self._env.now):
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
-                payload = make_payload(directive, *pose, count_boxes, self._rules.tile_limit_bytes, tracks_in)
+                payload = make_payload(
+                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, classes=rules.classes
+                )
                 if payload is not None and self.status.feature_space:
                     payload = payload._replace(feature_space=self.status.feature_space)
                 made[what] = payload

@@ -13,6 +13,7 @@ from sortie.fleet import tiles
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.perception import budget
 from sortie.perception.motion import Tracks
+from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, Disc, Representation
 from sortie.scenarios.representation import BOXES, NAME_OF
 
@@ -29,6 +30,8 @@ CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
 TracksIn = Callable[[Disc | None], Tracks | None]
 """What the drone's own tracker sends of a region; None where it has no tracker."""
+PeopleIn = Callable[[Disc | None], Boxes]
+"""The people that the drone's thermal camera found in a region."""
 
 
 class Payload(NamedTuple):
@@ -50,6 +53,9 @@ class Payload(NamedTuple):
     """The tracks that it carries, as they are read from its bytes; None where it carries none, or no tracker runs."""
     feature_space: str = ""
     """Of its feature cells: the network that made them."""
+    people: Boxes | None = None
+    """The people among its detections; None where the drone has no thermal camera, and for other payloads. People among
+    its tracks are in `tracks`."""
 
     @property
     def reliable(self) -> bool:
@@ -65,16 +71,21 @@ def make_payload(
     count_boxes: CountBoxes,
     tile_limit_bytes: int | None = None,
     tracks_in: TracksIn | None = None,
+    people_in: PeopleIn | None = None,
+    *,
+    classes: bool = False,
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
     Args:
         tile_limit_bytes: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
         tracks_in: gives the tracks of a region that the drone sends; without a tracker, boxes are counted in their place.
+        people_in: gives the people of a region; None without a thermal camera.
+        classes: whether each detection names its class.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
-    tracks = None
+    tracks = people = None
     if rung == _NONE:
         return None
     if rung == _FEATURES:
@@ -88,10 +99,13 @@ def make_payload(
     elif rung == _TRACKS and tracks_in is not None and (tracks := tracks_in(roi)) is not None:
         boxes = len(tracks)
     elif rung != _RAW:
-        boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi))
+        people = None if people_in is None else people_in(roi)
+        boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi) + (0 if people is None else len(people)))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
-    size_bytes = HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes)
-    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks)
+    size_bytes = (
+        HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes, classes=classes)
+    )
+    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks, people=people)
 
 
 class Gate:

@@ -27,6 +27,8 @@ class PlaneRules:
     """Whether drones check the claims of their peers (`sortie.fleet.trust`)."""
     people: bool = False
     """Whether drones have thermal cameras, so that what they know of people is logged."""
+    classes: bool = False
+    """Whether there are targets of several classes, so that each detection names its class."""
     publish_every: int = 1
     """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL

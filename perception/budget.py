@@ -25,6 +25,8 @@ CELL_M = FULL.cell_m
 """Side of a cell in UAV3D's geometry, which sorties fly; only the benchmark has a smaller one."""
 DETECTION_BYTES = 24
 """One detection: x, y, length, width, yaw, score as float32."""
+CLASS_BYTES = 1
+"""The class of a detection, where the scenario has targets of several classes (`perception.classes`)."""
 TRACK_BYTES = 20
 """One track: x, y, vx, vy as float32, id, class and score packed in 4 B."""
 MAX_TRACKS = 12
@@ -54,8 +56,11 @@ def boxes_sent(representation: str, boxes: int) -> int:
     return min(boxes, MAX_TRACKS) if representation == "tracks" else boxes
 
 
-def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0) -> int:
+def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0, classes: bool = False) -> int:
     """Bytes of a payload without its header: features with their index, detections, tracks, or raw images.
+
+    Args:
+        classes: whether each detection names its class. A track always does.
 
     Raises:
         ValueError: another representation, naming it.
@@ -64,7 +69,7 @@ def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0) -> int
         case "features":
             return payload_bytes(cells) + index_bytes(cells)
         case "detections":
-            return boxes * DETECTION_BYTES
+            return boxes * (DETECTION_BYTES + CLASS_BYTES * classes)
         case "tracks":
             return boxes * TRACK_BYTES
         case "raw":

@@ -5,6 +5,9 @@ stays, and the false positives of all drones add up. Averaging puts a car at the
 score. Its score is the mean over all drones that looked there, also those that saw nothing (weighted boxes fusion: R.
 Solovyev, W. Wang, T. Gabruseva, Image and Vision Computing 107, 2021).
 
+Boxes of one class are joined, never those of two. Boxes of people are one person's where they lie within `NEAR_M` and come
+from different drones.
+
 Weight and age count under both rules. A peer's score is multiplied by its weight, and by the chance that a box of its age
 still covers its car (`sortie.perception.lateness`). In a mean, a place counts by the inverse of its variance as well.
 """
@@ -12,18 +15,20 @@ still covers its car (`sortie.perception.lateness`). In a mean, a place counts b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.classes import PERSON
 from sortie.perception.geometry import in_square
 from sortie.perception.lateness import (
+    movement,
     moving_m2,
     own_age_s,
-    reach_m,
+    reach_of,
     stands,
     still_right,
     still_right_of,
@@ -31,6 +36,7 @@ from sortie.perception.lateness import (
     within,
 )
 from sortie.perception.metrics.ap import best_first, rivals, standing
+from sortie.perception.metrics.overlap import close_people
 from sortie.perception.tracking.following import boxes_of, motion_of, motion_of_boxes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
@@ -166,13 +172,12 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     weight = np.array([s.weight for s in every])[source]
     if rule == "nms":
         score = (boxes.score * (np.minimum(weight, 1.0) * left)).astype(np.float32)
-        boxes = Boxes(boxes.xy_m, boxes.size_m, boxes.yaw_rad, score)
+        boxes = replace(boxes, score=score)
         order = best_first(score, ego)
     else:
         order = best_first(boxes.score * weight * left, ego)
     boxes, source, ego, left, known = boxes.take(order), source[order], ego[order], left[order], known[order]
-    i, j, iou = rivals(boxes.table(), ego)
-    i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]
+    i, j = _of_one_thing(boxes, source, ego)
     kept = standing(len(ego), i, j)
     ends = np.searchsorted(ego, np.arange(len(receivers) + 1))
     if rule == "nms":
@@ -195,13 +200,26 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     return out
 
 
+def _of_one_thing(boxes: Boxes, source: NDArray[np.intp], ego: NDArray[np.intp]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Pairs (i, j) of one ego's boxes of one class that are taken to be of one thing, i the better one; boxes best first."""
+    i, j, iou = rivals(boxes.table(), ego)
+    i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]
+    kind = boxes.kind
+    if not kind.any():
+        return i, j
+    same = (kind[i] == kind[j]) & (kind[i] != PERSON)
+    a, b, _ = close_people(boxes.xy_m, kind, boxes.xy_m, kind, ego, ego)
+    near = (a < b) & (source[a] != source[b])
+    return np.concatenate([i[same], a[near]]), np.concatenate([j[same], b[near]])
+
+
 def _moved(source: SourceBoxes) -> Boxes:
     """The boxes of a source where they are at the fusion, as far as their velocities are known."""
     boxes, velocity = source.boxes, source.velocity_mps
     if velocity is None:
         return boxes
     xy = boxes.xy_m + np.nan_to_num(velocity) * source.age_s
-    return Boxes(xy.astype(np.float32), boxes.size_m, boxes.yaw_rad, boxes.score)
+    return replace(boxes, xy_m=xy.astype(np.float32))
 
 
 def _given(values: NDArray[np.floating] | None, count: int) -> Floats:
@@ -214,9 +232,9 @@ def _left(boxes: Boxes, age_s: Floats, freshest_s: Floats, known_m2: Floats) -> 
     Args:
         known_m2: [n] the variance of a place where it is known, else NaN.
     """
-    reach = reach_m(boxes.size_m)
-    chance = np.where(np.isnan(known_m2), still_right(reach, age_s), still_right_of(reach, known_m2))
-    return np.asarray(np.minimum(chance / still_right(reach, freshest_s), 1.0))
+    reach, of = reach_of(boxes), movement(boxes.kind)
+    chance = np.where(np.isnan(known_m2), still_right(reach, age_s, of), still_right_of(reach, known_m2, of))
+    return np.asarray(np.minimum(chance / still_right(reach, freshest_s, of), 1.0))
 
 
 class _Members(NamedTuple):
@@ -239,13 +257,14 @@ class _Members(NamedTuple):
         anchor = np.lexsort((-boxes.score, age_s, self.group))
         anchor = anchor[np.unique(self.group[anchor], return_index=True)[1]][self.group]
         off_m = np.hypot(*(boxes.xy_m - boxes.xy_m[anchor]).T.astype(np.float64))
-        still, reach = stands(off_m, age_s - age_s[anchor]), reach_m(boxes.size_m)
-        fresh_m2, late_m2 = moving_m2(freshest_s), moving_m2(age_s)
+        of, reach = movement(boxes.kind), reach_of(boxes)
+        still = stands(off_m, age_s - age_s[anchor], of)
+        fresh_m2, late_m2 = moving_m2(freshest_s, of), moving_m2(age_s, of)
         precise = still + (1.0 - still) * np.minimum(fresh_m2 / late_m2, 1.0)
         left = still + (1.0 - still) * np.minimum(within(reach, late_m2) / within(reach, fresh_m2), 1.0)
         alone = off_m == 0.0
         given = ~np.isnan(self.known_m2)
-        precise = np.where(given, np.minimum(variance_m2(freshest_s) / self.known_m2, 1.0), precise)
+        precise = np.where(given, np.minimum(variance_m2(freshest_s, of) / self.known_m2, 1.0), precise)
         return precise, np.where(given | alone, self.left, left)
 
 
@@ -268,17 +287,18 @@ def _averaged(boxes: Boxes, of: _Members, sources: Sequence[SourceBoxes], freshe
     yaw = np.arctan2(mean(np.sin(twice)), mean(np.cos(twice))) / 2.0
     first = np.unique(group, return_index=True)[1]
     yaw = np.where(np.cos(yaw - boxes.yaw_rad[first]) < 0.0, yaw + np.pi, yaw)
+    joined = Boxes(xy, size, yaw, np.zeros(count), kind=boxes.kind[first])
     best, votes = np.zeros((2, count, len(sources)))
     np.maximum.at(best, (group, source), boxes.score)
     np.maximum.at(votes, (group, source), left)
     # that a late drone saw nothing says as little as its boxes do
-    reach = reach_m(size)[:, None]
-    silent = np.minimum(still_right(reach, ages_s) / still_right(reach, freshest_s), 1.0)
+    reach, moves = reach_of(joined)[:, None], movement(joined.kind[:, None])
+    silent = np.minimum(still_right(reach, ages_s, moves) / still_right(reach, freshest_s, moves), 1.0)
     votes = weights * np.where(best > 0.0, votes, np.where(_looked(sources, xy), silent, 0.0))
     # less than one whole vote is not made up to one: a single late box has the score that its age leaves
     score = (votes * best).sum(axis=1) / np.maximum(votes.sum(axis=1), 1.0)
     order = np.argsort(-score, kind="stable")
-    return Boxes(xy, size, yaw, score).single().take(order)
+    return replace(joined, score=score).single().take(order)
 
 
 def _looked(sources: Sequence[SourceBoxes], xy_m: NDArray[np.floating]) -> NDArray[np.bool_]:

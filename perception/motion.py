@@ -1,4 +1,4 @@
-"""Tracks of cars on the ground, many drones' in one table, and how they move on. Free of torch.
+"""Tracks of cars, trucks and people on the ground, many drones' in one table, and how they move on. Free of torch.
 
 A track is a Kalman filter's state: a car that keeps its velocity but for white noise in its acceleration (constant
 velocity; Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, §6.2).
@@ -55,6 +55,12 @@ class Tracks:
     """[n] when it had its last box."""
     confirmed: Bools
     """[n] False for a track that is tentative: what it follows may be a false positive."""
+    kind: NDArray[np.int8] = None  # type: ignore[assignment]  # filled in below
+    """[n] its class, as `TargetClass`; cars where left out."""
+
+    def __post_init__(self) -> None:
+        if self.kind is None:
+            object.__setattr__(self, "kind", np.zeros(len(self.id), np.int8))
 
     def __len__(self) -> int:
         return len(self.id)

@@ -1,6 +1,6 @@
 """A thermal camera that finds people: a declared sensor model, not a measured one.
 
-The camera looks straight down, on a gimbal. It can find a person within its cone whom no roof and no crown hides. It then
+The camera looks straight down, on a gimbal. It can find a person within its cone whom no roof, crown or truck hides. It then
 finds the person with the probability
 
     p(d) = near_probability / (1 + exp((d − half_range_m) / range_width_m)),    d: distance from the camera, m.
@@ -18,10 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.scene.height_field import HeightField
-from sortie.perception.scene.traffic import TargetPath
-from sortie.perception.types import Capture
-from sortie.scenarios.schema import Person, Thermal
+from sortie.perception.classes import PERSON, PERSON_SIZE_M
+from sortie.perception.scene.behind_trucks import behind
+from sortie.perception.scene.height_field import CAR_TOP_M, HeightField
+from sortie.perception.scene.traffic import Cars
+from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.disc import Disc
+from sortie.scenarios.schema import Thermal
 from sortie.scenarios.streams import stream
 
 Floats = NDArray[np.float64]
@@ -43,20 +46,6 @@ class Sighting(NamedTuple):
     """Which person it is, for the record; the drone does not know. NOBODY for a false alarm."""
 
 
-class Walkers:
-    """The people of a scene as a function of time."""
-
-    def __init__(self, people: Sequence[Person]) -> None:
-        self._paths = [(TargetPath.of(person), person.begin_s) for person in people]
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def at(self, t_s: float) -> Floats:
-        """[n, 2] where each of them is at `t_s`, ENU."""
-        return np.array([path.pose(t_s - begin_s)[:2] for path, begin_s in self._paths]).reshape(-1, 2)
-
-
 def found_probability(distance_m: Floats | float, camera: Thermal) -> Floats:
     """The probability of finding an unhidden person at a distance from the camera, any shape."""
     return np.asarray(
@@ -71,6 +60,28 @@ def in_cone(xy_m: Floats, position_m: Sequence[float] | Floats, camera: Thermal)
     return np.asarray(away_m <= at[..., 2] * math.tan(math.radians(camera.field_of_view_deg / 2)))
 
 
+def looked_at(camera: Thermal, capture: Capture) -> Disc:
+    """The ground in the camera's cone, where the drone believes itself to be."""
+    x_m, y_m, z_m = capture.est_position_m
+    return Disc(x_m, y_m, max(z_m, 0.0) * math.tan(math.radians(camera.field_of_view_deg / 2)))
+
+
+def people_boxes(xy_m: Floats, score: Floats, person: NDArray[np.integer] | None = None) -> Boxes:
+    """People at places [n, 2] as boxes; `person` says who they are, where that is known."""
+    n = len(xy_m)
+    size, which = np.tile(PERSON_SIZE_M[:2], (n, 1)), None if person is None else person.astype(np.int32)
+    kind = np.full(n, PERSON, np.int8)
+    return Boxes(xy_m.reshape(-1, 2), size, np.zeros(n), score, which, kind).single()  # type: ignore[arg-type]
+
+
+def boxes_of(sightings: Sequence[Sighting]) -> Boxes:
+    """What the camera reports as boxes, best first. They do not say who is who."""
+    boxes = people_boxes(
+        np.array([(s.x_m, s.y_m) for s in sightings]).reshape(-1, 2), np.array([s.score for s in sightings])
+    )
+    return boxes.take(np.argsort(-boxes.score, kind="stable"))
+
+
 def look(
     camera: Thermal,
     people_m: Floats,
@@ -79,6 +90,7 @@ def look(
     frame: int,
     frame_s: float,
     key: tuple[int, int],
+    trucks: Cars | None = None,
 ) -> list[Sighting]:
     """What a drone's thermal camera reports in a frame.
 
@@ -90,6 +102,7 @@ def look(
         frame: the number of the frame, for the draws.
         frame_s: how long a frame lasts.
         key: seed and replication.
+        trucks: what else hides them; None for nothing.
     """
     position, drone = np.array(capture.position_m), capture.drone
     off = np.subtract(capture.est_position_m[:2], position[:2])  # the drone places spots relative to itself
@@ -98,6 +111,8 @@ def look(
         at = np.flatnonzero(seen)
         eye = np.broadcast_to(position, (len(at), 3))
         seen[at] = field.seen(people_m[at, 0], people_m[at, 1], eye) & field.open(people_m[at, 0], people_m[at, 1])
+        if trucks is not None and len(trucks):
+            seen[at] &= ~behind(trucks, people_m[at], eye, CAR_TOP_M)
     out = []
     for person in np.flatnonzero(seen).tolist():
         draws = stream(*key, (drone, frame, person), "thermal")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.classes import TargetClass
 from sortie.perception.geometry import to_world
 from sortie.perception.motion import Tracks
 from sortie.scenarios.disc import Disc
@@ -68,6 +69,8 @@ class Share(NamedTuple):
     """Of a payload of tracks: the tracks that came. Of detections: the receiver's own tracks, which say how late boxes move."""
     boxes: Boxes | None = None
     """The sender's own boxes, best first, where another network than the receiver's made them."""
+    people: Boxes | None = None
+    """People that the sender's thermal camera found; None where the payload has none to give."""
 
     @property
     def is_map(self) -> bool:
@@ -93,18 +96,33 @@ class Boxes:
     score: NDArray[Any]
     """[n]; ones for ground truth."""
     car: NDArray[Any] = None  # type: ignore[assignment]  # filled in below
-    """[n] int32: of ground truth, which car it is; −1, which left out stands for, where nobody knows."""
+    """[n] int32: of ground truth, which car or person it is; −1, which left out stands for, where nobody knows."""
+    kind: NDArray[Any] = None  # type: ignore[assignment]  # filled in below
+    """[n] int8: its class, as `TargetClass`; cars where left out."""
 
     def __post_init__(self) -> None:
         if self.car is None:
             object.__setattr__(self, "car", np.full(len(self.score), -1, np.int32))
+        if self.kind is None:
+            object.__setattr__(self, "kind", np.zeros(len(self.score), np.int8))
 
     def __len__(self) -> int:
         return len(self.score)
 
     def take(self, which: NDArray[Any] | slice) -> Boxes:
         """The boxes at the given indices, under the given mask or in the given slice, in that order."""
-        return Boxes(self.xy_m[which], self.size_m[which], self.yaw_rad[which], self.score[which], self.car[which])
+        return Boxes(
+            self.xy_m[which],
+            self.size_m[which],
+            self.yaw_rad[which],
+            self.score[which],
+            self.car[which],
+            self.kind[which],
+        )
+
+    def of_class(self, kind: TargetClass) -> Boxes:
+        """Those of one class."""
+        return self.take(self.kind == kind)
 
     def inside(self, disc: Disc | None) -> Boxes:
         """The boxes whose centres are in the disc; all of them for None."""
@@ -120,7 +138,7 @@ class Boxes:
     def single(self) -> Boxes:
         """The same boxes in float32, as sorties record them."""
         xy, size, yaw, score = (v.astype(np.float32) for v in (self.xy_m, self.size_m, self.yaw_rad, self.score))
-        return Boxes(xy, size, yaw, score, self.car)
+        return Boxes(xy, size, yaw, score, self.car, self.kind)
 
     @classmethod
     def empty(cls) -> Boxes:

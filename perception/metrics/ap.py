@@ -18,7 +18,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.metrics.overlap import Floats, Ints, Kind, corners, iou_pairs, near_pairs, overlapping
+from sortie.perception.classes import PERSON
+from sortie.perception.metrics.overlap import (
+    Floats,
+    Ints,
+    Kind,
+    close_people,
+    corners,
+    iou_pairs,
+    near_pairs,
+    overlapping,
+)
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
 
@@ -145,6 +155,19 @@ def hits(count: int, i: Ints, j: Ints, value: Floats, match: Literal["remaining"
     return out
 
 
+def alike(
+    found: Boxes, truth: Boxes, image: Ints, cars: Ints, iou: float, overlap: Kind = "rotated"
+) -> tuple[Ints, Ints, Floats]:
+    """Pairs (i, j) of one image and class that match, and how well: vehicles by their IoU, people by their distance."""
+    i, j, value = overlapping(found.table(), truth.table(), image, cars, overlap)
+    good = value >= iou
+    if not (found.kind.any() or truth.kind.any()):
+        return i[good], j[good], value[good]
+    good &= (found.kind[i] == truth.kind[j]) & (found.kind[i] != PERSON)
+    near = close_people(found.xy_m, found.kind, truth.xy_m, truth.kind, image, cars)
+    return tuple(np.concatenate([v[good], w]) for v, w in zip((i, j, value), near, strict=True))  # type: ignore[return-value]
+
+
 def suppress(boxes: Boxes, iou: float) -> Boxes:
     """Rotated non-maximum suppression of one image: best first, a box that overlaps a kept one by more than `iou` goes."""
     boxes = boxes.take(np.argsort(-boxes.score, kind="stable"))
@@ -160,13 +183,13 @@ def match(
 ) -> Matched:
     """Match one frame's detections to its ground truth, best score first, each to the best remaining truth.
 
-    With a `disc` only detections and truths centred in it count.
+    With a `disc` only detections and truths centred in it count. Only boxes of one class match.
     """
     found, truth = found.inside(disc), truth.inside(disc)
     found = found.take(np.argsort(-found.score, kind="stable"))
-    i, j, value = overlapping(found.table(), truth.table(), kind=convention.overlap)
-    good = value >= iou
-    hit = hits(len(found), i[good], j[good], value[good], convention.match)
+    image, cars = np.zeros(len(found), np.int64), np.zeros(len(truth), np.int64)
+    i, j, value = alike(found, truth, image, cars, iou, convention.overlap)
+    hit = hits(len(found), i, j, value, convention.match)
     return Matched(found.score.astype(np.float64), hit, len(truth))
 
 
@@ -211,16 +234,15 @@ class Judged:
 def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou: float = 0.5) -> Judged:
     """Detections and truths of so many images, joined; `image` and `cars` say of which each is, and ascend."""
     order = best_first(found.score, image)
-    boxes, theirs = found.table()[order], truth.table()
+    found = found.take(order)
     cuts = [0, *range(MATCH_BATCH, images, MATCH_BATCH), images]
     parts = []
     first, first_car = np.searchsorted(image, cuts).tolist(), np.searchsorted(cars, cuts).tolist()
     for a, b, c, d in zip(first[:-1], first[1:], first_car[:-1], first_car[1:], strict=True):
-        i, j, value = overlapping(boxes[a:b], theirs[c:d], image[a:b], cars[c:d])
-        good = value >= iou
-        parts.append((i[good] + a, j[good] + c, value[good]))
+        i, j, value = alike(found.take(slice(a, b)), truth.take(slice(c, d)), image[a:b], cars[c:d], iou)
+        parts.append((i + a, j + c, value))
     i, j, value = (np.concatenate(v) for v in zip(*parts, strict=True))
-    return Judged(images, order, found.score[order].astype(np.float64), image, cars, i, j, value)
+    return Judged(images, order, found.score.astype(np.float64), image, cars, i, j, value)
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:

@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.classes import NEAR_M, PERSON
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Kind = Literal["rotated", "axis-aligned"]
@@ -133,3 +135,24 @@ def overlapping(
         a, b = hulls(a), hulls(b)
     i, j = near_pairs(a, b, of_a, of_b)
     return i, j, iou_pairs(a[i], b[j])
+
+
+def close_people(
+    a_m: Floats, kind_a: NDArray[np.integer], b_m: Floats, kind_b: NDArray[np.integer], of_a: Ints, of_b: Ints
+) -> tuple[Ints, Ints, Floats]:
+    """Pairs (i, j) of people of one image within `NEAR_M`, and 1 less their distance over that: 1 where they coincide.
+
+    Args:
+        a_m, kind_a, of_a: [n, 2] places, [n] classes and [n] images of all boxes; likewise b.
+    """
+    a, b = np.flatnonzero(kind_a == PERSON), np.flatnonzero(kind_b == PERSON)
+    i, j = near_pairs(_discs(a_m[a]), _discs(b_m[b]), of_a[a], of_b[b])
+    i, j = a[i], b[j]
+    return i, j, 1.0 - np.hypot(*(a_m[i] - b_m[j]).T.astype(np.float64)) / NEAR_M
+
+
+def _discs(xy_m: Floats) -> Floats:
+    """Boxes [n, 5] whose circumscribed circles touch where they are `NEAR_M` apart."""
+    out = np.zeros((len(xy_m), 5))
+    out[:, :2], out[:, 2] = xy_m, NEAR_M
+    return out

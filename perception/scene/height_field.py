@@ -12,6 +12,8 @@ STEP_M = 1.0
 """Heights between which a ray is not looked at."""
 CAR_TOP_M = 1.2
 """What of a car has to be seen over a roof or a hedge."""
+TRUCK_TOP_M = 2.4
+"""The same of a truck: three quarters of its height too."""
 _RAYS = 16384
 
 
@@ -35,23 +37,26 @@ class HeightField:
         self._flat = height.ravel()
         self._sun = shadow_m(town.scene)
 
-    def seen(self, x_m: Floats, y_m: Floats, eye_m: Floats) -> NDArray[np.bool_]:
-        """Whether points [n] at a car's height are seen from `eye_m` [n, 3]."""
-        fall = np.maximum(eye_m[:, 2] - CAR_TOP_M, 1.0)
-        return self._march(x_m, y_m, (eye_m[:, 0] - x_m) / fall, (eye_m[:, 1] - y_m) / fall)
+    def seen(self, x_m: Floats, y_m: Floats, eye_m: Floats, top_m: float = CAR_TOP_M) -> NDArray[np.bool_]:
+        """Whether points [n] at a height, a car's if not given, are seen from `eye_m` [n, 3]."""
+        fall = np.maximum(eye_m[:, 2] - top_m, 1.0)
+        return self._march(x_m, y_m, (eye_m[:, 0] - x_m) / fall, (eye_m[:, 1] - y_m) / fall, top_m)
 
     def lit(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         """Whether the sun reaches points [n] at a car's height."""
-        return self._march(x_m, y_m, *(np.full(len(x_m), -along) for along in self._sun))
+        sun_x, sun_y = (np.full(len(x_m), -along) for along in self._sun)
+        return self._march(x_m, y_m, sun_x, sun_y)
 
     def open(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         """Whether points [n] lie on the ground, beneath no roof."""
         pixel = ((y_m - self.y0_m) / RES_M).astype(np.intp) * self.columns + ((x_m - self.x0_m) / RES_M).astype(np.intp)
         return np.asarray(~self._roofed.take(pixel, mode="clip"))
 
-    def _march(self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats) -> NDArray[np.bool_]:
-        """Follow rays upwards; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
-        steps = int(np.ceil(max(self.top_m - CAR_TOP_M, 0.0) / STEP_M))
+    def _march(
+        self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats, from_m: float = CAR_TOP_M
+    ) -> NDArray[np.bool_]:
+        """Follow rays upwards from a height; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
+        steps = int(np.ceil(max(self.top_m - from_m, 0.0) / STEP_M))
         clear = np.ones(len(x_m), bool)
         for at in range(0, len(x_m), _RAYS):
             some = slice(at, at + _RAYS)
@@ -67,7 +72,7 @@ class HeightField:
                 pixel = py.astype(np.intp)
                 pixel *= self.columns
                 pixel += px.astype(np.intp)
-                clear[some] &= self._flat.take(pixel, mode="clip") < CAR_TOP_M + (k + 0.5) * STEP_M
+                clear[some] &= self._flat.take(pixel, mode="clip") < from_m + (k + 0.5) * STEP_M
         return clear
 
 

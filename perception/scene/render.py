@@ -174,7 +174,7 @@ class Renderer:
         gain = np.float32(self.scene.config.brightness)
         for t_s in dict.fromkeys(c.t_s for c in captures):
             here = [i for i, c in enumerate(captures) if c.t_s == t_s]
-            with window.with_cars(self.scene.moving_cars(t_s)):
+            with window.with_cars(self.scene.moving_bodies(t_s)):
 
                 def one(i: int) -> None:
                     c = captures[i]

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sortie.perception.classes import TRUCK, vehicle_classes
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.town import Town
 from sortie.perception.scene.traffic import (
@@ -18,7 +19,8 @@ from sortie.perception.scene.traffic import (
     lanes,
     parked,
 )
-from sortie.scenarios.schema import Scene, Target
+from sortie.perception.scene.walkers import Walkers
+from sortie.scenarios.schema import Person, Scene, Target
 
 MARGIN_M = 200.0
 """Cars exist this far around the bounds: the ±102.4 m grid's corner and a drone's drift fit inside."""
@@ -33,6 +35,7 @@ class SceneModel:
         more_targets: further ones. Ids of targets are 0, 1 …; parked cars follow, from 1 at least, then moving ones.
         bounds: (x_min, y_min, x_max, y_max) of the route, ENU metres; drones outside it by more than
             about 50 m begin to miss cars. The town itself has no bounds.
+        people: who walks about; cameras see them, and they are no cars.
 
     Making one costs tens of milliseconds: blocks are drawn, nothing is rasterised (`town.tile` does that on demand).
     """
@@ -43,11 +46,12 @@ class SceneModel:
         target: Target | None,
         bounds: tuple[float, float, float, float],
         more_targets: Sequence[Target] = (),
+        people: Sequence[Person] = (),
     ) -> None:
         if not (bounds[0] <= bounds[2] and bounds[1] <= bounds[3]):
             raise ValueError(f"bounds are {bounds}, must be (x_min, y_min, x_max, y_max)")
         self.config = config
-        self.made_of = config, target, bounds, tuple(more_targets)
+        self.made_of = config, target, bounds, tuple(more_targets), tuple(people)
         """Scenes that are made of the same are the same."""
         self.town = Town(config)
         self.rect = (bounds[0] - MARGIN_M, bounds[1] - MARGIN_M, bounds[2] + MARGIN_M, bounds[3] + MARGIN_M)
@@ -57,6 +61,7 @@ class SceneModel:
         n, m, first = len(self._parked_pose), len(self._lanes.s0_m), max(1, len(self.targets))
         self._parked_ids = np.arange(first, n + first)
         self._moving_ids = np.arange(n + first, n + m + first)
+        self.walkers = Walkers(people)
         self._xy_at: tuple[float, np.ndarray] | None = None
 
     @cached_property
@@ -85,6 +90,16 @@ class SceneModel:
         length, width, height = np.tile(TARGET_SIZE_M, (k, 1)).T
         colour = np.tile(np.array(TARGET_COLOUR, np.uint8), (k, 1))
         return join(Cars(np.arange(k), tx, ty, heading, length, width, height, colour), cars)
+
+    def trucks(self, t_s: float) -> Cars:
+        """The trucks among the moving cars."""
+        cars = self.moving_cars(t_s)
+        return cars.where(vehicle_classes(cars.length_m) == TRUCK)
+
+    def moving_bodies(self, t_s: float) -> Cars:
+        """All that moves in a camera's picture: cars, and people with ids of −1."""
+        cars = self.moving_cars(t_s)
+        return join(cars, self.walkers.bodies(t_s)) if self.walkers else cars
 
     def cars_at(self, t_s: float) -> Cars:
         """Every car inside `rect` at `t_s`, by id: the targets, the parked ones, the moving ones.

@@ -10,6 +10,8 @@ from sortie.perception.compiled import compiled
 
 _F = np.float32
 _BONNET, _LOWEST = _F(0.62), _F(-1.0)
+_TRUCK_M = _F(2.7)
+"""What is as high as this is a truck: its load is as high as its cab."""
 _GLASS = (np.uint8(30), np.uint8(34), np.uint8(42))
 
 
@@ -17,7 +19,7 @@ _GLASS = (np.uint8(30), np.uint8(34), np.uint8(42))
 def stamp(
     height: Any, colour: Any, light: Any, res_m: Any, spans: Any, middles: Any, turns: Any, sizes: Any, colours: Any
 ) -> None:
-    """Each car: bonnet and boot at 0.62 of its height, a cabin with dark glass at its ends.
+    """Each car: bonnet and boot at 0.62 of its height, a cabin with dark glass at its ends. Trucks are boxes with dark glass in front.
 
     Where something stands higher (a canopy), it goes on hiding the car.
 
@@ -38,12 +40,13 @@ def stamp(
                 v = (cos * dy - sin * dx) / width
                 if abs(u) >= 0.5 or abs(v) >= 0.5:
                     continue
-                cabin = -0.42 < u < 0.24
+                truck = top > _TRUCK_M
+                cabin = truck or -0.42 < u < 0.24
                 z = top if cabin else _BONNET * top
                 if z <= height[r, c]:
                     continue
                 height[r, c] = z
-                glass = cabin and (u > 0.12 or u < -0.34)
+                glass = u > 0.44 if truck else cabin and (u > 0.12 or u < -0.34)
                 for i in range(3):
                     colour[r, c, i] = np.uint8(_F(_GLASS[i] if glass else colours[k, i]) * light[r, c])
 

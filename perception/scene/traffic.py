@@ -103,12 +103,13 @@ def lanes(scene: Scene, rect: tuple[float, float, float, float]) -> Lanes:
                 lateral = road * scene.block_m + side * LANE_CENTRE_M
                 yaw = (0.0 if sense > 0 else np.pi) if axis == 0 else sense * np.pi / 2
                 for k in np.flatnonzero(u[:, 0] < scene.moving_cars_per_km / 100.0):
+                    off = 0.0 if u[k, 2] > 1.0 - scene.trucks else 0.4 * (u[k, 1] - 0.5)  # a truck fills its slot
                     for copy in range(copies):
-                        s0 = (k + 0.5 + 0.4 * (u[k, 1] - 0.5)) * SLOT_M + copy * PATTERN_M
+                        s0 = (k + 0.5 + off) * SLOT_M + copy * PATTERN_M
                         rows.append((s0, speed, low, high, copies * PATTERN_M, lateral, axis == 0, yaw))
                         shapes.append(u[k, 2:5])
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    bodies = draw_bodies(np.array(shapes, dtype=np.float64).reshape(-1, 3))
+    bodies = draw_bodies(np.array(shapes, dtype=np.float64).reshape(-1, 3), scene.trucks)
     s0, speed_, low_, limit_, period_, lateral_, east_, yaw_ = table.T
     return Lanes(s0, speed_, low_, limit_, period_, lateral_, east_ > 0, yaw_, bodies.size_m, bodies.colour)
 

@@ -255,7 +255,7 @@ class SurrogateDetector:
             + off_axes(off[:, :2].astype(np.float64), angle, hand)
             + mean_shift(pairs, exchange, sent, here) * follow[:, None]
         )
-        size = self._eyes.traffic.size_m[looks.car[look]] * np.exp(off[:, 3:5])
+        size = self._eyes.traffic.seen_size_m[looks.car[look]] * np.exp(off[:, 3:5])
         yaw = heading + hand * off[:, 2]
         also = self._alarms(exchange, looks, fleet, zeros, draws)
         row, score = np.concatenate([row, also.job]), np.concatenate([score, also.drawn[:, 5]])

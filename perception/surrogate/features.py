@@ -12,7 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sortie.perception.classes import TRUCK, vehicle_classes
 from sortie.perception.geometry import FULL, camera_margins
+from sortie.perception.scene.behind_trucks import behind
+from sortie.perception.scene.height_field import CAR_TOP_M, TRUCK_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Floats
 from sortie.perception.scene.traffic import TARGET_COLOUR, TARGET_SIZE_M
@@ -28,6 +31,9 @@ LEARNED_AT_M = 60.0
 """The height at which networks are trained: what is higher or lower is strange to them."""
 NEXT_M = 8.0
 """A car that stands farther away from the next one has none."""
+LARGEST_M = (5.8, 2.05)
+"""The largest vehicle that the calibration knows, a van. A truck is seen as one: the network gives it a box like a car's, and
+so does the surrogate (`perception/README.md`)."""
 SQUARE_RAD = np.radians(3.0)
 _ROAD_TONE, _TONE = 0.34, np.array([0.299, 0.587, 0.114]) / 255.0
 
@@ -96,6 +102,9 @@ class Traffic:
             np.tile(TARGET_SIZE_M[:2], (extra, 1)),
         ]
         self.size_m: Floats = np.concatenate(size)
+        self.seen_size_m: Floats = np.minimum(self.size_m, LARGEST_M)
+        """As the network takes them to be."""
+        self.truck = vehicle_classes(self.size_m[:, 0]) == TRUCK
         colour = np.concatenate([parked.colour, lanes.colour, np.tile(np.array(TARGET_COLOUR, np.uint8), (extra, 1))])
         self.tone: Floats = np.einsum("nc,c->n", colour, _TONE)
         self.tint: Floats = (colour.max(axis=1).astype(float) - colour.min(axis=1)) / 255.0
@@ -155,6 +164,7 @@ class Eyes:
     def __init__(self, scene: SceneModel) -> None:
         self.traffic = Traffic(scene)
         self._field, self._kerbs = scene.height_field, Kerbs(scene)
+        self._trucks_at = scene.trucks if self.traffic.truck.any() else None
         config = scene.config
         self._light = np.array([config.overcast, config.brightness, 1.0 / np.tan(np.radians(config.sun_elevation_deg))])
         parked = self.traffic.parked_xy
@@ -197,8 +207,9 @@ class Eyes:
         eye = fleet.position_m[capture]
         reach = np.hypot(local[:, 0], local[:, 1])
         nadir, margin = _in_view(np.moveaxis(fleet.tilt, 0, 2)[..., capture], local, eye[:, 2])
-        along = 0.35 * traffic.size_m[car, 0, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        visible = sum(self._field.seen(p[:, 0], p[:, 1], eye).astype(np.float32) for p in (xy - along, xy, xy + along))
+        along = 0.35 * traffic.seen_size_m[car, 0, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        points = (xy - along, xy, xy + along)
+        visible = sum(self._seen(p, eye, fleet.t_s[capture], traffic.truck[car]).astype(np.float32) for p in points)
         moving = car >= traffic.parked
         crowd = np.empty(len(car), np.float32)
         crowd[~moving], crowd[moving] = self._kerbs.parked[car[~moving]], self._kerbs.near(xy[moving, 0], xy[moving, 1])
@@ -216,10 +227,21 @@ class Eyes:
         columns = (
             reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
             (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
-            traffic.size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / LEARNED_AT_M - 1.0,
+            traffic.seen_size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / LEARNED_AT_M - 1.0,
             np.abs(eye[:, 2] / LEARNED_AT_M - 1.0), square(yaw - fleet.yaw_rad[capture]), close, way[:, 0], way[:, 1],
         )  # fmt: skip
         return beside(len(car), columns)
+
+    def _seen(self, xy: Floats, eye: Floats, t_s: Floats, truck: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether points [n, 2] of vehicles are seen: over roofs and crowns, and past trucks."""
+        seen = self._field.seen(xy[:, 0], xy[:, 1], eye)
+        if self._trucks_at is None:
+            return seen
+        seen[truck] = self._field.seen(xy[truck, 0], xy[truck, 1], eye[truck], TRUCK_TOP_M)
+        for now_s in np.unique(t_s).tolist():
+            here = np.flatnonzero((t_s == now_s) & ~truck)
+            seen[here] &= ~behind(self._trucks_at(now_s), xy[here], eye[here], CAR_TOP_M)
+        return seen
 
 
 def square(turn_rad: Floats) -> Floats:

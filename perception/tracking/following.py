@@ -9,10 +9,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sortie.perception.lateness import SIGMA0_M
+from sortie.perception.classes import PERSON
+from sortie.perception.lateness import movement
 from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, grown, predicted
 from sortie.perception.tracking.association import GATE
-from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S
+from sortie.perception.tracking.tracker import COAST_S, PLACE_VARIANCE_M2
 from sortie.perception.types import Boxes
 
 CUE_VARIANCE_M2, CUE_SPEED_VARIANCE = 1.0**2, 1.0**2
@@ -27,7 +28,7 @@ Cue = tuple[float, float, float, float]
 
 def boxes_of(tracks: Tracks) -> Boxes:
     """Tracks as boxes, each at its own time."""
-    return Boxes(tracks.xy_m, tracks.size_m, tracks.yaw_rad, tracks.score).single()
+    return Boxes(tracks.xy_m, tracks.size_m, tracks.yaw_rad, tracks.score, kind=tracks.kind).single()
 
 
 def motion_of(tracks: Tracks, age_s: float) -> tuple[Floats, Floats]:
@@ -40,14 +41,15 @@ def motion_of(tracks: Tracks, age_s: float) -> tuple[Floats, Floats]:
 
 
 def motion_of_boxes(boxes: Boxes, t_s: float, age_s: float, tracks: Tracks) -> tuple[Floats, Floats]:
-    """The same of boxes detected at `t_s`, by the nearest confirmed track of the drone that received them.
+    """The same of boxes detected at `t_s`, by the nearest confirmed track of their class of the drone that received them.
 
     Near is by Mahalanobis distance, within `GATE`, at the time of the box. NaN where there is no track.
     """
     dt = t_s - tracks.t_s
-    spread = grown(tracks.covariance, dt)[:, 0] + BOX_VARIANCE_M2
+    spread = grown(tracks.covariance, dt)[:, 0] + PLACE_VARIANCE_M2[tracks.kind]
     off_x, off_y = (boxes.xy_m[:, k, None] - (tracks.xy_m[:, k] + dt * tracks.velocity_mps[:, k]) for k in (0, 1))
-    cost = np.where(tracks.confirmed, (off_x * off_x + off_y * off_y) / spread, np.inf)
+    its = tracks.confirmed & (tracks.kind == boxes.kind[:, None])
+    cost = np.where(its, (off_x * off_x + off_y * off_y) / spread, np.inf)
     if not cost.size:
         return np.full((len(boxes), 2), np.nan), np.full(len(boxes), np.nan)
     best = cost.argmin(axis=1)
@@ -60,7 +62,8 @@ def _going_on(tracks: Tracks, late_s: Floats) -> tuple[Floats, Floats]:
     """Velocity [n, 2], and the variance of position [n] of what was certain for the last time `late_s` ago."""
     moves = tracks.moves
     spread = tracks.covariance[:, 2] * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3.0
-    return np.where(moves[:, None], tracks.velocity_mps, 0.0), SIGMA0_M**2 + np.where(moves, spread, 0.0)
+    fresh_m2 = movement(tracks.kind).sigma0_m2
+    return np.where(moves[:, None], tracks.velocity_mps, 0.0), fresh_m2 + np.where(moves, spread, 0.0)
 
 
 def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int], t_s: float) -> dict[int, int]:
@@ -75,7 +78,8 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
         before: what was followed until now, as returned.
         t_s: now.
     """
-    now = predicted(tracks.take(tracks.confirmed & (t_s - tracks.seen_s <= COAST_S)), t_s)
+    vehicle = tracks.kind != PERSON
+    now = predicted(tracks.take(vehicle & tracks.confirmed & (t_s - tracks.seen_s <= COAST_S)), t_s)
     row = {track: k for k, track in enumerate(now.id.tolist())}
     spread = now.covariance + np.array([CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE])
     out: dict[int, int] = {}

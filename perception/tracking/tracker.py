@@ -3,7 +3,7 @@
 A track begins as *tentative* with a box that belongs to no other track. It is *confirmed* after `CONFIRM_HITS` boxes in at
 most `CONFIRM_LOOKS` looks; a tentative track that cannot reach that any more ends. A confirmed track without a box
 *coasts*: it goes on by its velocity. It is *lost* after `COAST_S` without a box, or once its score is below `LEAST_SCORE`.
-Ids are not used again.
+Ids are not used again. Boxes of a class belong to tracks of that class alone.
 
 The constants were tried on towns 7, 8 and 9 of `track_target` with the surrogate, by HOTA at 2 and 10 looks a second.
 """
@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sortie.perception.classes import TargetClass
 from sortie.perception.motion import Floats, Ints, Tracks, predicted
 from sortie.perception.tracking.association import assigned
 from sortie.perception.types import Boxes
@@ -24,6 +24,10 @@ BOX_VARIANCE_M2 = 0.8**2
 boxes in a row lean to one side."""
 SPEED_VARIANCE = 6.0**2
 """Variance of each component of an unseen car's velocity, m²/s²."""
+PLACE_VARIANCE_M2 = np.array([BOX_VARIANCE_M2, BOX_VARIANCE_M2, 1.0**2])
+"""By class. A person's is that of the thermal camera's places, whose errors are independent from look to look."""
+FIRST_SPEED_VARIANCE = np.array([SPEED_VARIANCE, SPEED_VARIANCE, 1.5**2])
+"""By class."""
 BEGIN_SCORE = 0.3
 """Boxes below this score begin no track."""
 CONFIRM_HITS, CONFIRM_LOOKS = 3, 4
@@ -50,7 +54,8 @@ def step(tracks: Tracks, boxes: Boxes, owner: Ints, looks_s: Floats, next_id: In
     looking = ~np.isnan(now_s)
     resting, ahead = tracks.take(~looking), predicted(tracks.take(looking), now_s[looking])
     place = boxes.xy_m.astype(np.float64)
-    i, j = assigned(ahead.xy_m, ahead.covariance[:, 0] + BOX_VARIANCE_M2, ahead.owner, place, owner)
+    mine, theirs = (k + len(TargetClass) * of for k, of in ((ahead.kind, ahead.owner), (boxes.kind, owner)))
+    i, j = assigned(ahead.xy_m, ahead.covariance[:, 0] + PLACE_VARIANCE_M2[ahead.kind], mine, place, theirs)
     of_box = np.full(len(boxes), -1, np.int64)
     of_box[j] = ahead.id[i]
     kept = _survivors(_corrected(ahead, boxes, i, j))
@@ -64,11 +69,12 @@ def _corrected(ahead: Tracks, boxes: Boxes, i: Ints, j: Ints) -> Tracks:
     """Predicted tracks after a look in which tracks `i` got boxes `j`: the Kalman update, and the smoothing of the rest."""
     xy, velocity, covariance = ahead.xy_m.copy(), ahead.velocity_mps.copy(), ahead.covariance.copy()
     pp, pv, vv = covariance[i].T
-    total = pp + BOX_VARIANCE_M2
+    of_box = PLACE_VARIANCE_M2[ahead.kind[i]]
+    total = pp + of_box
     off = boxes.xy_m[j] - xy[i]
     xy[i] += (pp / total)[:, None] * off
     velocity[i] += (pv / total)[:, None] * off
-    covariance[i] = np.stack([pp * BOX_VARIANCE_M2 / total, pv * BOX_VARIANCE_M2 / total, vv - pv * pv / total], axis=1)
+    covariance[i] = np.stack([pp * of_box / total, pv * of_box / total, vv - pv * pv / total], axis=1)
     hits, looks, seen_s = ahead.hits.copy(), ahead.looks + 1, ahead.seen_s.copy()
     hits[i] += 1
     seen_s[i] = ahead.t_s[i]
@@ -101,12 +107,12 @@ def _begun(boxes: Boxes, owner: Ints, looks_s: Floats, next_id: Ints) -> tuple[T
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n) - (np.cumsum(count) - count)[owner[order]]
     one = np.ones(n, np.int64)
-    table: NDArray[np.float64] = np.zeros((n, 3))
-    table[:] = BOX_VARIANCE_M2, 0.0, SPEED_VARIANCE
+    table = np.column_stack([PLACE_VARIANCE_M2[boxes.kind], np.zeros(n), FIRST_SPEED_VARIANCE[boxes.kind]])
     at = looks_s[owner]
     xy, size, yaw, score = (v.astype(np.float64) for v in (boxes.xy_m, boxes.size_m, boxes.yaw_rad, boxes.score))
     tentative = np.zeros(n, bool)
     begun = Tracks(
-        owner, next_id[owner] + rank, at, xy, np.zeros((n, 2)), table, size, yaw, score, one, one, at, tentative
-    )
+        owner, next_id[owner] + rank, at, xy, np.zeros((n, 2)), table, size, yaw, score, one, one, at, tentative,
+        boxes.kind,
+    )  # fmt: skip
     return begun, next_id + count

@@ -11,7 +11,7 @@
 | 2 | standard deviations of position and of velocity | 2 cm and 5 cm/s, up to 5.1 m and 12.75 m/s |
 | 1 | their correlation | 1/127 |
 | 1 | time since the last box | 20 ms, up to 5.1 s |
-| 1 | class | 0: car |
+| 1 | class | 0: car, 1: truck, 2: person |
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception import budget
+from sortie.perception.classes import TargetClass
 from sortie.perception.motion import Floats, Tracks, predicted
 from sortie.scenarios.disc import Disc
 
@@ -65,6 +66,7 @@ def packed(tracks: Tracks, origin_m: Sequence[float]) -> bytes:
     out["score"] = _rounded(tracks.score, 1.0 / 255.0, "u1")
     out["deviation"] = np.maximum(_rounded(deviation, _DEVIATION, "u1"), 1)
     out["correlation"] = _rounded(tracks.covariance[:, 1] / (deviation[:, 0] * deviation[:, 1]), 1.0 / 127.0, "i1")
+    out["kind"] = tracks.kind
     out["unseen"] = _rounded(tracks.t_s - tracks.seen_s, 0.02, "u1")
     return out.tobytes()
 
@@ -73,12 +75,14 @@ def unpacked(datagram: bytes, owner: int, origin_m: Sequence[float], t_s: float)
     """The tracks in `packed` bytes; all are confirmed, and how many boxes they had is not sent: 0.
 
     Raises:
-        ValueError: the bytes are not a whole number of tracks.
+        ValueError: the bytes are not a whole number of tracks, or a class is unknown.
     """
     if len(datagram) % TRACK.itemsize:
         raise ValueError(f"tracks are {len(datagram)} B, must be a multiple of {TRACK.itemsize} B")
     read = np.frombuffer(datagram, TRACK)
     n = len(read)
+    if n and (unknown := int(read["kind"].max())) >= len(TargetClass):
+        raise ValueError(f"a track's class is {unknown}, must be at most {len(TargetClass) - 1}")
     deviation: Floats = read["deviation"] * _DEVIATION
     joint = read["correlation"] / 127.0 * deviation[:, 0] * deviation[:, 1]
     zero: NDArray[np.int64] = np.zeros(n, np.int64)
@@ -86,6 +90,7 @@ def unpacked(datagram: bytes, owner: int, origin_m: Sequence[float], t_s: float)
         np.full(n, owner, np.int64), read["id"].astype(np.int64), np.full(n, t_s), read["xy"] * 0.01 + (origin_m[0], origin_m[1]),
         read["velocity"] * 0.01, np.stack([deviation[:, 0] ** 2, joint, deviation[:, 1] ** 2], axis=1), read["size"] * 0.05,
         read["yaw"] * _TURN, read["score"] / 255.0, zero, zero, t_s - read["unseen"] * 0.02, np.ones(n, bool),
+        read["kind"].astype(np.int8),
     )  # fmt: skip
 
 

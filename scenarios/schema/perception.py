@@ -23,6 +23,12 @@ class Scene(Section):
     parked_density: float = Field(0.35, ge=0, le=1, description="Fraction of kerb spots with a parked car.")
     moving_cars_per_km: float = Field(10.0, ge=0, le=100, description="Moving cars per kilometre of lane.")
     moving_speed_mps: float = Field(8.0, gt=0, le=40, description="Mean speed of moving cars.")
+    trucks: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="Share of the moving vehicles that are trucks, 7 to 9 m long; vans give way first, and none park.",
+    )
     sun_azimuth_deg: float = Field(212.5, ge=0, le=360, description="Where the sun stands, from east towards north.")
     sun_elevation_deg: float = Field(56.9, ge=20, le=90, description="How high it stands; low suns cast long shadows.")
     overcast: float = Field(0.0, ge=0, le=1, description="Cloud: 0 casts dark shadows, 1 casts none.")
@@ -114,6 +120,11 @@ class Perception(Section):
         None, description="A thermal camera on every drone, which finds people; left out, nobody finds them."
     )
     scene: Scene = Scene()
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The classes of targets that drones look for."""
+        return "car", *(["truck"] if self.scene.trucks > 0.0 else []), *(["person"] if self.thermal is not None else [])
 
     @model_validator(mode="after")
     def _recording_where_recorded(self) -> Perception:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,12 +12,17 @@ import simpy
 
 from sortie.fleet.agent import Agent
 from sortie.fleet.memory import Received
+from sortie.perception.classes import PERSON, vehicle_classes
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.people import People
 from sortie.sim.results.record import Recorder
+
+INSTANT_S = 1e-9
+"""Ages closer together than this are equal but for rounding."""
 
 
 def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
@@ -26,12 +32,25 @@ def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Shar
     """
     payload = received.payload
     name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
-    tracks = payload.tracks
-    return Share(received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s, tracks)
+    tracks, people = payload.tracks, payload.people
+    return Share(
+        received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s, tracks, people=people
+    )
+
+
+def of_vehicles(share: Share) -> Share:
+    """What a detector takes of a share: it joins vehicles alone."""
+    tracks = share.tracks
+    if tracks is None or not np.any(person := tracks.kind == PERSON):
+        return share
+    return share._replace(tracks=tracks.take(~person))
 
 
 Job = tuple[Capture, list[Share]]
 """An ego's capture, and the shares of its peers."""
+
+
+NOBODY = Boxes.empty()
 
 
 class Ego(NamedTuple):
@@ -43,6 +62,8 @@ class Ego(NamedTuple):
     """What it fuses; None where its own capture is too old and nothing fresh was received, so that it detects nothing."""
     flying: bool = True
     """False for a drone that left the air: it fuses nothing, and the cars about its place in the plan are recorded."""
+    people: Boxes = NOBODY
+    """The people that it knows of after sharing, from its thermal camera and its peers'."""
 
 
 Moment = tuple[float, list[Ego]]
@@ -70,19 +91,25 @@ class Scorer:
         recorder: Recorder,
         planned: Callable[[int, int], Capture],
         own_tracks: Callable[[int], Tracks],
+        people: People,
     ) -> None:
         """Args:
         planned: where a drone is in a frame, or would be had it not left the air.
         own_tracks: what a drone's own tracker follows.
+        people: finds, joins and records people; the detector has vehicles alone.
         """
         self._env, self._scenario, self._detector = env, scenario, detector
         # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
+        self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
-        recorder.unfold |= {"detections": _unfold_detections, "truths": _unfold_truths}
+        recorder.unfold |= {
+            "detections": partial(_unfold_detections, classes=recorder.classes),
+            "truths": partial(_unfold_truths, classes=recorder.classes),
+        }
 
     def start(self) -> None:
         """Begin the process; call once."""
@@ -104,7 +131,9 @@ class Scorer:
             if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
             elif agent.here is not None and agent.latest is not None:
-                moment[1].append(Ego(agent.here, self._job(agent, agent.here, agent.latest, now_s)))
+                shares = self._shares(agent, now_s)
+                job = self._job(agent.here, agent.latest, [of_vehicles(s) for s in shares], now_s)
+                moment[1].append(Ego(agent.here, job, people=self._people.known(agent.here, shares, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
             self._begun.append(self._ahead.begin(jobs_of(moment)))
@@ -134,6 +163,8 @@ class Scorer:
         for (now_s, ego), truth in zip(egos_scored, truths, strict=True):
             boxes, shares = (Boxes.empty(), []) if ego.job is None else (next(each), ego.job[1])
             drone = ego.here.drone
+            boxes = Boxes.join([boxes, ego.people]) if len(ego.people) else boxes
+            truth = self._with_classes(truth, now_s, ego.here)
             rows["truths"].append((now_s, drone, truth))
             if not ego.flying:
                 continue
@@ -145,33 +176,44 @@ class Scorer:
                 )
             )  # fmt: skip
 
-    def _job(self, agent: Agent, here: Capture, look: Capture, now_s: float) -> Job | None:
-        """The agent's capture and recent shares, by ascending peer.
+    def _shares(self, agent: Agent, now_s: float) -> list[Share]:
+        """What the agent received lately, by ascending peer."""
+        limit_s, memory = self._scenario.perception.max_age_s + INSTANT_S, agent.memory
+        held = [
+            received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
+        ]
+        shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
+        if any(s.representation == "detections" for s in shares):
+            own = self._own_tracks(agent.drone)
+            shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]
+        return shares
+
+    def _job(self, here: Capture, look: Capture, shares: list[Share], now_s: float) -> Job | None:
+        """The agent's capture and its recent shares.
 
         Where its own capture is too old it has its present pose alone, and fuses what its peers sent; None where that is
         nothing.
         """
         config = self._scenario.perception
-        limit_s = config.max_age_s + 1e-9
-        memory = agent.memory
-        held = [
-            received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
-        ]
+        limit_s = config.max_age_s + INSTANT_S
         if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
-            if not held:
+            if not shares:
                 return None
             look = here._replace(looked=False)
-        shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
-        if any(s.representation == "detections" for s in shares):
-            own = self._own_tracks(agent.drone)
-            shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]
         return look, shares
 
+    def _with_classes(self, truth: Boxes, t_s: float, here: Capture) -> Boxes:
+        """The vehicles about an ego with their classes, and the people there."""
+        if self._has_trucks:
+            truth = replace(truth, kind=vehicle_classes(truth.size_m[:, 0]))
+        people = self._people.truth(t_s, here)
+        return Boxes.join([truth, people]) if len(people) else truth
 
-def _unfold_detections(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+
+def _unfold_detections(rows: Sequence[tuple[Any, ...]], *, classes: bool) -> Sequence[Any]:
     """Columns of the table; each row gathered holds all boxes of a fusion."""
     columns, boxes = _unfold_boxes(rows)
-    return [*columns, boxes.score.astype(np.float64)]
+    return [*columns, boxes.score.astype(np.float64), *([boxes.kind] if classes else [])]
 
 
 def _unfold_boxes(rows: Sequence[tuple[Any, ...]]) -> tuple[list[Any], Boxes]:
@@ -182,6 +224,6 @@ def _unfold_boxes(rows: Sequence[tuple[Any, ...]]) -> tuple[list[Any], Boxes]:
     return [np.repeat(t_s, counts), np.repeat(drones, counts), *(v.astype(np.float64) for v in values)], boxes
 
 
-def _unfold_truths(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
+def _unfold_truths(rows: Sequence[tuple[Any, ...]], *, classes: bool) -> Sequence[Any]:
     columns, boxes = _unfold_boxes(rows)
-    return [*columns, boxes.car]
+    return [*columns, boxes.car, *([boxes.kind] if classes else [])]

@@ -137,7 +137,7 @@ def build(
     detector_of: DetectorMaker = make_detector,
 ) -> Parts:
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
-    env, recorder = simpy.Environment(), Recorder()
+    env, recorder = simpy.Environment(), Recorder(classes=len(scenario.perception.classes) > 1)
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
     statuses = [DroneStatus(space) for space in scenario.fleet.feature_spaces]
     memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
@@ -156,7 +156,13 @@ def build(
         up=up,
     )
     mission = scenario.mission
-    scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
+    scene = SceneModel(
+        scenario.perception.scene,
+        mission.target,
+        route_bounds(motion),
+        mission.more_targets,
+        scenario.perception.people,
+    )
     plan = MissionPlan(mission, len(drones))
     clocks = oscillators(scenario.fleet.clock, len(drones), seed, replication)
     people = People(scenario, scene, recorder, (seed, replication))
@@ -183,7 +189,7 @@ def build(
     ahead = captures_ahead(scenario, capture_of)
     looking = detector.looks if isinstance(detector, LooksByAnother) else detector
     own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead)
-    tracking = FleetTracking(scenario, own_boxes)
+    tracking = FleetTracking(scenario, people.with_people(own_boxes))
     agents = [
         Agent(
             env,
@@ -203,7 +209,7 @@ def build(
     ]
     scorer = None
     if detector is not None:
-        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks)
+        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people)
     membership = Membership(scenario, world)
     schedule(scenario, world, transport, membership, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
@@ -292,6 +298,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
         trust=context.trust,
         people=scenario.perception.thermal is not None,
+        classes=len(scenario.perception.classes) > 1,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
         roster=context.roster,

@@ -28,7 +28,7 @@ from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.tracking.wire import content
-from sortie.perception.types import Capture
+from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
 from sortie.radio import Air
 from sortie.radio.topology import connectivity, linked_drones
@@ -375,6 +375,9 @@ class OwnSenses:
         if self._count_boxes is None:
             return None
         return content(self._tracking.tracks(self._drone), roi, capture.est_position_m, capture.t_s)
+
+    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
+        return self._world.people.found(capture).inside(roi)
 
 
 def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:

@@ -18,7 +18,7 @@ from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import flown_motion
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Capture
+from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
@@ -113,6 +113,10 @@ class ReplaySenses:
     def perceived(self, capture: Capture) -> None:
         """The drone looked: it finds a target that it has in view."""
         self._tracking.perceived(capture)
+
+    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
+        """Nobody: no thermal camera runs here."""
+        return Boxes.empty()
 
     def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
         """No tracks: no detector runs here."""

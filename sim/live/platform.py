@@ -18,7 +18,7 @@ from sortie.fleet.logs.mavlink import Companion, Listener, Origin
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
-from sortie.perception.types import Capture
+from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
 from sortie.sim.export.telemetry import parse_address
 from sortie.sim.folders import RunError
@@ -154,6 +154,10 @@ class MavlinkSenses:
     def perceived(self, capture: Capture) -> None:
         """The drone looked from where its vehicle is."""
         self._replay.perceived(capture)
+
+    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
+        """Nobody: no thermal camera runs here."""
+        return Boxes.empty()
 
     def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
         """No tracks: no detector runs here."""

@@ -20,6 +20,11 @@ the less sure. **Hatching**: cells of feature maps that peers sent to drone {ego
 colour; a thin **square**: a whole map. Other drones' are under `world/seen` and `world/received`.
 """
 
+OF_CLASSES = """
+Boxes of **trucks** are teal (found), brown (missed) and orange (false alarm); those of **people** violet, white and pink.
+Pale spheres are the people themselves.
+"""
+
 EGO = 0
 """Whose detections are shown until another's are switched on."""
 MAX_LANES = 8
@@ -157,5 +162,7 @@ def time_axis(scenario: Scenario) -> rrb.TimeAxis:
 def legend(scenario: Scenario) -> rr.TextDocument:
     """How to read the playback, for someone who has never seen one."""
     seen = "" if scenario.perception.detector == "none" else SEEN.format(ego=EGO)
+    if seen and len(scenario.perception.classes) > 1:
+        seen += OF_CLASSES
     told = {"name": scenario.name, "description": " ".join(scenario.description.split()) or "no description."}
     return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen, **told).strip(), media_type=rr.MediaType.MARKDOWN)

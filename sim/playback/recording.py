@@ -113,4 +113,10 @@ def scene_of(record: SortieRecord) -> SceneModel:
     states, scenario = record.tables["states"], record.scenario
     x, y = states["x_m"].to_numpy(), states["y_m"].to_numpy()
     bounds = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
-    return SceneModel(scenario.perception.scene, scenario.mission.target, bounds, scenario.mission.more_targets)
+    return SceneModel(
+        scenario.perception.scene,
+        scenario.mission.target,
+        bounds,
+        scenario.mission.more_targets,
+        scenario.perception.people,
+    )

@@ -19,6 +19,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from sortie.fleet.coverage import footprint_radius_m
+from sortie.perception.classes import PERSON
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
 from sortie.perception.scene.traffic import Cars
@@ -35,6 +36,8 @@ CARS_WITHIN_M = 160.0
 """Moving cars are drawn up to this far from the middle of the fleet."""
 GROUND_M = 1.0
 BOX_HEIGHT_M = 1.8
+PERSON_DRAWN_M = 1.5
+"""People and their boxes are drawn this wide, so that they can be seen."""
 CIRCLE = np.array([(np.cos(a), np.sin(a), 0.0) for a in np.linspace(0, 2 * np.pi, 49)])
 
 
@@ -69,6 +72,7 @@ class Drawing:
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
         self._links.begin()
         self._received.begin()
+        canvas.static("world/people", rr.Points3D.from_fields(radii=[PERSON_DRAWN_M / 2], colors=[c.PEOPLE]))
         canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
         for group in self._groups:
             disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
@@ -121,7 +125,7 @@ class Drawing:
     # --- what changes ----------------------------------------------------------------------------
 
     def add(self, known_s: float, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
-        """Draw new rows: `states`, `mission`, `descriptors`, `directives`, `transmissions`, and the fusions seen."""
+        """Draw new rows: `states`, `people`, `mission`, `descriptors`, `directives`, `transmissions`, and the fusions seen."""
         n = self._n
         column = {k: new["states"][k].to_numpy() for k in new["states"].column_names}
         t_s = column["t_s"][::n]
@@ -133,6 +137,7 @@ class Drawing:
         self._links.add(t_s, position, airborne, new)
         self._received.add(known_s, t_s, position, attitude, new)
         self._cars(t_s, position)
+        self._people(new["people"])
         for group in self._groups:
             self._mission(group, new["mission"].filter(pc.equal(new["mission"]["group"], group)))
         self._follow(t_s)
@@ -209,6 +214,13 @@ class Drawing:
             boxes = rr.Boxes3D.columns(**_car_boxes(every)).partition(lengths)
             self._canvas.columns("world/cars/moving", t_s, boxes)
 
+    def _people(self, people: pa.Table) -> None:
+        at_s, lengths = np.unique(people["t_s"].to_numpy(), return_counts=True)
+        places = np.column_stack(
+            [people["x_m"].to_numpy(), people["y_m"].to_numpy(), np.full(len(people), PERSON_DRAWN_M / 2)]
+        )
+        self._canvas.columns("world/people", at_s, rr.Points3D.columns(positions=places).partition(lengths))
+
     def _mission(self, group: int, mission: pa.Table) -> None:
         t_s, path = mission["t_s"].to_numpy(), _mission_path(group)
         x, y, radius = (mission[k].to_numpy() for k in ("region_x_m", "region_y_m", "region_radius_m"))
@@ -247,7 +259,7 @@ class Drawing:
         ):
             boxes = Boxes.join(several)
             light = 0.25 + 0.75 * np.clip(boxes.score, 0.0, 1.0)[:, None]
-            shades = np.column_stack([light * np.array(colour[:3]), np.full(len(boxes), 255)]).astype(np.uint8)
+            shades = np.column_stack([light * colour[boxes.kind], np.full(len(boxes), 255)]).astype(np.uint8)
             columns = rr.Boxes3D.columns(**_flat_boxes(boxes), colors=c.packed(shades))
             self._canvas.columns(f"world/seen/{drone}/{name}", t_s, columns.partition([len(b) for b in several]))
 
@@ -317,7 +329,8 @@ def _target_path(k: int) -> str:
 
 
 def _flat_boxes(boxes: Boxes) -> dict[str, Any]:
-    half = np.column_stack([boxes.size_m / 2, np.full(len(boxes), BOX_HEIGHT_M / 2)])
+    size = np.where((boxes.kind == PERSON)[:, None], PERSON_DRAWN_M, boxes.size_m)
+    half = np.column_stack([size / 2, np.full(len(boxes), BOX_HEIGHT_M / 2)])
     return {
         "centers": np.column_stack([boxes.xy_m, half[:, 2]]),
         "half_sizes": half,

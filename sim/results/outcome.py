@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
 from sortie.policies.verification.enforced import CAUSES
@@ -21,7 +22,7 @@ from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.people_outcome import people_outcome
-from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, VIOLATIONS_OF, SortieRecord
+from sortie.sim.results.record import DECISIONS_OF, HANDSHAKE, VIOLATIONS_OF, SortieRecord, classes_in
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.tracking_outcome import tracking_outcome
 
@@ -45,7 +46,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
     changes = list(transitions(tables["directives"], {}))
     drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
-    both = both_matched(record)
+    fusions = _Fusions(record, 0.0, float("inf"))
+    both = fusions.both(CAR)
     ap = _accuracy(both)
     return {
         "scenario": scenario.name,
@@ -66,6 +68,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
         },
+        "ap_by_class": _by_class(scenario.perception.classes, fusions),
         "tracking": tracking_outcome(record),
         "mission": mission_outcome(record),
         "people": people_outcome(record),
@@ -123,17 +126,17 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
 def matched(
     record: SortieRecord, *, mission: bool, begin_s: float = 0.0, end_s: float = float("inf")
 ) -> dict[tuple[float, int], Matched]:
-    """Every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
+    """The cars of every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
 
     Args:
         mission: count the mission disc alone, and only fusions made while there is one.
     """
     fusions = _Fusions(record, begin_s, end_s)
-    return fusions.in_mission() if mission else fusions.in_full()
+    return fusions.in_mission(CAR) if mission else fusions.in_full(CAR)
 
 
 def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
-    """AP@0.5 in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
+    """AP@0.5 of cars in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
     return _accuracy(both_matched(record), begin_s, end_s)
 
 
@@ -142,9 +145,18 @@ Both = dict[str, dict[tuple[float, int], Matched]]
 
 
 def both_matched(record: SortieRecord) -> Both:
-    """Every scored fusion matched in the full scene and in the mission disc."""
-    fusions = _Fusions(record, 0.0, float("inf"))
-    return {"full_scene": fusions.in_full(), "mission": fusions.in_mission()}
+    """The cars of every scored fusion matched in the full scene and in the mission disc."""
+    return _Fusions(record, 0.0, float("inf")).both(CAR)
+
+
+def _by_class(classes: Sequence[str], fusions: _Fusions) -> dict[str, dict[str, float | None]]:
+    """AP of each class that drones look for; null of all where cars are the only one, as `ap50` says it."""
+    nothing: dict[str, float | None] = {"full_scene": None, "mission": None}
+    looked_for = classes if len(classes) > 1 else ()
+    return {
+        (name := kind.name.lower()): _accuracy(fusions.both(kind)) if name in looked_for else nothing
+        for kind in TargetClass
+    }
 
 
 def _grounded_blind(record: SortieRecord, both: Both, ap: dict[str, float | None]) -> dict[str, float | None]:
@@ -155,6 +167,7 @@ def _grounded_blind(record: SortieRecord, both: Both, ap: dict[str, float | None
     truths = record.tables["truths"]
     scored = both["full_scene"].keys()  # who left the air has cars and no fusion
     blind = [row not in scored for row in zip(truths["t_s"].to_pylist(), truths["drone"].to_pylist(), strict=True)]
+    blind = np.array(blind, bool) & (classes_in(truths) == CAR)
     t_s, drone, x_m, y_m = (truths[c].to_numpy()[blind] for c in ("t_s", "drone", "x_m", "y_m"))
     disc_x_m, disc_y_m, radius_m = Regions(record.tables["mission"], record.scenario.mission).at(t_s, drone).T
     inside = (x_m - disc_x_m) ** 2 + (y_m - disc_y_m) ** 2 <= radius_m**2
@@ -184,17 +197,27 @@ class _Fusions:
         self._matches = judge(boxes, at, self._truth, cars, len(self._keys))
         self._boxes = boxes.take(self._matches.order)
 
-    def in_full(self) -> dict[tuple[float, int], Matched]:
-        """By (time, ego), the full scene."""
-        return dict(zip(self._keys, self._matches.matched(), strict=True))
+    def both(self, kind: TargetClass) -> Both:
+        """Those of a class matched in the full scene and in the mission disc."""
+        return {"full_scene": self.in_full(kind), "mission": self.in_mission(kind)}
 
-    def in_mission(self) -> dict[tuple[float, int], Matched]:
+    def in_full(self, kind: TargetClass) -> dict[tuple[float, int], Matched]:
+        """By (time, ego), the full scene."""
+        return dict(zip(self._keys, self._matches.matched(*self._of(kind)), strict=True))
+
+    def in_mission(self, kind: TargetClass) -> dict[tuple[float, int], Matched]:
         """By (time, ego), the mission disc, where there is one."""
-        disc = self._discs
+        disc, (boxes, truth) = self._discs, self._of(kind)
         images, cars = self._matches.image, self._matches.cars
-        inside = self._matches.matched(_within(self._boxes, disc[images]), _within(self._truth, disc[cars]))
+        inside = self._matches.matched(
+            boxes & _within(self._boxes, disc[images]), truth & _within(self._truth, disc[cars])
+        )
         there = ~np.isnan(disc[:, 2])
         return {key: m for key, m, is_ in zip(self._keys, inside, there.tolist(), strict=True) if is_}
+
+    def _of(self, kind: TargetClass) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which boxes and which truths are of a class."""
+        return self._boxes.kind == kind, self._truth.kind == kind
 
 
 def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -223,7 +246,9 @@ def _boxes_of(keys: Sequence[tuple[float, int]], table: pa.Table) -> tuple[Boxes
     at = np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
     score = column.get("score", np.ones(len(t_s)))
     xy = np.column_stack([column["x_m"], column["y_m"]])
-    boxes = Boxes(xy, np.column_stack([column["length_m"], column["width_m"]]), column["yaw_rad"], score)
+    boxes = Boxes(
+        xy, np.column_stack([column["length_m"], column["width_m"]]), column["yaw_rad"], score, kind=classes_in(table)
+    )
     return (boxes, at) if len(at) == 0 or at.min() >= 0 else (boxes.take(at >= 0), at[at >= 0])
 
 

@@ -52,6 +52,23 @@ class Ap50(Accuracy):
     scored_fusions: Annotated[int, "How many fusions were scored."]
 
 
+class ClassAccuracy(TypedDict):
+    full_scene: Annotated[
+        float | None, "AP of that class over all within range, pooled over egos and scored fusions.", SHARE
+    ]
+    mission: Annotated[float | None, "The same in the mission disc, while there is one.", SHARE]
+
+
+class ByClass(TypedDict):
+    car: Annotated[ClassAccuracy, "As `ap50`: AP@0.5 by rotated BEV IoU."]
+    truck: Annotated[ClassAccuracy, "Trucks, likewise. The shipped detectors call every vehicle a car."]
+    person: Annotated[
+        ClassAccuracy,
+        "People, by distance: a box may be of a person within 2 m of it. Boxes are those of the ego's own thermal camera "
+        "joined with those that its peers sent; everybody in the ego's square counts, hidden or not.",
+    ]
+
+
 class TrackingOutcome(TypedDict):
     hota: Annotated[
         float | None,
@@ -96,8 +113,17 @@ class PeopleOutcome(TypedDict):
     ap_2m: Annotated[
         float | None,
         "AP of people, pooled over drones and frames: what a drone's thermal camera reports, against everybody in its cone, "
-        "hidden or not. A detection may be of a person within 2 m of it. `ap50` is the AP of cars.",
+        "hidden or not. A detection may be of a person within 2 m of it. `ap_by_class.person` is that of people after sharing.",
         SHARE,
+    ]
+    located_share: Annotated[
+        float | None,
+        "Of the people in a drone's region at a scored fusion, the share of which the drone had a box within 2 m, its own or "
+        "a peer's, 0 … 1.",
+        SHARE,
+    ]
+    located_alone_share: Annotated[
+        float | None, "The same by the drone's own thermal camera in that frame, without its peers.", SHARE
     ]
     in_region_drone_s: Annotated[
         float | None, "Time in which a person truly was in a flying drone's region, summed over drones, s."
@@ -241,6 +267,11 @@ class Outcome(TypedDict):
     duration_s: Annotated[float, "Length of the sortie."]
     frame_s: Annotated[float, "From one frame to the next."]
     ap50: Annotated[Ap50, "Accuracy of the drones that fly."]
+    ap_by_class: Annotated[
+        ByClass,
+        "AP of each class of targets. A box counts for its own class alone. Null for classes that drones do not look for, "
+        "and for all where cars are the only class.",
+    ]
     tracking: Annotated[TrackingOutcome, "How well each drone that flies follows the cars, beside `ap50`."]
     mission: Annotated[
         MissionOutcome, "The mission of the whole fleet; null where there is no region, no target or no detector."

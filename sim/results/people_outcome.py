@@ -5,22 +5,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from sortie.perception.classes import NEAR_M, PERSON
 from sortie.perception.metrics.ap import Matched, average_precision, hits
 from sortie.perception.thermal import in_cone
-from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.outcome_fields import PeopleOutcome
+from sortie.sim.results.record import SortieRecord, classes_in
 from sortie.sim.results.regions import Regions
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-NEAR_M = 2.0
-"""A detection within this distance of a person may be of that person: a box half a metre wide has no useful overlap."""
 _INSTANT_S = 1e-6
 
 
@@ -28,7 +29,7 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `people` of the outcome."""
     perception = record.scenario.perception
     if not perception.people and perception.thermal is None:
-        return dict.fromkeys(("ap_2m", "in_region_drone_s", "unknown_share", "unknown_longest_s", "false_alert_share"))
+        return dict.fromkeys(PeopleOutcome.__annotations__)
     n, frame_s = record.scenario.fleet.drones, record.scenario.frame_s
     states = record.tables["states"]
     t_s = states["t_s"].to_numpy()[::n]
@@ -44,11 +45,50 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     without = flying & ~np.isnan(discs[..., 2]) & ~present
     return {
         "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
+        **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
         "in_region_drone_s": float(present.sum()) * frame_s,
         "unknown_share": _share(present & ~known, present),
         "unknown_longest_s": _longest(present & ~known) * frame_s if present.any() else None,
         "false_alert_share": _share(without & known, without),
     }
+
+
+def _located(record: SortieRecord) -> tuple[float | None, float | None]:
+    """Of the people in egos' regions at scored fusions, the shares that egos had a box of: after sharing, and alone."""
+    fusions, truths, boxes = (record.tables[name] for name in ("fusions", "truths", "detections"))
+    frame_s, sightings = record.scenario.frame_s, record.tables["sightings"]
+    truths, boxes = (table.filter(pa.array(classes_in(table) == PERSON)) for table in (truths, boxes))
+    t_s, drone, x_m, y_m = (truths[c].to_numpy() for c in ("t_s", "drone", "x_m", "y_m"))
+    disc = Regions(record.tables["mission"], record.scenario.mission).at(t_s, drone)
+    scored = set(zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True))
+    flies = np.array([key in scored for key in zip(t_s.tolist(), drone.tolist(), strict=True)], bool)
+    sought = flies & ((x_m - disc[:, 0]) ** 2 + (y_m - disc[:, 1]) ** 2 <= disc[:, 2] ** 2)
+    here_m = np.column_stack([x_m, y_m])[sought]
+    keys = list(zip(t_s[sought].tolist(), drone[sought].tolist(), strict=True))
+    if not keys:
+        return None, None
+    alone = _places(sightings, [round(t / frame_s) for t in sightings["t_s"].to_pylist()])
+    joined = _places(boxes, boxes["t_s"].to_pylist())
+    frames = [(int(t / frame_s + _INSTANT_S), d) for t, d in keys]
+    return _near(here_m, [joined.get(k) for k in keys]), _near(here_m, [alone.get(k) for k in frames])
+
+
+def _places(table: pa.Table, moments: Sequence[float]) -> dict[tuple[float, int], list[tuple[float, float]]]:
+    """Places by moment and drone."""
+    out: dict[tuple[float, int], list[tuple[float, float]]] = {}
+    columns = (table[c].to_pylist() for c in ("drone", "x_m", "y_m"))
+    for moment, drone, x_m, y_m in zip(moments, *columns, strict=True):
+        out.setdefault((moment, drone), []).append((x_m, y_m))
+    return out
+
+
+def _near(here_m: Floats, places: Sequence[list[tuple[float, float]] | None]) -> float:
+    """The share of places [n, 2] that have one of their own list within `NEAR_M`."""
+    found = [
+        at is not None and bool((np.hypot(*(np.array(at) - here).T) <= NEAR_M).any())
+        for here, at in zip(here_m, places, strict=True)
+    ]
+    return float(np.mean(found))
 
 
 def _share(part: Bools, whole: Bools) -> float | None:

@@ -84,6 +84,9 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
     "trust": dict(t_s=F, drone=I, peer=I, trust=F, reason=S),
     "ages": dict(t_s=F, drone=I, age_s=F),
 }  # fmt: skip
+CLASS_COLUMN = {"kind": pa.int8()}
+"""What `detections` and `truths` have too, where a scenario has targets of several classes."""
+OF_CLASSES = ("detections", "truths")
 ABOUT = {
     "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU. "
     "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`; "
@@ -99,7 +102,7 @@ ABOUT = {
     "transmissions": "A payload handed to the radio, with its fate. `partial`: some of its tiles arrived, "
     "`arrived_bytes` of it. The reason `other_feature_space`: delivered feature maps that the receiver's network cannot fuse.",
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
-    "detections": "A box that an ego detected, ENU.",
+    "detections": "A box that an ego detected, ENU. People among them are from thermal cameras, its own and its peers'.",
     "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
     "it would have in the formation. Such a drone has no row in `fusions`. `car` is the car's number, the targets first, the "
     "same at all times; −1 where the detector does not know.",
@@ -177,6 +180,11 @@ def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
         digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
 
 
+def classes_in(table: pa.Table) -> np.ndarray:
+    """The class of each box of `detections` or `truths`; cars where the record does not name classes."""
+    return table["kind"].to_numpy() if "kind" in table.column_names else np.zeros(table.num_rows, np.int8)
+
+
 Unfold = Callable[[Sequence[tuple[Any, ...]]], Sequence[Any]]
 """Some rows to a table's columns, in the order of `TABLES`."""
 
@@ -188,7 +196,10 @@ class Recorder:
     becomes columns.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, classes: bool = False) -> None:
+        """Args: `classes`: whether boxes name their class."""
+        self.classes = classes
+        self._columns = TABLES | {name: TABLES[name] | CLASS_COLUMN for name in OF_CLASSES} if classes else TABLES
         self.rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
         self.unfold: dict[str, Unfold] = {}
         self._taken = dict.fromkeys(TABLES, 0)
@@ -206,7 +217,7 @@ class Recorder:
         return new
 
     def _table(self, name: str, rows: list[tuple[Any, ...]]) -> pa.Table:
-        columns = TABLES[name]
+        columns = self._columns[name]
         values = self.unfold.get(name, _columns)(rows) if rows else [()] * len(columns)
         return pa.table({c: pa.array(v, t) for (c, t), v in zip(columns.items(), values, strict=True)})
 

@@ -60,6 +60,9 @@ def page() -> str:
             ((f"`{name}`", ABOUT[name], _columns(columns)) for name, columns in TABLES.items()),
         ),
         "",
+        "Where a scenario has trucks or thermal cameras, `detections` and `truths` have the column `kind` too: 0 a car, 1 a "
+        "truck, 2 a person. `car` is then a person's number where the box is of one.",
+        "",
         "With `record.views: true` the first three of these too, with `record.disagreement: true` the fourth, with "
         "`context.roster: true` the last one. They are no part of the fingerprint.",
         "",

@@ -13,6 +13,7 @@ from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures
 from sortie.sim.results.sentences import decision_in_words, event_in_words
+from sortie.sim.results.summary import PLURAL
 
 STYLE = """
 :root { color-scheme: light; }
@@ -98,6 +99,14 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
             notes = [f"{number(blind[area])} with grounded drones blind" for area in ("mission", "full_scene")]
         tiles.append(("Accuracy, mission disc", number(ap["mission"]), notes[0]))
         tiles.append(("Accuracy, full scene", number(ap["full_scene"]), notes[1]))
+        for name, of_class in result["ap_by_class"].items():
+            if name != "car" and of_class["full_scene"] is not None:
+                note = "full scene, by distance" if name == "person" else "full scene, AP@0.5"
+                tiles.append((f"Accuracy, {PLURAL[name]}", number(of_class["full_scene"]), note))
+    people = result["people"]
+    if people["located_share"] is not None:
+        alone = f"in drones' regions, {percent(people['located_alone_share'])} by own cameras"
+        tiles.append(("People located", percent(people["located_share"]), alone))
     if mission["region_observed_share"] is not None:
         tiles.append(("Region in view", percent(mission["region_observed_share"]), "of its area, mean over time"))
     if mission["target_in_view_share"] is not None:

@@ -10,17 +10,19 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
+from sortie.sim.results.record import classes_in
 from sortie.sim.results.regions import Regions
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One ego's fusion: `hits` are detected cars, `false` detections without a car, `missed` cars without a detection.
+    """One ego's fusion: `hits` are detected targets, `false` detections without one, `missed` targets without a detection.
 
-    `full` and `mission` are the matches behind AP; `mission` is None while there is no mission disc.
+    Boxes say of which class they are. `full` and `mission` are the matches behind the AP of cars; `mission` is None while there is no mission disc.
     """
 
     t_s: float
@@ -51,19 +53,24 @@ def sightings(tables: Mapping[str, pa.Table], regions: Regions) -> Iterator[Sigh
         own = boxes.take(np.arange(at, at + count))
         truth = truths.take(np.arange(truth_at, truth_at + truth_count))
         at, truth_at = at + count, truth_at + truth_count
-        full = match(own, truth)
-        own = own.take(np.argsort(-own.score, kind="stable"))  # the order of full.hit
-        hits = own.take(full.hit)
+        whole = match(own, truth)
+        own = own.take(np.argsort(-own.score, kind="stable"))  # the order of whole.hit
+        hits = own.take(whole.hit)
+        missed = Boxes.join([_missed(truth.of_class(kind), hits.of_class(kind)) for kind in TargetClass])
+        false = own.take(~whole.hit)
+        if own.kind.any() or truth.kind.any():
+            own, truth = own.of_class(CAR), truth.of_class(CAR)
+            whole = match(own, truth)
         mission = None if np.isnan(disc[2]) else match(own, truth, Disc(*disc.tolist()))
-        yield Sighting(t_s, drone, hits, own.take(~full.hit), truth.take(_uncovered(truth, hits)), full, mission)
+        yield Sighting(t_s, drone, hits, false, missed, whole, mission)
 
 
-def _uncovered(truth: Boxes, hits: Boxes) -> NDArray[np.bool_]:
-    """Which cars no hit stands for; each hit stands for one car, together at the least distance."""
+def _missed(truth: Boxes, hits: Boxes) -> Boxes:
+    """The cars that no hit stands for; each hit stands for one car, together at the least distance."""
     away = ((truth.xy_m[:, None, :] - hits.xy_m[None, :, :]) ** 2).sum(axis=-1)
     left = np.ones(len(truth), bool)
     left[linear_sum_assignment(away)[0]] = False
-    return left
+    return truth.take(left)
 
 
 def _fusion_of(table: pa.Table) -> NDArray[np.complex128]:
@@ -78,4 +85,5 @@ def _boxes(table: pa.Table) -> Boxes:
         np.column_stack([column["length_m"], column["width_m"]]),
         column["yaw_rad"],
         column.get("score", np.ones(table.num_rows)),
+        kind=classes_in(table),
     )

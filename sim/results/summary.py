@@ -14,6 +14,7 @@ from rich.table import Table
 from sortie.scenarios.report_text import number, percent, size
 
 MAX_TRANSITIONS = 24
+PLURAL = {"car": "cars", "truck": "trucks", "person": "people"}
 WIDTH = 110
 """Columns of a summary as plain text."""
 
@@ -55,6 +56,12 @@ def outcome_table(result: dict[str, Any]) -> Table:
                 "  grounded drones blind",
                 f"{number(blind['full_scene'])} full scene, {number(blind['mission'])} mission",
             )
+        for name, of_class in result["ap_by_class"].items():
+            if name != "car" and of_class["full_scene"] is not None:
+                table.add_row(
+                    f"  AP of {PLURAL[name]}",
+                    f"{number(of_class['full_scene'])} full scene, {number(of_class['mission'])} mission",
+                )
         for phase in result["phases"]:
             seen = phase["ap50"]
             payload = (
@@ -65,6 +72,8 @@ def outcome_table(result: dict[str, Any]) -> Table:
                 f"{number(seen['full_scene'])} full, {number(seen['mission'])} mission, "
                 f"{phase['data_rate_mbps']:.1f} Mb/s{payload}, {percent(phase['deadline_miss_rate'])} missed",
             )
+    if people_known := _people_in_words(result["people"]):
+        table.add_row("people", people_known)
     if seen_of_mission := _mission_in_words(mission):
         table.add_row("mission", seen_of_mission)
     table.add_row(
@@ -126,6 +135,14 @@ def _mission_in_words(mission: dict[str, Any]) -> str:
                 f"target {what} {percent(mission[f'target_{share}_share'])} of the time, longest gap {gap_s:.1f} s"
             )
     return "; ".join(told)
+
+
+def _people_in_words(people: dict[str, Any]) -> str:
+    """How well drones knew where the people in their regions were; empty where nobody was there, or nothing was scored."""
+    if people["located_share"] is None:
+        return ""
+    alone = percent(people["located_alone_share"])
+    return f"{percent(people['located_share'])} of those in a drone's region located, {alone} by the drone's own camera"
 
 
 def transitions_table(result: dict[str, Any]) -> Table:

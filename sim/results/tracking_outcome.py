@@ -9,16 +9,18 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
+from sortie.perception.classes import PERSON
 from sortie.perception.metrics.hota import Followed, hota
 from sortie.perception.motion import Tracks
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes
-from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.record import SortieRecord, classes_in
 
 
 def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `tracking` of the outcome; null without a detector, a car, or a detector that knows which car is which."""
-    fusions, truths = record.tables["fusions"], record.tables["truths"]
+    fusions = record.tables["fusions"]
+    truths, detections = (_vehicles(record.tables[name]) for name in ("truths", "detections"))
     nothing: dict[str, float | None] = {"hota": None, "det_a": None, "ass_a": None}
     if not fusions.num_rows or np.any(truths["car"].to_numpy() < 0):
         return nothing
@@ -27,8 +29,14 @@ def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
     instants, instant = np.unique(key.real, return_inverse=True)
     frame_of = dict(zip(key.tolist(), (instant * drones + key.imag.astype(np.int64)).tolist(), strict=True))
     cars = _followed(truths, truths["car"].to_numpy(), frame_of, drones)
-    value = hota(cars, _tracked(record.tables["detections"], instants, frame_of, drones))
+    value = hota(cars, _tracked(detections, instants, frame_of, drones))
     return nothing if value is None else value._asdict()
+
+
+def _vehicles(table: pa.Table) -> pa.Table:
+    """The boxes of cars and trucks. A person has no useful overlap, by which HOTA judges."""
+    kind = classes_in(table)
+    return table.filter(pa.array(kind != PERSON)) if kind.any() else table
 
 
 def _followed(table: pa.Table, identity: np.ndarray, frame_of: dict[complex, int], drones: int) -> Followed:
@@ -50,7 +58,10 @@ def _tracked(table: pa.Table, instants: np.ndarray, frame_of: dict[complex, int]
     frame = _frames(table, frame_of)
     order = np.argsort(frame, kind="stable")
     xy, size = (np.column_stack([column[a], column[b]])[order] for a, b in (("x_m", "y_m"), ("length_m", "width_m")))
-    boxes, frame = Boxes(xy, size, column["yaw_rad"][order], column["score"][order]), frame[order]
+    boxes, frame = (
+        Boxes(xy, size, column["yaw_rad"][order], column["score"][order], kind=classes_in(table)[order]),
+        frame[order],
+    )
     looked = np.full((len(instants), drones), np.nan)
     scored = np.array(list(frame_of.values()), np.int64)
     looked[scored // drones, scored % drones] = instants[scored // drones]

@@ -10,6 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
+from sortie.sim.results.summary import PLURAL
 from sortie.sim.studies.compare import Compared, Flown, Gain
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
@@ -123,6 +124,7 @@ def _side_by_side(flown: Flown) -> dict[str, list[str]]:
         "  gain ": gain("ap50.mission"),
         "  grounded drones blind ": blind["mission"],
         "    gain ": gain("ap50.grounded_blind.mission") if grounded else [],
+        **_of_classes(flown, mean),
         "data sent": mean("bytes", "data_sent", text=size),
         "data delivered": mean("bytes", "data_delivered", text=size),
         "  handshakes": mean("bytes", "handshakes_sent", text=size),
@@ -137,6 +139,16 @@ def _side_by_side(flown: Flown) -> dict[str, list[str]]:
     least = [[min(s.outcome["battery"].values(), default=None) for s in of] for of in _by_policy(flown).values()]
     rows["charge left, least"] = [percent(_mean(values)) for values in least]
     return {name: cells for name, cells in rows.items() if cells}
+
+
+def _of_classes(flown: Flown, mean: Callable[..., list[str]]) -> dict[str, list[str]]:
+    """Rows of trucks and people, where drones look for them."""
+    first = flown.sorties[0].outcome
+    of = [name for name, ap in first["ap_by_class"].items() if name != "car" and ap["full_scene"] is not None]
+    rows = {f"AP of {PLURAL[name]}, full scene": mean("ap_by_class", name, "full_scene", text=number) for name in of}
+    if first["people"]["located_share"] is not None:
+        rows["people located"] = mean("people", "located_share", text=percent)
+    return rows
 
 
 def _at(result: Any, path: Sequence[str]) -> float | None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.thermal import NOBODY, Walkers, found_probability, in_cone, look
+from sortie.perception.scene.walkers import Walkers
+from sortie.perception.thermal import NOBODY, found_probability, in_cone, look
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Person, Scene, Thermal
 

@@ -86,6 +86,7 @@ def test_units_stand_in_names() -> None:
         "score_threshold",
         "building_density",
         "tree_density",
+        "trucks",
         "parked_density",
         "lost_fraction",
         "at_least",

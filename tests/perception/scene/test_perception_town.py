@@ -74,6 +74,7 @@ OTHERS = {
     "parked_density": 0.7,
     "moving_cars_per_km": 30.0,
     "moving_speed_mps": 3.0,
+    "trucks": 0.8,
     "sun_azimuth_deg": 30.0,
     "sun_elevation_deg": 25.0,
     "overcast": 0.5,

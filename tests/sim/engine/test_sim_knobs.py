@@ -299,6 +299,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.scene.parked_density": ("0.9", ()),
     "perception.scene.moving_cars_per_km": ("40", ()),
     "perception.scene.moving_speed_mps": ("15", ()),
+    "perception.scene.trucks": ("0.8", ()),
     "perception.scene.sun_azimuth_deg": ("30", ()),
     "perception.scene.sun_elevation_deg": ("20", ()),
     "perception.scene.overcast": ("1", ()),

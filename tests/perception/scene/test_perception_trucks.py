@@ -1,0 +1,152 @@
+"""Trucks in the scene: their sizes, the gaps between them, what they hide, and how detectors see them. People in pictures."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from perception_examples import EMPTY, capture
+
+from sortie.perception.classes import CAR, PERSON_SIZE_M, TRUCK_FROM_M
+from sortie.perception.metrics.overlap import overlapping
+from sortie.perception.scene.behind_trucks import behind
+from sortie.perception.scene.height_field import CAR_TOP_M, HeightField
+from sortie.perception.scene.render import CAMERAS, Renderer, Window
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.scene.town import Town
+from sortie.perception.scene.traffic import Cars
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.features import CaptureColumns, Eyes
+from sortie.perception.thermal import look
+from sortie.scenarios.schema import Perception, Person, Scene, Thermal
+
+AREA = (-200.0, -200.0, 200.0, 200.0)
+
+
+def model(trucks: float, per_km: float = 60.0, **scene: float) -> SceneModel:
+    return SceneModel(Scene(trucks=trucks, moving_cars_per_km=per_km, **scene), None, AREA)
+
+
+def test_trucks_are_as_many_and_as_large_as_they_should_be() -> None:
+    cars = model(0.3).moving_cars(2.0)
+    truck = cars.length_m >= TRUCK_FROM_M
+    assert truck.mean() == pytest.approx(0.3, abs=0.06)
+    assert not np.any((cars.length_m > 5.8) & (cars.length_m < 7.0))
+    for values, low, high in ((cars.length_m, 7.0, 9.0), (cars.width_m, 2.45, 2.55), (cars.height_m, 3.0, 3.4)):
+        assert low <= values[truck].min() <= values[truck].max() <= high
+    assert cars.length_m[truck].mean() == pytest.approx(8.0, abs=0.2)
+    assert len(model(0.3).trucks(2.0)) == truck.sum()
+
+
+def test_no_share_of_trucks_moves_or_changes_any_other_vehicle() -> None:
+    """Vans give way first. Parked cars stay as they are: kerb spots are too short for trucks."""
+    before, after = model(0.0), model(0.3)
+    for f in fields(Cars):
+        np.testing.assert_array_equal(getattr(before.parked_cars, f.name), getattr(after.parked_cars, f.name))
+    one, other = before.moving_cars(0.0), after.moving_cars(0.0)
+    rest = {id_: k for k, id_ in enumerate(one.ids.tolist())}
+    kept = [(rest[i], k) for k, i in enumerate(other.ids.tolist()) if other.length_m[k] < TRUCK_FROM_M and i in rest]
+    assert len(kept) > 100
+    a, b = np.array(kept).T
+    np.testing.assert_array_equal(one.where(a).table(), other.where(b).table())
+
+
+def test_trucks_do_not_stand_in_each_other_or_in_cars() -> None:
+    """Also where every slot of a lane is taken. Lanes cross, so those along one axis are looked at."""
+    cars = model(0.5, per_km=100.0).moving_cars(0.0)
+    along = cars.where(np.abs(np.sin(cars.yaw_rad)) < 0.5)
+    assert (along.length_m >= TRUCK_FROM_M).sum() > 50
+    i, j, iou = overlapping(along.table(), along.table())
+    assert not (iou[i < j] > 0).any()
+
+
+# --- what they hide --------------------------------------------------------------------------------
+
+
+def truck(x_m: float = 0.0, y_m: float = 0.0, yaw: float = 0.0) -> Cars:
+    one = np.ones(1)
+    colour = np.full((1, 3), 200, np.uint8)
+    return Cars(np.array([1]), x_m * one, y_m * one, yaw * one, 8.0 * one, 2.5 * one, 3.2 * one, colour)
+
+
+@pytest.mark.parametrize(
+    ("y_m", "eye", "hidden"),
+    [
+        (2.0, (0.0, -60.0, 60.0), True),  # the ray rises by 0.95 m a metre: at the truck's side it is 1.9 m high
+        (3.6, (0.0, -60.0, 60.0), False),  # 3.4 m high there, above the roof
+        (2.0, (0.0, 2.0, 60.0), False),  # from straight above
+        (2.0, (0.0, 60.0, 60.0), False),  # from the other side
+        (0.5, (0.0, -60.0, 60.0), False),  # on the truck's own ground
+    ],
+)
+def test_a_truck_hides_what_lies_in_its_lee(y_m: float, eye: tuple[float, ...], hidden: bool) -> None:
+    for yaw in (0.0, np.pi / 2, 0.7):
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, s], [-s, c]])
+        at, eyes = np.array([[1.0, y_m]]) @ turn, np.array([[*np.array(eye[:2]) @ turn, eye[2]]])
+        assert behind(truck(yaw=yaw), at, eyes, CAR_TOP_M).tolist() == [hidden]
+
+
+def test_a_thermal_camera_does_not_see_a_person_behind_a_truck() -> None:
+    camera = Thermal(near_probability=1.0, half_range_m=2000.0, false_alarms_per_min=0.0, field_of_view_deg=120.0)
+    field, at = HeightField(Town(EMPTY), AREA), np.array([[0.0, 2.0]])
+    frame = (camera, at, field, capture(0.0, -60.0), 3, 0.1, (1, 0))
+    assert len(look(*frame)) == len(look(*frame, truck(30.0))) == 1
+    assert look(*frame, truck()) == []
+
+
+def test_trucks_hide_cars_from_the_surrogate_and_are_seen_over_hedges() -> None:
+    """Of cars the share that is seen falls where trucks drive; of trucks it is not less than of cars in their place."""
+    captures = CaptureColumns.of([capture(10.0 * k, 5.0, t_s=1.0 + k, drone=k) for k in range(5)])
+    dense, bare = (dict(building_density=d, tree_density=d) for d in (0.6, 0.0))
+
+    def seen(trucks: float, scene: dict[str, float]) -> tuple[float, float]:
+        eyes = Eyes(model(trucks, **scene))
+        looks = eyes.look(captures)
+        visible, large = looks.covariates[:, 3], eyes.traffic.truck[looks.car]
+        return float(visible[~large].mean()), float(visible[large].mean()) if large.any() else float("nan")
+
+    assert seen(0.0, bare)[0] == 1.0
+    assert 0.9 < seen(0.4, bare)[0] < 0.999
+    assert seen(0.4, bare)[1] == 1.0
+    assert seen(1.0, dense)[1] > seen(0.0, dense)[0]
+
+
+# --- how they look ---------------------------------------------------------------------------------
+
+
+def test_a_trucks_body_is_as_high_behind_as_in_front() -> None:
+    window = Window(SceneModel(EMPTY, None, (-20, -20, 20, 20)), range(-1, 1), range(-1, 1))
+    with window.with_cars(truck()):
+        x, y = (int(v) for v in window.pixel(0.0, 0.0))
+        along = window.height[y, x - 11 : x + 11]  # 7 m of the 8
+        assert (along == np.float32(3.2)).all()
+    assert window.height.max() == 0.0
+
+
+def test_a_person_is_in_the_picture_and_is_no_car() -> None:
+    walker = Person(waypoints_m=((0.0, 0.0), (0.0, 20.0)), speed_mps=1.0)
+    scene, empty = (SceneModel(EMPTY, None, (-20, -20, 20, 20), people=p) for p in ((walker,), ()))
+    here = capture(0.0, 5.0, z_m=25.0, t_s=5.0)  # the person has come below the drone
+    with_, without = (Renderer(s, 1).render([here])[0, CAMERAS.index("nadir")].astype(int) for s in (scene, empty))
+    rows, columns = np.nonzero(np.abs(with_ - without).max(axis=-1) > 15)
+    assert 1 <= len(rows) <= 30
+    assert abs(rows.mean() - 45) < 4
+    assert abs(columns.mean() - 80) < 4
+    assert len(scene.cars_at(5.0)) == 0
+    assert scene.walkers.bodies(5.0).height_m.tolist() == [PERSON_SIZE_M[2]]
+
+
+def test_the_surrogate_finds_trucks_as_cars_of_a_cars_length() -> None:
+    """As the network does, which was measured: `perception/README.md`."""
+    scene = model(1.0, 20.0, parked_density=0.0)
+    detector = SurrogateDetector(scene, Perception(detector="surrogate", scene=scene.config), 1)
+    jobs = [(capture(8.0 * k, 10.0, t_s=2.0 + k, drone=k), ()) for k in range(12)]
+    found, there = detector.detect(jobs), [detector.truth(c.t_s, c) for c, _ in jobs]
+    every = np.concatenate([b.size_m[b.score > 0.5, 0] for b in found])
+    assert len(every) > 0.4 * sum(len(t) for t in there)
+    assert 4.0 < np.median(every) < 5.0
+    assert every.max() < TRUCK_FROM_M
+    assert {k for b in found for k in b.kind.tolist()} == {CAR}
+    assert min(t.size_m[:, 0].min() for t in there) >= 7.0
