@@ -153,6 +153,7 @@ class Agent:
         """The newest capture with computed features."""
         self._env = env
         self._rules = rules
+        self._compute_delay_s = rules.equipment(self.drone).compute_delay_s
         self._policy = policy
         self._senses = senses
         self._modem = modem
@@ -212,11 +213,11 @@ class Agent:
     def look(self, frame: int, sensed: Sensed) -> None:
         """The gate's part: look in as many frames as its directives want, and send what the look gives."""
         duty = self._gate.duty_percent
-        self.status.perceiving = (frame + 1) * duty // 100 > frame * duty // 100
+        self.status.perceiving = self.status.looks and (frame + 1) * duty // 100 > frame * duty // 100
         self.status.work.looks += self.status.perceiving
         if self.status.perceiving:
             self._look = sensed
-            self._env.timeout(self._rules.compute_delay_s, sensed.capture).callbacks.append(self._send)
+            self._env.timeout(self._compute_delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 

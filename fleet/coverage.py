@@ -10,7 +10,7 @@ It is seen well where the picture is as fine there as the network's map. Roofs h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, overload
 
@@ -18,17 +18,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.geometry import FOCAL_PX, FULL, camera_depth_m
+from sortie.perception.geometry import FULL, USUAL, Cameras, camera_depth_m
 from sortie.perception.scene.height_field import HeightField
 from sortie.policies.catalogue.coverage_cells import Cells, seen_well
 from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS, Coverage, Descriptor
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
+from sortie.scenarios.schema import Fleet
 
 Array = npt.NDArray[np.float64]
 States = npt.NDArray[np.uint8]
 
-HALF_FIELD_OF_VIEW_DEG = 35.0
-"""Half of the nadir camera's 70° field of view: at 60 m a footprint radius of 42 m (FACTS §1)."""
 RANGE_M = FULL.half_extent_m
 """From the drone to each edge of the square that perception covers."""
 WELL_PIXEL_M2 = FULL.image_m**2
@@ -42,19 +41,23 @@ SAMPLES = 2
 SIGHT_MOVES_M = CELL_M / 4
 """Lines of sight are followed again when the drone has flown so far. Over this way a roof 10 m high moves its shadow,
 seen from 60 m, by half a metre."""
-_HALF_FIELD_OF_VIEW_TAN = math.tan(math.radians(HALF_FIELD_OF_VIEW_DEG))
 _HALF = COVERAGE_CELLS // 2
 _MIDDLES_M = ((np.arange(COVERAGE_CELLS) - _HALF + 0.5) * CELL_M).astype(np.float32)
 _BYTE_PLACES = np.array([1, 4, 16, 64], np.uint8)
 
 
+def cameras_of(fleet: Fleet) -> list[Cameras]:
+    """Each drone's cameras."""
+    return [Cameras(**camera.model_dump()) for camera in fleet.cameras]
+
+
 @overload
-def footprint_radius_m(height_m: float) -> float: ...
+def footprint_radius_m(height_m: float, cameras: Cameras = USUAL) -> float: ...
 @overload
-def footprint_radius_m(height_m: Array) -> Array: ...
-def footprint_radius_m(height_m: float | Array) -> float | Array:
-    """Radius of the nadir footprint at a height above ground, any shape."""
-    radius_m: Array = np.maximum(0.0, height_m) * _HALF_FIELD_OF_VIEW_TAN
+def footprint_radius_m(height_m: Array, cameras: Cameras = USUAL) -> Array: ...
+def footprint_radius_m(height_m: float | Array, cameras: Cameras = USUAL) -> float | Array:
+    """Radius of the nadir camera's footprint at a height above ground, any shape: with the usual 70° at 60 m it is 42 m."""
+    radius_m: Array = np.maximum(0.0, height_m) * math.tan(math.radians(cameras.field_of_view_deg / 2))
     return radius_m
 
 
@@ -89,7 +92,7 @@ class Poses(NamedTuple):
     est_yaw_rad: Array
 
 
-def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array) -> States:
+def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array, cameras: Cameras = USUAL) -> States:
     """How well cameras see the cells around them where nothing stands in between: uint8 [..., 16, 16].
 
     The ground that a pixel covers is depth³ ÷ (focal length² · height), with the depth along the camera's axis: the
@@ -99,6 +102,7 @@ def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array) -> State
         x_m, y_m: [...] from the corner between the grid's four middle cells to the drone, east and north.
         height_m: [...] above the ground.
         body: [..., 3, 3] the attitude, body (FLU) to ENU.
+        cameras: of all these drones.
     """
     east, north = ((_MIDDLES_M - np.asarray(v, np.float32)[..., None]) for v in (x_m, y_m))
     east, north, up = east[..., None, :], north[..., :, None], np.asarray(height_m, np.float32)[..., None, None]
@@ -106,9 +110,9 @@ def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array) -> State
     x, y, z = (
         turn[..., 0, k, :, :] * east + turn[..., 1, k, :, :] * north - turn[..., 2, k, :, :] * up for k in range(3)
     )
-    depth = camera_depth_m(x, y, z)
+    depth = camera_depth_m(x, y, z, cameras.lens)
     near = east * east + north * north <= np.float32(RANGE_M**2)
-    well = depth * depth * depth <= np.float32(WELL_PIXEL_M2 * FOCAL_PX**2) * up
+    well = depth * depth * depth <= np.float32(WELL_PIXEL_M2 * cameras.focal_px**2) * up
     states: States = (near & np.isfinite(depth)).astype(np.uint8) + (near & well).astype(np.uint8)
     return states
 
@@ -121,19 +125,27 @@ def attitude(orientation_xyzw: Array, turn_rad: Array | float = 0.0) -> Array:
     return np.stack([c * east - s * north, s * east + c * north, up], axis=-2)
 
 
-def views(poses: Poses, field: HeightField) -> list[list[View]]:
+def views(poses: Poses, field: HeightField, cameras: Sequence[Cameras] | None = None) -> list[list[View]]:
     """What every drone's cameras see in every frame: views [frames][drones].
 
     What is hidden follows from where the drone is. The cells are those of where it believes to be.
+
+    Args:
+        poses: of all drones in some frames.
+        field: what hides the ground.
+        cameras: each drone's; None: the usual ones.
     """
     believed = poses.est_position_m[..., :2].astype(np.float32).astype(np.float64)  # as the wire rounds it
     middle = np.floor(believed / CELL_M)  # the cell below the drone: its south-west corner is the grid's middle
     corner = (middle - _HALF).astype(np.int64)
     away = believed - middle * CELL_M
     turn = poses.est_yaw_rad - poses.yaw_rad
-    states = camera_states(
-        away[..., 0], away[..., 1], poses.position_m[..., 2], attitude(poses.orientation_xyzw, turn)
-    )  # fmt: skip
+    body, each = attitude(poses.orientation_xyzw, turn), cameras or [USUAL] * turn.shape[1]
+    states = np.empty((*turn.shape, COVERAGE_CELLS, COVERAGE_CELLS), np.uint8)
+    for kind in dict.fromkeys(each):
+        of = [drone for drone, its in enumerate(each) if its == kind]
+        x, y = away[:, of, 0], away[:, of, 1]
+        states[:, of] = camera_states(x, y, poses.position_m[:, of, 2], body[:, of], kind)
     states *= _in_sight(poses, corner, -turn, field)
     packed = states.reshape(*states.shape[:2], COVERAGE_BYTES, 4) @ _BYTE_PLACES
     return [

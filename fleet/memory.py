@@ -77,7 +77,9 @@ class PeerMemory:
         self._heard_at_s[sender] = now_s
 
     def can_fuse(self, payload: Payload) -> bool:
-        """Whether the drone's network can use it. Feature cells of another network mean nothing to it."""
+        """Whether the drone can use it. Feature cells of another network mean nothing to it; without one all maps do."""
+        if not self.status.looks and payload.representation in MAPS:
+            return False
         return payload.representation != FEATURES or payload.feature_space == self.status.feature_space
 
     def receive(self, received: Received) -> None:
@@ -87,7 +89,8 @@ class PeerMemory:
         self.status.work.payload_bytes += received.payload.size_bytes
         self.status.work.maps += received.payload.representation in MAPS
         if self._rules.trust:
-            took_s = self.payload_age_s(received, received.t_done_s) - self._rules.compute_delay_s
+            delay_s = self._rules.equipment(peer).compute_delay_s
+            took_s = self.payload_age_s(received, received.t_done_s) - delay_s
             self._arrivals.setdefault(peer, []).append(
                 Arrival(
                     0 if received.missing else received.payload.size_bytes, took_s, received.phy_mbps, received.t_done_s
@@ -162,6 +165,8 @@ class PeerMemory:
             if any(claimed_s - a.sent_s < LOOK_STANDS_S / 2 for a in arrivals[i]):
                 looking.add(i)
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
-        self._standings = after = judge(before, self.drone, heard, arrivals, self._rules.form, looking)
+        self._standings = after = judge(
+            before, self.drone, heard, arrivals, self._rules.form, looking, lambda i: self._rules.equipment(i).cameras
+        )
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
         return [(peer, after[peer]) for peer in heard if after[peer].trust != before.get(peer, UNJUDGED).trust]

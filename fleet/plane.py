@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from sortie.fleet.computer import Work
+from sortie.fleet.coverage import cameras_of
 from sortie.fleet.messages.compact import FULL, Form
+from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
+from sortie.scenarios.schema import Scenario
+
+
+class Equipment(NamedTuple):
+    """What every drone knows of another's make."""
+
+    compute_delay_s: float
+    """From sensing to features ready to send."""
+    cameras: Cameras = USUAL
+
+
+def equipment_of(scenario: Scenario) -> dict[int, Equipment]:
+    """Each drone's equipment."""
+    each = zip(scenario.compute_delays_s, cameras_of(scenario.fleet), strict=True)
+    return {i: Equipment(delay_s, cameras) for i, (delay_s, cameras) in enumerate(each)}
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneRules:
-    """The plane's periods, the same for every drone."""
+    """The plane's periods, the same for every drone, and what drones are known to carry."""
 
     period_s: float
     frames: int
@@ -35,6 +53,12 @@ class PlaneRules:
     """The resolution of descriptors on the wire."""
     roster: bool = False
     """Whether drones publish which members of the fleet they know (`sortie.policies.contract.Roster`)."""
+    makes: Mapping[int, Equipment] = field(default_factory=dict)
+    """The equipment of drones; others have `compute_delay_s` and the usual cameras."""
+
+    def equipment(self, drone: int) -> Equipment:
+        """What a drone carries."""
+        return self.makes.get(drone) or Equipment(self.compute_delay_s)
 
     @property
     def descriptor_period_s(self) -> float:
@@ -56,6 +80,8 @@ class DroneStatus:
 
     feature_space: str = ""
     """The network of the drone: only maps of one feature space can be fused. Empty: the fleet's common one."""
+    looks: bool = True
+    """Whether it has a detector. Without one it sends context alone, and uses the boxes that it is sent."""
     airborne: bool = True
     """False while the drone is on the ground or lost."""
     perceiving: bool = False

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from sortie.fleet.coverage import Poses, View, footprint_radius_m, views
 from sortie.fleet.flight.motion import Trajectories
+from sortie.perception.geometry import Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.types import Capture
 
@@ -32,9 +33,9 @@ class Sensed(NamedTuple):
 class FlightSenses:
     """What all drones sense; `at(frame)[drone]`. Sensors trigger with the frame."""
 
-    def __init__(self, motion: Trajectories, frame_s: float, field: HeightField) -> None:
-        """Args: `field`: what hides the ground from the drones' cameras."""
-        self._motion, self._frame_s, self._field = motion, frame_s, field
+    def __init__(self, motion: Trajectories, frame_s: float, field: HeightField, cameras: Sequence[Cameras]) -> None:
+        """Args: `field`: what hides the ground from the drones' cameras; `cameras`: each drone's."""
+        self._motion, self._frame_s, self._field, self._cameras = motion, frame_s, field, cameras
         self._first = -_BLOCK
         self._block: list[tuple[Sensed, ...]] = []
 
@@ -49,21 +50,21 @@ class FlightSenses:
         frames = slice(self._first, self._first + _BLOCK)
         m = self._motion
         states = m.position_m, m.orientation_xyzw, m.yaw_rad, m.est_position_m, m.est_yaw_rad
-        seen = zip(*views(Poses(*(v[frames] for v in states)), self._field), strict=True)
+        seen = zip(*views(Poses(*(v[frames] for v in states)), self._field, self._cameras), strict=True)
         self._block = list(zip(*(self._of(drone, frames, view) for drone, view in enumerate(seen)), strict=True))
 
     def _of(self, drone: int, frames: slice, views: Sequence[View]) -> list[Sensed]:
         """One drone in some frames."""
-        m = self._motion
+        m, cameras = self._motion, self._cameras[drone]
         position, orientation, velocity, believed = (
             map(tuple, states[frames, drone].tolist())
             for states in (m.position_m, m.orientation_xyzw, m.velocity_mps, m.est_position_m)
         )
         yaw = m.est_yaw_rad[frames, drone].tolist()
-        radius = footprint_radius_m(m.est_position_m[frames, drone, 2]).tolist()
+        radius = footprint_radius_m(m.est_position_m[frames, drone, 2], cameras).tolist()
         return [
-            Sensed(Capture(drone, frame * self._frame_s, *pose), v, r, view)
-            for frame, v, r, view, *pose in zip(
+            Sensed(Capture(drone, frame * self._frame_s, at, turn, est, heading, cameras=cameras), v, r, view)
+            for frame, v, r, view, at, turn, est, heading in zip(
                 range(frames.start, frames.start + len(yaw)), velocity, radius, views, position, orientation, believed,
                 yaw, strict=True,
             )

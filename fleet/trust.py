@@ -11,7 +11,7 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from statistics import median
@@ -22,6 +22,7 @@ from scipy.ndimage import binary_dilation
 
 from sortie.fleet.coverage import LOOK_STANDS_S, attitude, camera_states, unpack_grid
 from sortie.fleet.messages.compact import FULL, Form
+from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
 JUDGED_EVERY_S = 1.0
@@ -117,6 +118,7 @@ def judge(
     arrivals: Mapping[int, Sequence[Arrival]],
     form: Form = FULL,
     looking: Container[int] = (),
+    cameras: Callable[[int], Cameras] = lambda _: USUAL,
 ) -> dict[int, Standing]:
     """What `ego` thinks of everyone after one more second.
 
@@ -126,6 +128,7 @@ def judge(
         arrivals: payloads that reached it in this second, by sender.
         form: how finely descriptors are written; what rounding can do is no doubt.
         looking: who looked shortly before its claim, as payloads of that look show.
+        cameras: a drone's cameras, as its make has them.
 
     Returns:
         Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
@@ -144,7 +147,11 @@ def judge(
             came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
             others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
             doubt = (
-                (coverage_doubt(claim, form.blur_m, peer in looking) if math.isfinite(form.blur_m) else "")
+                (
+                    coverage_doubt(claim, form.blur_m, peer in looking, cameras(peer))
+                    if math.isfinite(form.blur_m)
+                    else ""
+                )
                 or goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
@@ -181,7 +188,7 @@ def discounted(d: Descriptor) -> Descriptor:
 
 
 @lru_cache(maxsize=1024)  # a claim is judged by everyone who heard it
-def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False) -> str:
+def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, cameras: Cameras = USUAL) -> str:
     """What a coverage grid says that its pose or its payloads forbid; empty where it may be so.
 
     How much is hidden from a drone, others cannot know. A drone that looks sees some of the ground.
@@ -190,12 +197,14 @@ def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False) -> s
         d: the claim.
         blur_m: how far a cell may be off by the descriptor's form.
         looks: whether the drone is known to look.
+        cameras: the drone's.
     """
     states = unpack_grid(d.coverage_grid)
     row, column = d.coverage_corner
     half, (x_m, y_m, z_m) = COVERAGE_CELLS // 2, d.position_m
     away_x, away_y = x_m - (column + half) * COVERAGE_CELL_M, y_m - (row + half) * COVERAGE_CELL_M
-    could = camera_states(np.array(away_x), np.array(away_y), np.array(z_m), attitude(np.array(d.orientation_xyzw)))
+    body = attitude(np.array(d.orientation_xyzw))
+    could = camera_states(np.array(away_x), np.array(away_y), np.array(z_m), body, cameras)
     flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
     reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # and a cell, since the drone may have turned since it looked
     possible = binary_dilation(could >= Coverage.WELL, np.ones((3, 3)), iterations=reach)

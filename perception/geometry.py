@@ -10,7 +10,8 @@ resolutions cover the same square: the image that the encoder sees, the cells th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,13 +20,59 @@ IMAGE_PX = 256
 CELLS = 64
 CHANNELS = 80
 HEAD_PX = 128
-WIDTH_PX, HEIGHT_PX = 160, 90
-"""A camera image."""
-HALF_H = float(np.tan(np.radians(35.0)))
-"""Tangent of half the cameras' horizontal field of view."""
-HALF_V = HALF_H * HEIGHT_PX / WIDTH_PX
-FOCAL_PX = 0.5 * WIDTH_PX / HALF_H
-"""The cameras' focal length in pixels."""
+
+
+class Lens(NamedTuple):
+    """What of cameras decides where a direction lies in their pictures; numbers, or arrays of many drones."""
+
+    half_h: Any
+    """Tangent of half the horizontal field of view."""
+    half_v: Any
+    ahead: Any
+    """√2 times the cosine and the sine of the pitch: 1 and 1 at 45°."""
+    down: Any
+
+
+class Cameras(NamedTuple):
+    """A drone's five cameras: front, left, right and back, pitched down, and one that looks straight down. UAV3D's by default."""
+
+    field_of_view_deg: float = 70.0
+    """Horizontal, of each camera."""
+    pitch_deg: float = 45.0
+    width_px: int = 160
+    """Of a picture, which is 16:9."""
+
+    @property
+    def height_px(self) -> int:
+        """Height of a picture."""
+        return self.width_px * 9 // 16
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels."""
+        return 0.5 * self.width_px / float(self.lens.half_h)
+
+    @property
+    def lens(self) -> Lens:
+        """The same as tangents."""
+        return _lens(self)
+
+
+@lru_cache(maxsize=64)
+def _lens(cameras: Cameras) -> Lens:
+    half_h = float(np.tan(np.radians(cameras.field_of_view_deg / 2)))
+    half_v = half_h * cameras.height_px / cameras.width_px
+    pitch = np.radians(cameras.pitch_deg)
+    # rounded, so that 45° are exactly 1 and 1
+    ahead, down = (round(float(np.sqrt(2.0) * part), 12) for part in (np.cos(pitch), np.sin(pitch)))
+    return Lens(half_h, half_v, ahead, down)
+
+
+USUAL = Cameras()
+"""The cameras of which the shipped networks have learned."""
+WIDTH_PX, HEIGHT_PX = USUAL.width_px, USUAL.height_px
+HALF_H, HALF_V = USUAL.lens.half_h, USUAL.lens.half_v
+FOCAL_PX = USUAL.focal_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,32 +115,35 @@ def to_world(forward_m: Any, left_m: Any, pose: Any) -> tuple[Any, Any]:
     return pose[0] + c * forward_m - s * left_m, pose[1] + s * forward_m + c * left_m
 
 
-def camera_margins(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+def camera_margins(x: Any, y: Any, z: Any, lens: Lens = USUAL.lens) -> tuple[Any, Any]:
     """How far inside a picture a direction lies: 1 in the middle, 0 at the edge, negative outside.
 
     Args:
         x, y, z: the direction in the body frame (FLU), numbers or arrays.
+        lens: the cameras', numbers or arrays that broadcast.
 
     Returns:
         The margin in the camera that looks straight down, and in that of the four pitched cameras which faces the
-        direction. A direction that another pitched camera sees is in the facing one, too.
+        direction. The lift asks no other one. By the usual cameras, none of the others sees what the facing one does not.
     """
     depth, across, along = np.maximum(-z, 0.1), np.abs(y), np.abs(x)
-    down = 1.0 - np.maximum(across / HALF_H, along / HALF_V) / depth
+    down = 1.0 - np.maximum(across / lens.half_h, along / lens.half_v) / depth
     ahead, right = np.maximum(along, across), np.minimum(along, across)
-    forward = np.maximum((ahead - z) / np.sqrt(2.0), 0.1)
-    u, v = right / (forward * HALF_H), np.abs(-ahead - z) / (np.sqrt(2.0) * forward * HALF_V)
+    forward = np.maximum((lens.ahead * ahead - lens.down * z) / np.sqrt(2.0), 0.1)
+    u = right / (forward * lens.half_h)
+    v = np.abs(-lens.down * ahead - lens.ahead * z) / (np.sqrt(2.0) * forward * lens.half_v)
     return down, 1.0 - np.maximum(u, v)
 
 
-def camera_depth_m(x: Any, y: Any, z: Any) -> Any:
+def camera_depth_m(x: Any, y: Any, z: Any, lens: Lens = USUAL.lens) -> Any:
     """How far points lie in front of the camera that shows them largest, along its axis; infinite where none shows them.
 
     Args:
         x, y, z: the points in the body frame (FLU), metres, arrays.
+        lens: the cameras', numbers.
     """
-    down, side = camera_margins(x, y, z)
-    ahead = (np.maximum(np.abs(x), np.abs(y)) - z) / np.sqrt(2.0, dtype=np.float32)
+    down, side = camera_margins(x, y, z, lens)
+    ahead = (lens.ahead * np.maximum(np.abs(x), np.abs(y)) - lens.down * z) / np.sqrt(2.0, dtype=np.float32)
     return np.minimum(np.where(down > 0.0, -z, np.inf), np.where(side > 0.0, ahead, np.inf))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.classes import TargetClass
-from sortie.perception.geometry import to_world
+from sortie.perception.geometry import USUAL, Cameras, to_world
 from sortie.perception.motion import Tracks
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
@@ -32,6 +32,7 @@ class Capture(NamedTuple):
     """Its estimated heading, from east towards north."""
     looked: bool = True
     """False: the drone's pose alone. It has no images, so no features and no boxes of its own."""
+    cameras: Cameras = USUAL
 
     @property
     def est_pose(self) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from sortie.radio.rates import STANDARDS, StandardName
@@ -55,6 +55,9 @@ class AirSettings:
     """Transmit power, antenna gains included."""
     noise_figure_db: float = 7.0
     antenna: AntennaName = "isotropic"
+    """Of every drone that `own_antennas` does not name."""
+    own_antennas: Mapping[int, AntennaName] = field(default_factory=dict)
+    """Antennas of single drones, by id."""
     path_loss: PathLossName = "log_distance"
     path_loss_exponent: float = 2.1
     """Exponent of `log_distance` beyond 1 m."""
@@ -89,12 +92,19 @@ class AirSettings:
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():
             self._check(name, allowed)
+        for drone, pattern in self.own_antennas.items():
+            if pattern not in _CHOICES["antenna"]:
+                raise ValueError(f"own_antennas[{drone}] is {pattern!r}, must be one of {list(_CHOICES['antenna'])}")
         self._check("bandwidth_mhz", STANDARDS[self.standard].rates_mbps)
 
     def _check(self, name: str, allowed: Iterable[object]) -> None:
         value, choices = getattr(self, name), list(allowed)
         if value not in choices:
             raise ValueError(f"{name} is {value!r}, must be one of {choices}")
+
+    def antennas(self, drones: int) -> tuple[AntennaName, ...]:
+        """Each drone's antenna."""
+        return tuple(self.own_antennas.get(drone, self.antenna) for drone in range(drones))
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> AirSettings:

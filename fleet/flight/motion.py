@@ -127,7 +127,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     arm = np.stack([cos * slot[:, 0] - sin * slot[:, 1], sin * slot[:, 0] + cos * slot[:, 1]], axis=-1)
     across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
     rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
-    position = _raise(path.position_m[:, None] + arm, fleet.formation.altitude_m)
+    position = _raise(path.position_m[:, None] + arm, np.array(fleet.altitudes_m))
     velocity = _raise(path.velocity_mps[:, None] + rate * across)
     acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
 
@@ -192,6 +192,7 @@ def _continuous(quaternion: Array) -> Array:
     return quaternion
 
 
-def _raise(ground: Array, height: float = 0.0) -> Array:
-    """[..., 2] to [..., 3]."""
-    return np.concatenate([ground, np.full((*ground.shape[:-1], 1), height)], axis=-1)
+def _raise(ground: Array, height: float | Array = 0.0) -> Array:
+    """[..., 2] to [..., 3], to one height or to one for each of the last axis but one."""
+    up = np.broadcast_to(height, ground.shape[:-1])
+    return np.concatenate([ground, up[..., None]], axis=-1)

@@ -6,7 +6,7 @@ So whatever stands up leans outwards and hides what is behind it; a second viewp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sortie.perception.compiled import compiled, fma
-from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, IMAGE_PX, Geometry
+from sortie.perception.geometry import FULL, IMAGE_PX, Cameras, Geometry
 from sortie.perception.scene.render import CAMERAS, tilt
 from sortie.perception.scene.town import Bytes, FloatMap
 from sortie.perception.types import Capture
@@ -23,9 +23,14 @@ _F = np.float32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 _FRONT, _LEFT, _RIGHT, _BACK, _NADIR = _F(0.0), _F(1.0), _F(2.0), _F(3.0), _F(4.0)
 _ROOT2, _NEAREST = _F(np.sqrt(2.0)), _F(0.1)
-_LENS = np.array([HALF_H, HALF_V, 1.0 - 1.0 / HEIGHT_PX, 2.0 / len(CAMERAS)], np.float32)
-"""Tangents of half the fields of view; how far rows are looked for, so that bilinear taps stay in the camera's own; and what a
-camera takes of the column of views (−1 … 1)."""
+
+
+@lru_cache(maxsize=16)
+def _lens(cameras: Cameras) -> FloatMap:
+    """Tangents of half the fields of view; how far rows are looked for, so that bilinear taps stay in the camera's own; what a
+    camera takes of the column of views (−1 … 1); and the pitch."""
+    half_h, half_v, ahead, down = cameras.lens
+    return np.array([half_h, half_v, 1.0 - 1.0 / cameras.height_px, 2.0 / len(CAMERAS), ahead, down], np.float32)
 
 
 def ground_points(geometry: Geometry) -> torch.Tensor:
@@ -40,22 +45,23 @@ def _planes(geometry: Geometry) -> tuple[FloatMap, FloatMap]:
     return x.contiguous().numpy(), y.contiguous().numpy()
 
 
-def lift(views: Bytes, captures: Sequence[Capture], geometry: Geometry = FULL) -> torch.Tensor:
-    """Camera views uint8 [n, 5, 90, 160, 3] to bird's-eye images uint8 [n, 4, 256, 256]: R, G, B, and 255 where any camera saw the ground."""
+def lift(views: Iterable[Bytes], captures: Sequence[Capture], geometry: Geometry = FULL) -> torch.Tensor:
+    """Camera views, each uint8 [5, height, width, 3], to bird's-eye images uint8 [n, 4, 256, 256]: R, G, B, and 255 where any camera saw the ground."""
     out = np.empty((len(captures), 4, IMAGE_PX, IMAGE_PX), np.uint8)
     ground = _planes(geometry)
     for seen, capture, image in zip(views, captures, out, strict=True):
         level_to_body = tilt(capture.orientation_xyzw).T.astype(np.float32)
         down = (level_to_body[:, 2].astype(float) * -max(capture.est_position_m[2], 1.0)).astype(np.float32)
-        _unproject(seen.reshape(len(CAMERAS) * HEIGHT_PX, -1, 3), level_to_body, down, _LENS, *ground, image)
+        column = seen.reshape(-1, capture.cameras.width_px, 3)
+        _unproject(column, level_to_body, down, _lens(capture.cameras), *ground, image)
     return torch.from_numpy(out)
 
 
 @compiled
 def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
-    """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [450, 160, 3]; into `out` [4, 256, 256]."""
+    """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [5 · height, width, 3]; into `out` [4, 256, 256]."""
     rows, columns, _ = views.shape
-    half_h, half_v, inset, view = lens
+    half_h, half_v, inset, view, flat, steep = lens
     for i in range(ground_x.shape[0]):
         for j in range(ground_x.shape[1]):
             gx, gy = ground_x[i, j], ground_y[i, j]
@@ -66,13 +72,13 @@ def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, groun
             depth = max(-z, _NEAREST)
             u, v, camera = -y / (depth * half_h), -x / (depth * half_v), _NADIR
             seen = abs(u) < _ONE and abs(v) < _ONE and z < _ZERO
-            if not seen:  # the camera of the quadrant: a forward and b right of it, pitched 45° down
+            if not seen:  # the camera of the quadrant: a forward and b right of it, pitched down
                 if abs(x) >= abs(y):
                     ahead, right, camera = abs(x), (-y if x > _ZERO else y), (_FRONT if x >= _ZERO else _BACK)
                 else:
                     ahead, right, camera = abs(y), (x if y > _ZERO else -x), (_LEFT if y >= _ZERO else _RIGHT)
-                forward = (ahead - z) / _ROOT2
-                u, v = right / (forward * half_h), (-ahead - z) / (_ROOT2 * forward * half_v)
+                forward = (flat * ahead - steep * z) / _ROOT2
+                u, v = right / (forward * half_h), (-steep * ahead - flat * z) / (_ROOT2 * forward * half_v)
                 seen = abs(u) < _ONE and abs(v) < _ONE and forward > _ONE
             if not seen:
                 out[:, i, j] = 0

@@ -34,7 +34,7 @@ from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.memory import keep_freed
 from sortie.perception.network.warp import arriving, rows, support
-from sortie.perception.scene.render import VIEWS_SHAPE, Renderer
+from sortie.perception.scene.render import Renderer, views_shape
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
@@ -160,7 +160,7 @@ class TorchDetector:
         return len(self._sendable(self._look_alone(capture).result()).inside(roi))
 
     def camera_views(self, capture: Capture) -> Bytes:
-        """The five camera images, uint8 [5, 90, 160, 3]: front, left, right, back, nadir."""
+        """The five camera images, uint8 [5, height, width, 3]: front, left, right, back, nadir."""
         views: Bytes = self._renderer.render([capture])[0]
         return views
 
@@ -177,7 +177,7 @@ class TorchDetector:
         """Render what is not kept yet, encode it in the background, and drop the oldest beyond the limit."""
         wanted = list(dict.fromkeys(captures))
         missing = [c for c in wanted if c not in self._kept]
-        views = np.empty((len(missing), *VIEWS_SHAPE), np.uint8)
+        views = [np.empty(views_shape(c.cameras), np.uint8) for c in missing]
         encoded: dict[Capture, _Encoded] = {}
 
         def encode(i: int, seen: Future[None]) -> Tensor:
@@ -196,7 +196,7 @@ class TorchDetector:
             finally:  # the moment's cars leave the scenery when nobody looks any more
                 wait(sights.values())
 
-        self._renderer.render(missing, side_by_side, views)
+        self._renderer.render_into(missing, views, side_by_side)
         self._kept.update(encoded)
         for capture in wanted:
             self._kept.move_to_end(capture)

@@ -1,8 +1,8 @@
 """What five cameras on a drone see: rays against the town's height field, on a CPU, a few milliseconds a camera.
 
-Each drone carries the cameras of UAV3D: front, left, right and back pitched 45° down and one that looks
-straight down, 70° horizontal field of view, 16:9, rendered at 160 × 90. They are fixed to the body, so a bank
-moves the view. `rays.py` walks the rays. The scenery is static; the moving cars of a moment are stamped into the rasters,
+Each drone carries the cameras of UAV3D, unless its make has others: front, left, right and back pitched 45° down and
+one that looks straight down, 70° horizontal field of view, 16:9, rendered at 160 × 90. They are fixed to the body, so a
+bank moves the view. `rays.py` walks the rays. The scenery is static; the moving cars of a moment are stamped into the rasters,
 and lifted out after.
 """
 
@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.geometry import HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
+from sortie.perception.geometry import USUAL, Cameras
 from sortie.perception.scene.rays import COARSE, FAR, FAR_REACH, REACH, see
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.stamping import raised, restore, saved, stamp
@@ -25,7 +26,6 @@ from sortie.perception.types import Capture
 from sortie.scenarios.streams import stream
 
 CAMERAS = ("front", "left", "right", "back", "nadir")
-VIEWS_SHAPE = (len(CAMERAS), HEIGHT_PX, WIDTH_PX, 3)
 MAX_REACH_M = 170.0
 RES = np.float32(RES_M)
 FloatOrArray = TypeVar("FloatOrArray", float, Floats)
@@ -59,32 +59,35 @@ def tilt(xyzw: Sequence[float]) -> Floats:
     return np.asarray(level @ r)
 
 
-def _camera_axes() -> Floats:
+def views_shape(cameras: Cameras = USUAL) -> tuple[int, int, int, int]:
+    """The shape of a drone's pictures: cameras, height, width, colours."""
+    return len(CAMERAS), cameras.height_px, cameras.width_px, 3
+
+
+def camera_axes(cameras: Cameras = USUAL) -> Floats:
     """[5, 3, 3]: rows are each camera's right, down and forward axes in the body frame (FLU)."""
-    out = []
+    out, lens = [], cameras.lens
     for azimuth in (0.0, 90.0, -90.0, 180.0):
         a = np.radians(azimuth)
         ahead = np.array([np.cos(a), np.sin(a), 0.0])
         right = np.array([np.sin(a), -np.cos(a), 0.0])
-        forward = (ahead + np.array([0.0, 0.0, -1.0])) / np.sqrt(2)
+        forward = (lens.ahead * ahead + np.array([0.0, 0.0, -lens.down])) / np.sqrt(2)
         out.append([right, np.cross(forward, right), forward])
     out.append([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     return np.array(out)
 
 
-AXES = _camera_axes()
+AXES = camera_axes()
 
 
-def _ray_table() -> Floats:
-    """Body-frame directions of every pixel, [5 · 90 · 160, 3], not normalised."""
-    u = (np.arange(WIDTH_PX) + 0.5) / WIDTH_PX * 2 - 1
-    v = (np.arange(HEIGHT_PX) + 0.5) / HEIGHT_PX * 2 - 1
-    vv, uu = np.meshgrid(v * HALF_V, u * HALF_H, indexing="ij")
+@lru_cache(maxsize=16)
+def _rays(cameras: Cameras) -> FloatMap:
+    """Body-frame directions of every pixel, float32 [5 · height · width, 3], not normalised."""
+    u = (np.arange(cameras.width_px) + 0.5) / cameras.width_px * 2 - 1
+    v = (np.arange(cameras.height_px) + 0.5) / cameras.height_px * 2 - 1
+    vv, uu = np.meshgrid(v * cameras.lens.half_v, u * cameras.lens.half_h, indexing="ij")
     local = np.stack([uu, vv, np.ones_like(uu)], axis=-1).reshape(-1, 3)
-    return np.concatenate([local @ axes for axes in AXES])
-
-
-_RAYS = _ray_table().astype(np.float32)
+    return np.concatenate([local @ axes for axes in camera_axes(cameras)]).astype(np.float32)
 
 
 class Window:
@@ -159,17 +162,21 @@ class Renderer:
         self._window: Window | None = None
         self._span: tuple[range, range] = (range(0), range(0))
 
-    def render(
-        self, captures: Sequence[Capture], each: Callable[..., Iterable[None]] = map, into: Bytes | None = None
-    ) -> Bytes:
-        """Camera images of all captures, uint8 [n, 5, 90, 160, 3], in the order of `CAMERAS`.
+    def render(self, captures: Sequence[Capture]) -> Bytes:
+        """Camera images of captures by cameras of one resolution, uint8 [n, 5, height, width, 3], in the order of `CAMERAS`."""
+        out = np.empty((len(captures), *views_shape(captures[0].cameras if captures else USUAL)), np.uint8)
+        self.render_into(captures, out)
+        return out
 
-        `each` runs a function over captures, `map` or a pool's `map`; the images are the same. They are written `into`
-        an array of that shape in C order, where one is given, each whole when its function is done.
+    def render_into(
+        self, captures: Sequence[Capture], out: Bytes | Sequence[Bytes], each: Callable[..., Iterable[None]] = map
+    ) -> None:
+        """Write the images of each capture into an array [5, height, width, 3] in C order, whole when its function is done.
+
+        `each` runs a function over captures, `map` or a pool's `map`; the images are the same.
         """
-        out = np.empty((len(captures), *VIEWS_SHAPE), np.uint8) if into is None else into
         if not captures:
-            return out
+            return
         window = self._window_over(captures)
         gain = np.float32(self.scene.config.brightness)
         for t_s in dict.fromkeys(c.t_s for c in captures):
@@ -182,11 +189,11 @@ class Renderer:
                     eye = tuple(np.float32(v) for v in (*window.pixel(*c.position_m[:2]), c.position_m[2]))
                     top_m = min(window.top_m, c.position_m[2] - 1.0)
                     rasters = (window.height, window.coarse, window.far, window.colour)
-                    see(_RAYS, turn, eye, RES, top_m, *rasters, gain, _noise(*self.key, c), out[i].reshape(-1, 3))
+                    rays = _rays(c.cameras)
+                    see(rays, turn, eye, RES, top_m, *rasters, gain, _noise(*self.key, c), out[i].reshape(-1, 3))
 
                 for _ in each(one, here):
                     pass
-        return out
 
     def _window_over(self, captures: Sequence[Capture]) -> Window:
         where = np.array([c.position_m for c in captures])
@@ -208,4 +215,5 @@ class Renderer:
 def _noise(seed: int, replication: int, capture: Capture) -> Bytes:
     """Uniform sensor noise, uint8 [rays, 3] of 0 … 15 levels (8 is none), keyed by drone and millisecond."""
     rng = stream(seed, replication, (capture.drone, max(round(capture.t_s * 1e3), 0)), "camera.noise")
-    return np.asarray(np.frombuffer(rng.bytes(_RAYS.size), np.uint8) & np.uint8(15)).reshape(_RAYS.shape)
+    numbers = int(np.prod(views_shape(capture.cameras)))
+    return np.asarray(np.frombuffer(rng.bytes(numbers), np.uint8) & np.uint8(15)).reshape(-1, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sortie.perception.classes import TRUCK, vehicle_classes
-from sortie.perception.geometry import FULL, camera_margins
+from sortie.perception.geometry import FULL, USUAL, Lens, camera_margins
 from sortie.perception.scene.behind_trucks import behind
 from sortie.perception.scene.height_field import CAR_TOP_M, TRUCK_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
@@ -41,7 +41,8 @@ _ROAD_TONE, _TONE = 0.34, np.array([0.299, 0.587, 0.114]) / 255.0
 @dataclass(frozen=True, slots=True)
 class CaptureColumns:
     """Captures as columns: `t_s` [c], `position_m` [c, 3], `est` [c, 3] (x, y, yaw), `yaw_rad` [c], `tilt` [c, 3, 3] (body to level), `stretch` [c]
-    the height that the lift believes over the height there is: by that much its map is too large."""
+    the height that the lift believes over the height there is: by that much its map is too large. `lens` holds numbers
+    where all cameras are alike, else arrays [c]."""
 
     t_s: Floats
     position_m: Floats
@@ -49,6 +50,12 @@ class CaptureColumns:
     yaw_rad: Floats
     tilt: Floats
     stretch: Floats
+    lens: Lens
+
+    def lens_at(self, capture: Ints) -> Lens:
+        """The lens of some captures [n], or of all."""
+        first = self.lens.half_h
+        return Lens(*(v[capture] for v in self.lens)) if isinstance(first, np.ndarray) else self.lens
 
     @classmethod
     def of(cls, captures: Sequence[Capture]) -> CaptureColumns:
@@ -67,7 +74,10 @@ class CaptureColumns:
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         tilt = np.stack([c * body[:, 0] + s * body[:, 1], c * body[:, 1] - s * body[:, 0], body[:, 2]], axis=1)
         stretch = np.array([c.est_position_m[2] for c in captures]) / np.maximum(position[:, 2], 1.0)
-        return cls(t_s, position, est, yaw, tilt, stretch)
+        alike = len({c.cameras for c in captures}) < 2
+        first = captures[0].cameras if len(captures) else USUAL
+        lens = first.lens if alike else Lens(*np.array([c.cameras.lens for c in captures]).T)
+        return cls(t_s, position, est, yaw, tilt, stretch, lens)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +216,8 @@ class Eyes:
         traffic = self.traffic
         eye = fleet.position_m[capture]
         reach = np.hypot(local[:, 0], local[:, 1])
-        nadir, margin = _in_view(np.moveaxis(fleet.tilt, 0, 2)[..., capture], local, eye[:, 2])
+        tilt = np.moveaxis(fleet.tilt, 0, 2)[..., capture]
+        nadir, margin = _in_view(tilt, local, eye[:, 2], fleet.lens_at(capture))
         along = 0.35 * traffic.seen_size_m[car, 0, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
         points = (xy - along, xy, xy + along)
         visible = sum(self._seen(p, eye, fleet.t_s[capture], traffic.truck[car]).astype(np.float32) for p in points)
@@ -259,13 +270,13 @@ def beside(rows: int, columns: Sequence[ArrayLike]) -> NDArray[np.float32]:
     return out
 
 
-def _in_view(tilt: Floats, local: Floats, height_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
+def _in_view(tilt: Floats, local: Floats, height_m: Floats, lens: Lens) -> tuple[NDArray[np.bool_], Floats]:
     """Whether the camera that looks down sees the point, and how far inside the camera that the lift asks it lies (1 in its middle).
 
     `tilt` is [3, 3, n], so that each of its numbers is a run in memory."""
     ahead_m, left_m, drop_m = local[:, 0], local[:, 1], height_m - 0.8
     x, y, z = (tilt[0, k] * ahead_m + tilt[1, k] * left_m - tilt[2, k] * drop_m for k in range(3))
-    down, side = camera_margins(x, y, z)
+    down, side = camera_margins(x, y, z, lens)
     return down > 0.0, np.maximum(down, side)
 
 

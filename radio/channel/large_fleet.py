@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.radio.channel.antenna import antenna_loss_db
+from sortie.radio.channel.antenna import Antennas
 from sortie.radio.channel.draws import (
     StreamDraws,
     drone_keys,
@@ -61,6 +61,7 @@ class Crowd:
         frame_s: float,
     ) -> None:
         self._settings, self._n, self._n_early = settings, n, n_early
+        self._antennas = Antennas(settings.antennas(n))
         self._early, self._field, self._earshot_m = early, field, earshot_m
         self._keys = drone_keys(seed, replication, n)
         self._fades = fade_table_db(settings.rician_k_db)
@@ -80,7 +81,7 @@ class Crowd:
         p = positions_m.astype(np.float32)
         low, high, distance = near_pairs(p, self._earshot_m)
         loss_db = path_loss_db(self._settings, distance, p[:, low, 2], p[:, high, 2])
-        if self._settings.antenna != "isotropic":
+        if not self._antennas.lossless:
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
         links = both_ways(self._n, low, high)
         self._frame, self._pairs = frame, len(low)
@@ -117,10 +118,9 @@ class Crowd:
 
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
-        if up is None:
-            return 2.0 * antenna_loss_db(self._settings.antenna, along[..., 2])
-        ends = (np.einsum("tpk,tpk->tp", along, up[:, end]) for end in (low, high))
-        return np.asarray(sum(antenna_loss_db(self._settings.antenna, cosine) for cosine in ends))
+        ends = (low, high)
+        cosines = (along[..., 2] if up is None else np.einsum("tpk,tpk->tp", along, up[:, end]) for end in ends)
+        return np.asarray(sum(self._antennas.loss_db(end, cosine) for end, cosine in zip(ends, cosines, strict=True)))
 
     def _shadowing(self, low: IntArray, high: IntArray, flown: int) -> Array:
         """[flown, P] dB; a pair that has come into earshot begins anew."""

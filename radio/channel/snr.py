@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.channel.antenna import antenna_loss_db
+from sortie.radio.channel.antenna import Antennas
 from sortie.radio.channel.draws import StreamDraws, fade_table_db
 from sortie.radio.channel.earshot import IntArray, LinkList, all_links
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
@@ -135,6 +135,7 @@ class Channel:
             raise ValueError("up holds a value that is not finite")
         self.settings = settings
         self.n = n_drones = p.shape[1]
+        self._antennas = Antennas(settings.antennas(n_drones))
         self.frame = -1
         self.noise_dbm = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
         # group frames go out in the primary 20 MHz with the whole power, so over less noise
@@ -301,10 +302,10 @@ class Channel:
             toward = p - where
             d = np.sqrt((toward**2).sum(axis=1))
             loss_db = path_loss_db(self.settings, d, p[:, 2], np.full(self.n, where[2]))
-            if self.settings.antenna != "isotropic":
+            if not self._antennas.lossless:
                 up = np.array([0.0, 0.0, 1.0]) if self._up is None else self._up[self.frame]
                 cosine = (toward * up).sum(axis=1) / np.maximum(d, 1e-9)
-                loss_db = loss_db + antenna_loss_db(self.settings.antenna, cosine)
+                loss_db = loss_db + self._antennas.loss_db(slice(None), cosine)
             total_mw += 10.0 ** ((power_dbm - loss_db) / 10.0)
         return np.asarray(10.0 * np.log10(total_mw) - self.noise_dbm)
 
@@ -359,11 +360,11 @@ class Channel:
         distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
         heights = p[:, :, 2]
         loss_db = path_loss_db(c, distance, heights[:, links.sender], heights[:, links.receiver])
-        if c.antenna != "isotropic":
+        if not self._antennas.lossless:
             along = delta.reshape(len(p), -1, 3) / np.maximum(distance, 1e-9)[..., None]
             for end in (links.sender, links.receiver):
                 cosine = along[..., 2] if up is None else np.einsum("tlk,tlk->tl", along, up[:, end])
-                loss_db = loss_db + antenna_loss_db(c.antenna, cosine)
+                loss_db = loss_db + self._antennas.loss_db(end, cosine)
         return loss_db
 
 

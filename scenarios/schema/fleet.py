@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -179,6 +179,27 @@ class Computer(Section):
     )
 
 
+class Camera(Section):
+    """A drone's five cameras: front, left, right, back and straight down. All are alike; the defaults are UAV3D's."""
+
+    field_of_view_deg: float = Field(
+        70.0, ge=20, le=110, description="Horizontal field of view of each camera; pictures are 16:9."
+    )
+    pitch_deg: float = Field(
+        45.0,
+        ge=20,
+        le=70,
+        description="How far the four that look to the sides are pitched down; the fifth looks down.",
+    )
+    width_px: int = Field(160, ge=32, le=640, description="Width of a picture, a multiple of 16.")
+
+    @model_validator(mode="after")
+    def _whole_rows(self) -> Camera:
+        if self.width_px % 16:
+            raise inconsistent(("width_px",), f"{self.width_px}", "a multiple of 16, as pictures are 16:9")
+        return self
+
+
 class Clocks(Section):
     """The drones' clocks (fleet/clock.py). With GNSS and no offset they are perfect."""
 
@@ -226,35 +247,47 @@ class Make(Section):
     )
     battery: Battery | None = Field(None, description="In place of fleet.battery, as a whole.")
     computer: Computer | None = Field(None, description="In place of fleet.computer, as a whole.")
+    camera: Camera | None = Field(None, description="In place of fleet.camera, as a whole.")
+    altitude_offset_m: float = Field(
+        0.0, ge=-390, le=390, description="How much higher than fleet.formation.altitude_m its drones fly."
+    )
     tx_power_dbm: float | None = Field(None, ge=-20, le=36, description="In place of radio.tx_power_dbm.")
+    antenna: Literal["isotropic", "dipole"] | None = Field(None, description="In place of radio.antenna.")
     policy: str | None = Field(
         None,
         min_length=1,
         description="A policy of its own: a registered one, or path/to/file.py:function.",
     )
     policy_params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of that policy.")
+    detector: Literal["torch", "surrogate", "none"] | None = Field(
+        None,
+        description="In place of perception.detector. With none its drones send context alone, and use the boxes that they are sent.",
+    )
     weights: str | None = Field(
         None, description="A network of its own, as perception.weights. Its maps are of another feature space."
     )
+    compute_delay_s: float | None = Field(None, ge=0, le=5, description="In place of perception.compute_delay_s.")
     feature_space: str | None = Field(
         None,
         max_length=32,
         pattern=r"^([A-Za-z0-9][A-Za-z0-9_.+-]*)?$",
-        description="What its feature maps are called; only maps of one name can be fused. Left out, the make's name where weights are given, else the fleet's common one, which has no name.",
+        description="What its feature maps are called; only maps of one name can be fused. Left out, the make's name where its network is another than the fleet's, else the fleet's common one, which has no name.",
     )
-
-    @property
-    def space(self) -> str:
-        """The feature space that its drones publish; empty is the fleet's common one."""
-        if self.feature_space is not None:
-            return self.feature_space
-        return "" if self.weights is None else self.name
 
     @model_validator(mode="after")
     def _parameters_of_a_policy(self) -> Make:
         if self.policy_params and self.policy is None:
             raise inconsistent(("policy_params",), f"{self.policy_params}", "left out where there is no policy")
         return self
+
+
+class Network(NamedTuple):
+    """What makes a drone's feature maps and boxes."""
+
+    detector: str
+    """A value of `perception.detector`; `none` for a drone that sends context alone."""
+    weights: str | None
+    """None takes the shipped ones."""
 
 
 class Fleet(Section):
@@ -270,6 +303,7 @@ class Fleet(Section):
     )
     battery: Battery = Battery()
     computer: Computer = Computer()
+    camera: Camera = Camera()
     clock: Clocks = Clocks()
     makes: tuple[Make, ...] = Field(
         (), description="Kinds of drones that differ from the fleet's; other drones are as the fleet says."
@@ -313,11 +347,22 @@ class Fleet(Section):
                 if drone in made:
                     raise inconsistent(at, f"{drone}", f"of one make, it is of {made[drone]!r} already")
                 made[drone] = make.name
+            altitude_m = self.formation.altitude_m + make.altitude_offset_m
+            if not 10.0 <= altitude_m <= 400.0:
+                bound = (
+                    f"such that its drones fly at 10 to 400 m, formation.altitude_m is {self.formation.altitude_m:g}"
+                )
+                raise inconsistent(("makes", i, "altitude_offset_m"), f"{make.altitude_offset_m:g}", bound)
         return self
 
     def make_of(self, drone: int) -> Make | None:
         """The make that names a drone; None for one that is as the fleet says."""
         return next((make for make in self.makes if drone in make.drones), None)
+
+    @property
+    def make_of_each(self) -> tuple[Make | None, ...]:
+        """Each drone's make, as `make_of`."""
+        return tuple(self.make_of(drone) for drone in range(self.drones))
 
     @property
     def airframes(self) -> tuple[Airframe, ...]:
@@ -334,17 +379,20 @@ class Fleet(Section):
     @property
     def batteries(self) -> tuple[Battery, ...]:
         """Each drone's pack, overrides not included."""
-        makes = [self.make_of(drone) for drone in range(self.drones)]
-        return tuple(self.battery if make is None else make.battery or self.battery for make in makes)
+        return tuple(self.battery if make is None else make.battery or self.battery for make in self.make_of_each)
 
     @property
     def computers(self) -> tuple[Computer, ...]:
         """Each drone's companion computer."""
-        makes = [self.make_of(drone) for drone in range(self.drones)]
-        return tuple(self.computer if make is None else make.computer or self.computer for make in makes)
+        return tuple(self.computer if make is None else make.computer or self.computer for make in self.make_of_each)
 
     @property
-    def feature_spaces(self) -> tuple[str, ...]:
-        """Each drone's feature space; empty is the fleet's common one."""
-        makes = [self.make_of(drone) for drone in range(self.drones)]
-        return tuple("" if make is None else make.space for make in makes)
+    def cameras(self) -> tuple[Camera, ...]:
+        """Each drone's cameras."""
+        return tuple(self.camera if make is None else make.camera or self.camera for make in self.make_of_each)
+
+    @property
+    def altitudes_m(self) -> tuple[float, ...]:
+        """The height at which each drone flies."""
+        common = self.formation.altitude_m
+        return tuple(common if make is None else common + make.altitude_offset_m for make in self.make_of_each)

@@ -13,13 +13,15 @@ from sortie.scenarios.schema.base import Section, inconsistent
 from sortie.scenarios.schema.context import Context
 from sortie.scenarios.schema.events import BaseEvent, Event, LinkDrop
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
-from sortie.scenarios.schema.fleet import Fleet
+from sortie.scenarios.schema.fleet import Camera, Fleet, Make, Network
 from sortie.scenarios.schema.mission import Mission
 from sortie.scenarios.schema.perception import Perception
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import Radio
 from sortie.scenarios.schema.record import RecordSection
 
+LEARNED = ("torch", "surrogate")
+"""Detectors with weights, which makes may name."""
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -71,18 +73,84 @@ class Scenario(Section):
                 if one.at_s is not None and one.at_s >= self.duration_s:
                     bound = f"below duration_s = {self.duration_s:g}"
                     raise inconsistent((*section, i, "at_s"), f"{one.at_s:g}", bound)
-        for i, make in enumerate(self.fleet.makes):
-            detector = self.perception.detector
-            if make.weights is not None and detector not in ("torch", "surrogate"):
-                raise inconsistent(("fleet", "makes", i, "weights"), repr(make.weights), f"left out for {detector}")
-            if make.tx_power_dbm is not None and self.radio.trace is not None:
-                bound = "left out where radio.trace says what links are worth"
-                raise inconsistent(("fleet", "makes", i, "tx_power_dbm"), f"{make.tx_power_dbm:g}", bound)
+        self._makes_fit()
         degraded, detached = self.context.degraded_after_periods, self.context.detached_after_periods
         if detached <= degraded:
             bound = f"above degraded_after_periods = {degraded:g}"
             raise inconsistent(("context", "detached_after_periods"), f"{detached:g}", bound)
         return self
+
+    def _makes_fit(self) -> None:
+        """Check what makes say against the other sections."""
+        fleets = self.perception.detector
+        for i, make in enumerate(self.fleet.makes):
+            at = ("fleet", "makes", i)
+            if make.detector is not None and fleets not in LEARNED:
+                raise inconsistent(
+                    (*at, "detector"), repr(make.detector), f"left out where perception.detector is {fleets}"
+                )
+            own = make.detector or fleets
+            if make.weights is not None and own not in LEARNED:
+                raise inconsistent((*at, "weights"), repr(make.weights), f"left out for {own}")
+            for name in ("tx_power_dbm", "antenna"):
+                value = getattr(make, name)
+                if value is not None and self.radio.trace is not None:
+                    bound = "left out where radio.trace says what links are worth"
+                    shown = f"{value:g}" if isinstance(value, float) else repr(value)
+                    raise inconsistent((*at, name), shown, bound)
+        first: dict[str, int] = {}
+        networks, spaces = self.networks, self.feature_spaces
+        for drone, (network, space) in enumerate(zip(networks, spaces, strict=True)):
+            other = first.setdefault(space, drone)
+            if network != networks[other]:
+                which = next(d for d in (drone, other) if self.fleet.make_of(d) is not None)
+                i = next(k for k, make in enumerate(self.fleet.makes) if which in make.drones)
+                bound = f"another name than that of drone {drone + other - which}, which has another network"
+                raise inconsistent(("fleet", "makes", i, "feature_space"), repr(space), bound)
+        for drone, (network, camera) in enumerate(zip(networks, self.fleet.cameras, strict=True)):
+            if network.detector == "surrogate" and camera.width_px != Camera().width_px:
+                bound = f"{Camera().width_px} for the surrogate, which was fitted to such pictures"
+                makes = [k for k, m in enumerate(self.fleet.makes) if drone in m.drones and m.camera is not None]
+                where = ("fleet", "makes", makes[0], "camera") if makes else ("fleet", "camera")
+                raise inconsistent((*where, "width_px"), f"{camera.width_px}", bound)
+
+    @property
+    def networks(self) -> tuple[Network, ...]:
+        """Each drone's network."""
+        common = Network(self.perception.detector, self.perception.weights)
+        return tuple(common if make is None else self._network(make) for make in self.fleet.make_of_each)
+
+    def _network(self, make: Make) -> Network:
+        common = self.perception
+        detector = make.detector or common.detector
+        weights = common.weights if make.weights is None and detector == common.detector else make.weights
+        return Network(detector, weights)
+
+    @property
+    def feature_spaces(self) -> tuple[str, ...]:
+        """Each drone's feature space; empty is the fleet's common one."""
+        common = Network(self.perception.detector, self.perception.weights)
+
+        def space(make: Make | None) -> str:
+            if make is None:
+                return ""
+            if make.feature_space is not None:
+                return make.feature_space
+            return "" if make.weights is None and self._network(make) == common else make.name
+
+        return tuple(space(make) for make in self.fleet.make_of_each)
+
+    @property
+    def context_only(self) -> tuple[bool, ...]:
+        """Whether each drone is of a make without a detector."""
+        return tuple(make is not None and make.detector == "none" for make in self.fleet.make_of_each)
+
+    @property
+    def compute_delays_s(self) -> tuple[float, ...]:
+        """Each drone's time from sensing to features ready to send."""
+        common = self.perception.compute_delay_s
+        own = [None if make is None else make.compute_delay_s for make in self.fleet.make_of_each]
+        return tuple(common if delay_s is None else delay_s for delay_s in own)
 
     def _drones_named(self) -> Iterator[tuple[tuple[str | int, ...], int]]:
         """Every drone that a section outside of `fleet` names, and where."""

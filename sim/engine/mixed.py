@@ -1,7 +1,8 @@
 """Drones with different networks in one fleet: each drone's jobs go to its own network.
 
 No job has feature maps of another network: receivers refuse those (`PeerMemory.can_fuse`). Detections of a drone with
-another network are what that network finds in the sender's capture. Free of torch.
+another network are what that network finds in the sender's capture. A drone without a detector has no capture of its own:
+any network joins the boxes that it was sent. Free of torch.
 """
 
 from __future__ import annotations
@@ -24,18 +25,15 @@ Maker = Callable[[SceneModel, Perception, int, int], Detector | None]
 
 def mixed(detector_of: Maker, scene: SceneModel, scenario: Scenario, seed: int, replication: int) -> Detector | None:
     """The fleet's detector: one network, or one for each that its makes name; None flies without."""
-    perception, fleet = scenario.perception, scenario.fleet
-    makes = [fleet.make_of(drone) for drone in range(fleet.drones)]
-    weights = [perception.weights if m is None or m.weights is None else m.weights for m in makes]
-    networks = list(dict.fromkeys(weights))
-    found = [
-        detector_of(scene, perception.model_copy(update={"weights": of}), seed, replication) for of in networks
-    ]  # fmt: skip
+    perception, each = scenario.perception, scenario.networks
+    networks = list(dict.fromkeys(n for n, blind in zip(each, scenario.context_only, strict=True) if not blind))
+    found = [detector_of(scene, perception.model_copy(update=n._asdict()), seed, replication) for n in networks]
     detectors = [d for d in found if d is not None]
     if len(detectors) < 2:
-        return found[0]
-    of_drone = [networks.index(of) for of in weights]
-    sends = sendable if perception.detector == "torch" else None
+        return detectors[0] if detectors else None
+    of_drone = [networks.index(n) if n in networks else 0 for n in each]
+    cut = perception.fusion == "late"  # then the network's drones send confident boxes alone
+    sends = [sendable if cut and network.detector == "torch" else None for network in networks]
     if all(isinstance(d, DetectsMany) for d in detectors):
         return MixedMany(detectors, of_drone, sends)
     return Mixed(detectors, of_drone, sends)
@@ -45,15 +43,15 @@ class Mixed:
     """Several detectors as one."""
 
     def __init__(
-        self, detectors: Sequence[Detector], of_drone: Sequence[int], sends: Callable[[Boxes], Boxes] | None
+        self, detectors: Sequence[Detector], of_drone: Sequence[int], sends: Sequence[Callable[[Boxes], Boxes] | None]
     ) -> None:
         """Args:
         detectors: one for each network.
         of_drone: each drone's place among them.
-        sends: which of its boxes a drone sends; None sends all.
+        sends: which of its boxes a drone of each network sends; None sends all.
         """
         self._detectors, self._of, self._sends = detectors, of_drone, sends
-        self.name = str(getattr(detectors[0], "name", type(detectors[0]).__name__))
+        self.name = " + ".join(dict.fromkeys(str(getattr(d, "name", type(d).__name__)) for d in detectors))
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own capture and the shares it received, ENU, best first."""
@@ -68,8 +66,8 @@ class Mixed:
         return self._detectors[self._of[capture.drone]].count_boxes(capture, roi)
 
     def camera_views(self, capture: Capture) -> NDArray[Any]:
-        """The camera images; all drones have the same cameras."""
-        return self._detectors[0].camera_views(capture)
+        """The drone's camera images."""
+        return self._detectors[self._of[capture.drone]].camera_views(capture)
 
     def _detected(self, moments: Sequence[Sequence[Job]]) -> Iterator[Boxes]:
         moments = self._with_foreign_boxes(moments)
@@ -90,9 +88,9 @@ class Mixed:
                     if self._is_foreign(ego, share):
                         wanted[self._of[share.capture.drone]][share.capture] = None
         boxes: dict[Capture, Boxes] = {}
-        for detector, captures in zip(self._detectors, wanted, strict=True):
+        for detector, sends, captures in zip(self._detectors, self._sends, wanted, strict=True):
             made = _run(detector, [[(c, ())] for c in captures])
-            boxes |= zip(captures, made if self._sends is None else map(self._sends, made), strict=True)
+            boxes |= zip(captures, made if sends is None else map(sends, made), strict=True)
         if not boxes:
             return moments
         return [
@@ -111,7 +109,7 @@ class MixedMany(Mixed):
     """The same of detectors that compute many moments together."""
 
     def __init__(
-        self, detectors: Sequence[Detector], of_drone: Sequence[int], sends: Callable[[Boxes], Boxes] | None
+        self, detectors: Sequence[Detector], of_drone: Sequence[int], sends: Sequence[Callable[[Boxes], Boxes] | None]
     ) -> None:
         """Args: as for `Mixed`."""
         super().__init__(detectors, of_drone, sends)

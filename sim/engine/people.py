@@ -35,15 +35,15 @@ class Look(NamedTuple):
 class People:
     """Where people are, and what the fleet's thermal cameras find.
 
-    A camera looks in every frame, whatever the duty cycle of perception. A detection is known `perception.compute_delay_s`
-    after its frame, and counts for `perception.thermal.remembers_s`.
+    A camera looks in every frame, whatever the duty cycle of perception. A detection is known the
+    drone's compute delay after its frame, and counts for `perception.thermal.remembers_s`.
     """
 
     def __init__(self, scenario: Scenario, scene: SceneModel, recorder: Recorder, key: tuple[int, int]) -> None:
         """Args: `key`: seed and replication."""
         perception = scenario.perception
         self._walkers, self._camera, self._join = scene.walkers, perception.thermal, perception.join
-        self._delay_s, self._frame_s = perception.compute_delay_s, scenario.frame_s
+        self._delays_s, self._frame_s = scenario.compute_delays_s, scenario.frame_s
         self._scene, self._rows, self._key = scene, recorder.rows, key
         self._has_trucks = perception.scene.trucks > 0.0
         self._lately: list[deque[Sighting]] = [deque() for _ in range(scenario.fleet.drones)]
@@ -77,7 +77,7 @@ class People:
         if region is None:
             return False
         return any(
-            s.t_s + self._delay_s <= now_s + _INSTANT_S
+            s.t_s + self._delays_s[drone] <= now_s + _INSTANT_S
             and math.hypot(s.x_m - region.x_m, s.y_m - region.y_m) <= region.radius_m
             for s in self._lately[drone]
         )

@@ -104,6 +104,7 @@ class Scorer:
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
+        self._delays_s = scenario.compute_delays_s
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {
@@ -130,7 +131,7 @@ class Scorer:
             came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
             if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
-            elif agent.here is not None and agent.latest is not None:
+            elif agent.here is not None and (agent.latest is not None or not agent.status.looks):
                 shares = self._shares(agent, now_s)
                 job = self._job(agent.here, agent.latest, [of_vehicles(s) for s in shares], now_s)
                 moment[1].append(Ego(agent.here, job, people=self._people.known(agent.here, shares, now_s)))
@@ -188,7 +189,7 @@ class Scorer:
             shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]
         return shares
 
-    def _job(self, here: Capture, look: Capture, shares: list[Share], now_s: float) -> Job | None:
+    def _job(self, here: Capture, look: Capture | None, shares: list[Share], now_s: float) -> Job | None:
         """The agent's capture and its recent shares.
 
         Where its own capture is too old it has its present pose alone, and fuses what its peers sent; None where that is
@@ -196,7 +197,8 @@ class Scorer:
         """
         config = self._scenario.perception
         limit_s = config.max_age_s + INSTANT_S
-        if now_s - look.t_s > limit_s + config.compute_delay_s + config.fusion_delay_s:  # the delay of any capture
+        delay_s = self._delays_s[here.drone] + config.fusion_delay_s  # of any capture
+        if look is None or now_s - look.t_s > limit_s + delay_s:
             if not shares:
                 return None
             look = here._replace(looked=False)

@@ -19,7 +19,7 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, PlaneRules, equipment_of
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
 from sortie.perception.scene.scene_model import SceneModel
@@ -42,7 +42,7 @@ from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, route_bounds, strongest_dbm
+from sortie.sim.engine.world import OwnSenses, World, own_antennas, route_bounds, strongest_dbm
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results import disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
@@ -139,7 +139,10 @@ def build(
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
     env, recorder = simpy.Environment(), Recorder(classes=len(scenario.perception.classes) > 1)
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
-    statuses = [DroneStatus(space) for space in scenario.fleet.feature_spaces]
+    statuses = [
+        DroneStatus(space, looks=not blind)
+        for space, blind in zip(scenario.feature_spaces, scenario.context_only, strict=True)
+    ]
     memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
 
     motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
@@ -148,7 +151,10 @@ def build(
     up = up_vector(motion.orientation_xyzw)
     air = Air(
         env,
-        AirSettings.of(scenario.radio.model_dump(exclude={"framing"}) | {"tx_power_dbm": strongest_dbm(scenario)}),
+        AirSettings.of(
+            scenario.radio.model_dump(exclude={"framing"})
+            | {"tx_power_dbm": strongest_dbm(scenario), "own_antennas": own_antennas(scenario)}
+        ),
         motion.position_m,
         seed=seed,
         replication=replication,
@@ -302,6 +308,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
         roster=context.roster,
+        makes=equipment_of(scenario),
     )
 
 

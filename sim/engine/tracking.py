@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sortie.perception.geometry import Lens
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TARGET_SIZE_M
@@ -157,7 +158,8 @@ class TargetSeen:
             np.array([c.position_m for c in captures]),
             np.array([c.orientation_xyzw for c in captures]),
         )
-        seen = sees_ground(pose[..., :2], position, attitude)
+        lens = Lens(*np.array([c.cameras.lens for c in captures]).reshape(-1, 4, 1).transpose(1, 0, 2))
+        seen = sees_ground(pose[..., :2], position, attitude, lens)
         flat = pose.reshape(-1, 3)
         eyes = np.repeat(position, len(targets), axis=0)
         seen &= self._scene.height_field.seen(flat[:, 0], flat[:, 1], eyes).reshape(seen.shape)

@@ -18,7 +18,7 @@ import simpy
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.clock import Oscillator
 from sortie.fleet.computer import Work, headrooms
-from sortie.fleet.coverage import RANGE_M
+from sortie.fleet.coverage import RANGE_M, cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.flight.motion import Trajectories
@@ -73,9 +73,14 @@ def strongest_dbm(scenario: Scenario) -> float:
 
 def sent_dbm(scenario: Scenario) -> list[float]:
     """Each drone's transmit power."""
-    makes = [scenario.fleet.make_of(drone) for drone in range(scenario.fleet.drones)]
     common = scenario.radio.tx_power_dbm
-    return [common if m is None or m.tx_power_dbm is None else m.tx_power_dbm for m in makes]
+    return [common if m is None or m.tx_power_dbm is None else m.tx_power_dbm for m in scenario.fleet.make_of_each]
+
+
+def own_antennas(scenario: Scenario) -> dict[int, str]:
+    """The antennas of drones that have another than the fleet's."""
+    each = enumerate(scenario.fleet.make_of_each)
+    return {drone: make.antenna for drone, make in each if make is not None and make.antenna is not None}
 
 
 def weaker_senders_db(scenario: Scenario) -> np.ndarray | None:
@@ -117,10 +122,12 @@ class World:
         self._computers = scenario.fleet.computers
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
-        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field)
+        self._cameras = cameras_of(scenario.fleet)
+        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, self._cameras)
         recorder.unfold["states"] = self._unfold_states
-        self.busy_sensing = min(1.0, scenario.perception.compute_delay_s * scenario.context.rate_hz)
-        """Share of a frame in which a drone's computer runs perception, when it senses: its compute delay."""
+        self._delays_s = scenario.compute_delays_s
+        self._busy_sensing = [min(1.0, delay_s * scenario.context.rate_hz) for delay_s in self._delays_s]
+        """By drone: share of a frame in which its computer runs perception, when it senses: its compute delay."""
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
@@ -172,8 +179,10 @@ class World:
         self._work.append([replace(status.work) for status in self.drones])
         lasts_s = (len(self._work) - 1) * scenario.frame_s
         self._headrooms = [
-            headrooms(computer, scenario.perception.compute_delay_s, a, b, lasts_s)
-            for computer, a, b in zip(self._computers, self._work[0], self._work[-1], strict=True)
+            headrooms(computer, look_s, a, b, lasts_s)
+            for computer, look_s, a, b in zip(
+                self._computers, self._delays_s, self._work[0], self._work[-1], strict=True
+            )
         ]
 
     def _read_clocks(self) -> None:
@@ -189,7 +198,7 @@ class World:
         """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
-        self._flight = FlightSenses(motion, self._scenario.frame_s, self.scene.height_field)
+        self._flight = FlightSenses(motion, self._scenario.frame_s, self.scene.height_field, self._cameras)
         self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
 
     def drain(self) -> None:
@@ -204,7 +213,7 @@ class World:
         self.batteries.step(
             dt_s,
             self._rotor_w[self._frame],
-            [self.busy_sensing if d.perceiving else 0.0 for d in self.drones],
+            [busy if d.perceiving else 0.0 for d, busy in zip(self.drones, self._busy_sensing, strict=True)],
             airtime_share,
         )
         self.ground_landed()

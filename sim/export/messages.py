@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from sortie.fleet.coverage import TARGET_FLAG, footprint_radius_m
+from sortie.fleet.coverage import TARGET_FLAG, cameras_of, footprint_radius_m
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.results import rosters
@@ -18,7 +18,8 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     n, states = record.scenario.fleet.drones, record.tables["states"]
     names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
-    rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.fleet.feature_spaces
+    rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.feature_spaces
+    cameras = cameras_of(record.scenario.fleet)
     mission, group_of = record.tables["mission"], record.scenario.mission.group_of
     targets = {
         (int(t_s * rate_hz + 1e-6), group): target
@@ -39,7 +40,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             position_m=(float(x[k]), float(y[k]), float(z[k])),
             orientation_xyzw=(float(qx[k]), float(qy[k]), float(qz[k]), float(qw[k])),
             velocity_mps=(float(vx[k]), float(vy[k]), float(vz[k])),
-            footprint_radius_m=footprint_radius_m(float(z[k])),
+            footprint_radius_m=footprint_radius_m(float(z[k]), cameras[row["drone"]]),
             battery_soc=row["soc"],
             cpu_headroom=row["cpu_headroom"],
             gpu_headroom=row["gpu_headroom"],

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
+from sortie.fleet.coverage import cameras_of
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import flown_motion
+from sortie.perception.geometry import Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
@@ -73,7 +75,8 @@ class ReplaySenses:
         motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
-        self._flight = FlightSenses(motion, scenario.frame_s, self._scene.height_field)
+        self._cameras = cameras_of(scenario.fleet)
+        self._flight = FlightSenses(motion, scenario.frame_s, self._scene.height_field, self._cameras)
         self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace
@@ -91,6 +94,11 @@ class ReplaySenses:
     def height_field(self) -> HeightField:
         """What hides the ground from the drones' cameras."""
         return self._scene.height_field
+
+    @property
+    def cameras(self) -> Cameras:
+        """The drone's."""
+        return self._cameras[self._drone]
 
     def platform(self) -> Platform:
         """Charge and headrooms."""

@@ -296,7 +296,7 @@ class LiveNode:
     def _find_fault(self, content: bytes, topic: Topic) -> tuple[str, str] | None:
         """Why a payload is dropped, and the detail; None if it is accepted.
 
-        Its deadline counts from when its features can be ready: its capture, the fleet's compute delay, and the moment
+        Its deadline counts from when its features can be ready: its capture, the sender's compute delay, and the moment
         within a frame at which drones act.
         """
         stamp_ns, sender, *_ = _HEADER.unpack_from(content)
@@ -304,7 +304,7 @@ class LiveNode:
         if (sender, directive.source, directive.destination) != (topic.source, topic.source, topic.destination):
             return "of another link", f"{directive.source}→{directive.destination} on {topic.name}"
         age_s = self._clock_s() - stamp_ns * 1e-9
-        ready_s = self._rules.compute_delay_s + PHASE_SHARE * self._rules.period_s
+        ready_s = self._rules.equipment(sender).compute_delay_s + PHASE_SHARE * self._rules.period_s
         if age_s > ready_s + directive.deadline_s:
             late_s = age_s - ready_s
             return "late", f"from drone {sender}, {late_s:.2f} s after it was ready, must be {directive.deadline_s:g} s"

@@ -123,13 +123,14 @@ class MavlinkSenses:
         self._replay.sense(frame)
         state = self._link.state
         self._judge_age(time.monotonic() - state.pose_s)
-        radius_m = float(footprint_radius_m(state.position_m[2]))
+        cameras = self._replay.cameras
+        radius_m = float(footprint_radius_m(state.position_m[2], cameras))
         yaw = yaw_rad(state.orientation_xyzw)
         position, attitude, heading = (np.asarray([[v]]) for v in (state.position_m, state.orientation_xyzw, yaw))
-        ((view,),) = views(Poses(position, attitude, heading, position, heading), self._replay.height_field)
+        ((view,),) = views(Poses(position, attitude, heading, position, heading), self._replay.height_field, [cameras])
         capture = Capture(
             self._drone, state.pose_s + self._offset_s, state.position_m, state.orientation_xyzw, state.position_m,
-            float(yaw),
+            float(yaw), cameras=cameras,
         )  # fmt: skip
         return Sensed(capture, state.velocity_mps, radius_m, view)
 

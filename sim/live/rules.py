@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sortie.fleet.plane import PlaneRules
+from sortie.fleet.plane import PlaneRules, equipment_of
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import PHASE_SHARE
@@ -26,4 +26,5 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         publish_every=scenario.context.publish_every,
         trust=scenario.context.trust,
         roster=scenario.context.roster,
+        makes=equipment_of(scenario),
     )

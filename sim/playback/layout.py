@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from sortie.fleet.coverage import footprint_radius_m
+from sortie.fleet.coverage import cameras_of, footprint_radius_m
 from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
@@ -104,7 +104,11 @@ def scene_view(scenario: Scenario, root: str = "", name: str = "the fleet over t
     """The 3-D scene below `root`, from an eye that flies along."""
     n, altitude_m = scenario.fleet.drones, scenario.fleet.formation.altitude_m
     offsets = slots(scenario.fleet.formation.shape, n, scenario.fleet.formation.spacing_m)
-    reach_m = float(np.abs(offsets).max()) + footprint_radius_m(altitude_m)
+    widest_m = max(
+        footprint_radius_m(height_m, cameras)
+        for height_m, cameras in zip(scenario.fleet.altitudes_m, cameras_of(scenario.fleet), strict=True)
+    )
+    reach_m = float(np.abs(offsets).max()) + widest_m
     hidden: dict[str | rr.encodings.EntityPath, Any] = {
         f"{root}/world/{what}/{i}": rrb.EntityBehavior(visible=False)
         for what in ("seen", "received")

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
-from sortie.fleet.coverage import footprint_radius_m
+from sortie.fleet.coverage import cameras_of, footprint_radius_m
 from sortie.perception.classes import PERSON
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
@@ -48,6 +48,7 @@ class Drawing:
         self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
         self._rate_hz, self._targets = scenario.context.rate_hz, len(scenario.mission.targets)
         self._groups = range(len(scenario.mission.phases_of))
+        self._cameras = cameras_of(scenario.fleet)
         n = self._n
         self._links, self._received = LinkArrows(canvas, n, scenario.context.rate_hz), ReceivedCells(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
@@ -191,7 +192,7 @@ class Drawing:
                 for s, up in zip(soc[second, i], airborne[second, i], strict=True)
             ]
             canvas.columns(f"world/drones/{i}/name", t_s[second], rr.Points3D.columns(labels=names))
-            radius = np.maximum(1e-3, [footprint_radius_m(z) for z in position[:, i, 2].tolist()])
+            radius = np.maximum(1e-3, [footprint_radius_m(z, self._cameras[i]) for z in position[:, i, 2].tolist()])
             centre = np.column_stack([position[:, i, :2], np.full(len(t_s), 0.4)])
             scale = np.column_stack([radius, radius, np.ones(len(t_s))])
             canvas.columns(f"world/footprints/{i}", t_s, rr.Transform3D.columns(translation=centre, scale=scale))

@@ -15,7 +15,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.geometry import FULL, camera_margins
+from sortie.fleet.coverage import cameras_of
+from sortie.perception.geometry import FULL, USUAL, Cameras, Lens, camera_margins
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.scene.traffic import TARGET_SIZE_M, TargetPath
 from sortie.sim.results.record import SortieRecord
@@ -43,10 +44,11 @@ def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     pose = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=-1)
     pose = pose.reshape(-1, n, 7)
     groups = _groups(record.tables["mission"])
+    cameras = cameras_of(record.scenario.fleet)
     tracks = _tracked(groups, len(t_s))
     seen = []
     for target_xy_m, tracked in tracks.values():
-        in_view = _in_any_view(target_xy_m[:, None], pose, looking & tracked[:, None])[:, 0]
+        in_view = _in_any_view(target_xy_m[:, None], pose, looking & tracked[:, None], cameras)[:, 0]
         seen.append((in_view, tracked, width_s))
     in_view_share, out_of_view_s = _share_and_gap(seen)
     detected_share, undetected_s = _detected(record, t_s, {k: tracked for k, (_, tracked) in tracks.items()})
@@ -79,7 +81,7 @@ def _tracked(groups: Sequence[pa.Table], frames: int) -> dict[int, tuple[Floats,
     return out
 
 
-def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats) -> Bools:
+def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats, lens: Lens = USUAL.lens) -> Bools:
     """Which places on the ground lie in the picture of one of a drone's five cameras.
 
     The ground is flat, and nothing hides a place. Places outside the square that the drone's feature map covers do not
@@ -89,6 +91,7 @@ def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats) -> B
         xy_m: [T, P, 2] places at T instants, ENU.
         position_m: [T, 3] the drone, ENU.
         orientation_xyzw: [T, 4] its attitude, FLU in ENU.
+        lens: of its cameras, numbers or arrays [T, 1].
 
     Returns:
         [T, P].
@@ -97,7 +100,7 @@ def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats) -> B
     away = xy_m - position_m[:, None, :2]
     drop = np.broadcast_to(-position_m[:, None, 2:], (*away.shape[:2], 1))
     body = np.concatenate([away, drop], axis=-1) @ turn
-    seen = np.maximum(*camera_margins(body[..., 0], body[..., 1], body[..., 2])) > 0.0
+    seen = np.maximum(*camera_margins(body[..., 0], body[..., 1], body[..., 2], lens)) > 0.0
     yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])[:, None]
     ahead = np.cos(yaw) * away[..., 0] + np.sin(yaw) * away[..., 1]
     left = np.cos(yaw) * away[..., 1] - np.sin(yaw) * away[..., 0]
@@ -106,13 +109,13 @@ def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats) -> B
     return inside
 
 
-def _in_any_view(xy_m: Floats, pose: Floats, looking: Bools) -> Bools:
+def _in_any_view(xy_m: Floats, pose: Floats, looking: Bools, cameras: Sequence[Cameras]) -> Bools:
     """Which places [T, P, 2] at least one drone sees: [T, P]; `pose` [T, N, 7], `looking` [T, N]."""
     seen = np.zeros(xy_m.shape[:2], bool)
     for drone in range(pose.shape[1]):
         at = np.flatnonzero(looking[:, drone])
         if len(at):
-            seen[at] |= sees_ground(xy_m[at], pose[at, drone, :3], pose[at, drone, 3:])
+            seen[at] |= sees_ground(xy_m[at], pose[at, drone, :3], pose[at, drone, 3:], cameras[drone].lens)
     return seen
 
 
@@ -122,24 +125,25 @@ def _region_observed(
     """Share of the mission regions' area that is in view, averaged over regions and the time in which there are any."""
     every = max(1, round(LOOK_S / record.scenario.frame_s))
     width_s = np.diff(t_s[::every], append=record.scenario.duration_s)
+    cameras = cameras_of(record.scenario.fleet)
     shares = lasts_s = 0.0
     for rows in groups:
         disc = np.stack([rows[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")], axis=-1)[::every]
         there = ~np.isnan(disc[:, 2])
         if there.any():
-            seen = _disc_in_view(disc[there], pose[::every][there], looking[::every][there])
+            seen = _disc_in_view(disc[there], pose[::every][there], looking[::every][there], cameras)
             shares += float(seen @ width_s[there])
             lasts_s += float(width_s[there].sum())
     return shares / lasts_s if lasts_s else None
 
 
-def _disc_in_view(disc: Floats, pose: Floats, looking: Bools) -> Floats:
+def _disc_in_view(disc: Floats, pose: Floats, looking: Bools, cameras: Sequence[Cameras]) -> Floats:
     """Share of a disc [T, 3] that is in a drone's view: [T]."""
     k = np.arange(PLACES) + 0.5  # a sunflower's seeds: equal areas, and no row of them along a camera's edge
     turn, out = k * np.pi * (3.0 - math.sqrt(5.0)), np.sqrt(k / PLACES)
     seeds = np.stack([out * np.cos(turn), out * np.sin(turn)], axis=-1)
     places = disc[:, None, :2] + disc[:, None, 2:] * seeds
-    share: Floats = _in_any_view(places, pose, looking).mean(axis=1)
+    share: Floats = _in_any_view(places, pose, looking, cameras).mean(axis=1)
     return share
 
 

@@ -8,10 +8,10 @@ from perception_examples import capture
 from scipy.ndimage import map_coordinates
 
 from sortie.perception.compiled import compiled
-from sortie.perception.geometry import FULL, HALF_H, HALF_V, HEIGHT_PX, WIDTH_PX
+from sortie.perception.geometry import FULL, Cameras
 from sortie.perception.network.bev import ground_points, lift
 from sortie.perception.scene.rays import COARSE, FAR, FAR_REACH, HAZE, REACH, see
-from sortie.perception.scene.render import AXES, VIEWS_SHAPE, tilt
+from sortie.perception.scene.render import camera_axes, tilt, views_shape
 
 SIDE = 640
 RES_M = 0.32
@@ -78,11 +78,15 @@ def test_a_ray_shows_the_first_thing_on_its_way_down(tallest_m: float, gain: flo
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.02, 0.01), (0.15, -0.2)])
-def test_the_lift_reads_each_ground_point_where_a_pinhole_puts_it(pitch: float, roll: float) -> None:
+@pytest.mark.parametrize("cameras", [Cameras(), Cameras(90.0, 30.0, 64), Cameras(50.0, 60.0, 320)])
+def test_the_lift_reads_each_ground_point_where_a_pinhole_puts_it(pitch: float, roll: float, cameras: Cameras) -> None:
     rng = np.random.default_rng(1)
-    views = np.kron(rng.integers(0, 256, (5, 9, 16, 3)), np.ones((1, 10, 10, 1))).astype(np.uint8)
-    c = capture(yaw=0.7, pitch=pitch, roll=roll)
-    assert views.shape == VIEWS_SHAPE
+    square = cameras.width_px // 16
+    views = np.kron(rng.integers(0, 256, (5, 9, 16, 3)), np.ones((1, square, square, 1))).astype(np.uint8)
+    c = capture(yaw=0.7, pitch=pitch, roll=roll)._replace(cameras=cameras)
+    assert views.shape == views_shape(cameras)
+    half_h = np.tan(np.radians(cameras.field_of_view_deg) / 2)
+    half_v = half_h * 9 / 16
     image = lift(views[None], [c])[0].numpy().transpose(1, 2, 0)
     points = np.dstack([ground_points(FULL).double().numpy(), np.full((256, 256), -c.est_position_m[2])])
     body = points @ tilt(c.orientation_xyzw)
@@ -91,11 +95,11 @@ def test_the_lift_reads_each_ground_point_where_a_pinhole_puts_it(pitch: float, 
     lengthwise = np.abs(body[..., 0]) >= np.abs(body[..., 1])
     quadrant = np.where(lengthwise, np.where(body[..., 0] >= 0, front, back), np.where(body[..., 1] >= 0, left, right))
     for camera in (front, left, right, back, nadir):  # straight down wins
-        across, down, ahead = np.moveaxis(body @ AXES[camera].T, -1, 0)
-        u, v = across / ahead / HALF_H, down / ahead / HALF_V
+        across, down, ahead = np.moveaxis(body @ camera_axes(cameras)[camera].T, -1, 0)
+        u, v = across / ahead / half_h, down / ahead / half_v
         seen = (np.abs(u) < 1) & (np.abs(v) < 1) & (ahead > (0.1 if camera == nadir else 1.0))
         seen &= (quadrant == camera) | (camera == nadir)
-        column, row = (u + 1) / 2 * WIDTH_PX - 0.5, (v + 1) / 2 * HEIGHT_PX - 0.5
+        column, row = (u + 1) / 2 * cameras.width_px - 0.5, (v + 1) / 2 * cameras.height_px - 0.5
         for k in range(3):
             level = map_coordinates(views[camera, ..., k].astype(float), [row, column], order=1, mode="nearest")
             expected[seen, k] = level[seen]

@@ -116,6 +116,23 @@ def test_a_dipole_hardly_hears_a_jammer_below_it() -> None:
     assert heard["isotropic"] - heard["dipole"] == pytest.approx(FLOOR_DB, abs=0.01)
 
 
+def test_drones_have_antennas_of_their_own_in_small_fleets_and_large_ones() -> None:
+    """One above the other, a dipole loses most: once for each end that has one."""
+    above = still(np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 80.0]]))
+    many = still(np.concatenate([above[0], [[5000.0 * k, 5000.0, 60.0] for k in range(1, 40)]]))
+    for places in (above, many):
+        snr = []
+        for own in ({}, {1: "dipole"}, {0: "dipole", 1: "dipole"}):
+            config = AirSettings(shadowing_sigma_db=0.0, own_antennas=own)
+            channel = Channel(config, places, 1, 0, 0.1)
+            channel.advance()
+            snr.append([channel.snr_db[0, 1], channel.snr_db[1, 0]])
+        np.testing.assert_allclose(np.subtract(snr[0], snr[1]), FLOOR_DB, atol=1e-3)
+        np.testing.assert_allclose(np.subtract(snr[0], snr[2]), 2 * FLOOR_DB, atol=1e-3)
+    with pytest.raises(ValueError, match=r"own_antennas\[1\] is 'yagi', must be one of \['isotropic', 'dipole'\]"):
+        AirSettings(own_antennas={1: "yagi"})  # type: ignore[dict-item]
+
+
 # --- shadowing in space --------------------------------------------------------------------------------
 
 

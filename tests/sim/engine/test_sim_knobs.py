@@ -39,7 +39,7 @@ CELL = "events=[{kind: cell_failure, at_s: 1, drone: 1}]"
 DRIFT = "events=[{kind: clock_drift, at_s: 1, drone: 1, drift_ppm: -100000}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
 TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20, cycles: 10, payload_kg: 0.1}]"
-MADE = "fleet.makes=[{name: slow, drones: [1], airframe: solo, battery: {}, computer: {}, tx_power_dbm: 10, policy: all-4, policy_params: {received_budget: 0.2}, feature_space: theirs}]"
+MADE = "fleet.makes=[{name: slow, drones: [1], airframe: solo, battery: {}, computer: {}, camera: {}, antenna: isotropic, tx_power_dbm: 10, policy: all-4, policy_params: {received_budget: 0.2}, feature_space: theirs}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
 HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
@@ -143,6 +143,9 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.battery.ambient_c": ("5", ()),
     "fleet.battery.cycles": ("100", ()),
     "fleet.battery.life_cycles": ("500", ("fleet.battery.cycles=100",)),
+    "fleet.camera.field_of_view_deg": ("50", ()),
+    "fleet.camera.pitch_deg": ("30", ()),
+    "fleet.camera.width_px": ("64", ()),
     "fleet.computer.cpu_cores": ("6", ()),
     "fleet.computer.decision_s": ("0.001", ()),
     "fleet.computer.payload_mbps": ("1000", ()),
@@ -161,7 +164,11 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.makes.airframe": ("zeng_2019", (MADE,)),
     "fleet.makes.battery": ("{capacity_wh: 50}", (MADE,)),
     "fleet.makes.computer": ("{cpu_cores: 2}", (MADE,)),
+    "fleet.makes.camera": ("{field_of_view_deg: 50}", (MADE,)),
+    "fleet.makes.altitude_offset_m": ("20", (MADE,)),
     "fleet.makes.tx_power_dbm": ("5", (MADE,)),
+    "fleet.makes.antenna": ("dipole", (MADE,)),
+    "fleet.makes.compute_delay_s": ("0.08", (MADE,)),
     "fleet.makes.policy": ("silence", (MADE, "fleet.makes.0.policy_params={}")),
     "fleet.makes.policy_params": ("{received_budget: 0.1}", (MADE,)),
     "fleet.makes.feature_space": ("other", (MADE,)),
@@ -278,6 +285,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
 # These act through the detector, so their sorties fly with it, shortly.
 SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.fusion": ("late", ()),
+    "fleet.makes.detector": ("surrogate", (MADE,)),
     "perception.recording": ("OTHER", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.recorded_fusion": ("FUSION", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.weights": ("WEIGHTS", ()),

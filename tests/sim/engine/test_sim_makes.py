@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import sortie
+from sortie.fleet.coverage import unpack_grid
 from sortie.perception.surrogate.model import SHIPPED, load, save
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Descriptor, Directive, FleetView
+from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
@@ -158,6 +159,79 @@ def test_boxes_of_another_network_are_what_that_network_found(weaker: Path) -> N
     assert boxes(both, 0) != boxes(ours, 0)
 
 
+# --- detectors -----------------------------------------------------------------------------------
+
+STUDY = Path(__file__).parents[3] / "perception" / "study" / "weights"
+TORCH = ("perception.detector=torch", "duration_s=1.5", "perception.scene.moving_cars_per_km=30")
+
+
+@pytest.mark.slow
+def test_two_torch_networks_in_one_flight() -> None:
+    """Each drone's boxes are its own network's; maps stay within a network, and boxes of the other one are joined."""
+    net = STUDY / "full-2.safetensors"
+    ours, theirs = (
+        run_sortie(fleet("", *TORCH), "silence"),
+        run_sortie(fleet("", *TORCH, f"perception.weights={net}"), "silence"),
+    )
+    alone = run_sortie(fleet(f", weights: {net}", *TORCH), "silence")
+    assert boxes(ours, 2) != boxes(theirs, 2)
+    assert [boxes(alone, i) for i in (0, 1)] == [boxes(ours, i) for i in (0, 1)]
+    assert boxes(alone, 2) == boxes(theirs, 2)
+    assert alone.detector == "torch"
+
+    shared = run_sortie(fleet(f", weights: {net}", *TORCH), "all-4")
+    assert {(0, 1, "features"), (1, 0, "features"), (0, 2, "detections"), (2, 0, "detections")} <= fused(shared)
+    assert not {(0, 2, "features"), (2, 0, "features"), (1, 2, "features"), (2, 1, "features")} & fused(shared)
+    last_s = max(t_s for t_s, *_ in boxes(shared, 2))
+    got, had = ({b for b in boxes(record, 2) if b[0] == last_s} for record in (shared, alone))
+    added = [b for b in got - had if not any(np.hypot(b[1] - o[1], b[2] - o[2]) < 0.01 for o in had)]
+    sent_to_2 = [b for i in (0, 1) for b in boxes(alone, i)]
+    assert added, "it joins what the others found"
+    near = [min(np.hypot(b[1] - o[1], b[2] - o[2]) for o in sent_to_2) for b in added]
+    assert np.median(near) < 1.0, "which is where their own network put it"
+
+
+@pytest.mark.slow
+def test_a_torch_drone_and_a_surrogate_one_exchange_boxes() -> None:
+    record = run_sortie(fleet(", detector: surrogate", *TORCH), "all-4")
+    assert record.detector == "torch + surrogate"
+    assert {(0, 1, "features"), (0, 2, "detections"), (2, 0, "detections")} <= fused(record)
+    assert {p for a, p, how in fused(record) if how == "features"} == {0, 1}
+    ours, theirs = (
+        run_sortie(fleet("", *TORCH, *more), "silence") for more in ((), ("perception.detector=surrogate",))
+    )
+    alone = run_sortie(fleet(", detector: surrogate", *TORCH), "silence")
+    assert boxes(alone, 0) == boxes(ours, 0)
+    assert boxes(alone, 2) == boxes(theirs, 2)
+
+
+def test_a_drone_without_a_detector_sends_context_alone_and_uses_boxes() -> None:
+    record = run_sortie(fleet(", detector: none"), "all-4")
+    assert {i for i, *_ in sent(record)} == {0, 1}
+    assert {what for i, j, what, *_ in sent(record) if j == 2} == {"detections"}
+    assert {how for i, _, how in fused(record) if i == 2} == {"detections"}
+    assert boxes(record, 2), "it has the boxes that it was sent"
+    assert not boxes(run_sortie(fleet(", detector: none"), "silence"), 2), "and finds nothing itself"
+    assert column(record, "states", "looks", 2)[-1] == 0
+    assert set(column(record, "descriptors", "gpu_headroom", 2)) == {1.0}
+    assert column(record, "states", "spent_j", 2)[-1] < column(record, "states", "spent_j", 0)[-1]
+    assert all(not any(grid) for grid in column(record, "descriptors", "coverage_grid", 2))
+    assert record.tables["trust"].num_rows == 0
+
+
+def test_maps_and_raw_images_are_of_no_use_to_it() -> None:
+    def all_kinds(view: FleetView) -> list[Directive]:
+        rung = {0: Representation.FEATURES, 1: Representation.RAW}.get(view.ego, Representation.NONE)
+        sparse = full_sharing(view.ego, 2, 0.05, "")._replace(representation=rung, rate_hz=2.0, deadline_s=5.0)
+        return [sparse] if 2 in view.peers else []
+
+    record = run_sortie(fleet(", detector: none"), all_kinds)
+    assert {(0, 2, "features"), (1, 2, "raw")} <= {
+        (i, j, what) for i, j, what, status, _ in sent(record) if status == "delivered"
+    }
+    assert not [1 for i, *_ in fused(record) if i == 2]
+
+
 # --- machines ------------------------------------------------------------------------------------
 
 
@@ -172,16 +246,123 @@ def test_a_make_changes_its_own_drones_alone() -> None:
     assert column(heavy, "descriptors", "cpu_headroom", 0)[-1] == column(plain, "descriptors", "cpu_headroom", 0)[-1]
 
 
-def test_a_make_is_the_fleet_when_all_drones_are_of_it() -> None:
-    one = loads(BASE, overrides=[f"fleet.makes=[{{name: all, drones: [0, 1, 2], {HEAVY}}}]"])
-    fleet_wide = loads(
-        BASE,
-        overrides=[
-            "fleet.airframe={mass_kg: 3}", "fleet.battery={capacity_wh: 60, avionics_w: 30}",
-            "fleet.computer={cpu_cores: 2}", "radio.tx_power_dbm=10",
-        ],
-    )  # fmt: skip
-    assert run_sortie(one).fingerprint == run_sortie(fleet_wide).fingerprint
+OWN = "camera: {field_of_view_deg: 90, pitch_deg: 40}, altitude_offset_m: 12, antenna: dipole, compute_delay_s: 0.06"
+
+
+@pytest.mark.parametrize(
+    ("own", "fleets"),
+    [
+        (
+            HEAVY,
+            (
+                "fleet.airframe={mass_kg: 3}", "fleet.battery={capacity_wh: 60, avionics_w: 30}",
+                "fleet.computer={cpu_cores: 2}", "radio.tx_power_dbm=10",
+            ),
+        ),
+        (
+            OWN,
+            (
+                "fleet.camera={field_of_view_deg: 90, pitch_deg: 40}", "fleet.formation.altitude_m=72",
+                "radio.antenna=dipole", "perception.compute_delay_s=0.06",
+            ),
+        ),
+        ("detector: surrogate", ()),
+    ],
+)  # fmt: skip
+def test_a_make_is_the_fleet_when_all_drones_are_of_it(own: str, fleets: tuple[str, ...]) -> None:
+    one = loads(BASE, overrides=[f"fleet.makes=[{{name: all, drones: [0, 1, 2], {own}}}]"])
+    two = loads(BASE, overrides=[f"fleet.makes=[{{name: a, drones: [0, 2], {own}}}, {{name: b, drones: [1], {own}}}]"])
+    fleet_wide = run_sortie(loads(BASE, overrides=fleets)).fingerprint
+    assert run_sortie(one).fingerprint == fleet_wide
+    assert run_sortie(two).fingerprint == fleet_wide
+
+
+def seen(record: SortieRecord, drone: int, least: Coverage) -> float:
+    grids = column(record, "descriptors", "coverage_grid", drone)
+    return float(np.mean([(unpack_grid(grid) >= least).sum() for grid in grids]))
+
+
+def test_a_camera_of_one_s_own_changes_the_footprint_the_coverage_and_what_is_found() -> None:
+    kinds = [run_sortie(fleet(f", camera: {{field_of_view_deg: {fov}}}"), "silence") for fov in (40, 70, 100)]
+    plain = run_sortie(fleet(), "silence")
+    for drone in (0, 1):
+        assert {str(boxes(k, drone)) for k in kinds} == {str(boxes(plain, drone))}
+    assert boxes(kinds[1], 2) == boxes(plain, 2)
+    covered = [seen(k, 2, Coverage.POOR) for k in kinds]
+    assert covered[0] < 0.7 * covered[1] < 0.7 * covered[2]
+    assert len(boxes(kinds[0], 2)) < 0.9 * len(boxes(kinds[1], 2)), "less of the ground, fewer cars"
+    radii = [next(d.footprint_radius_m for _, d in descriptors(k) if d.agent_id == 2) for k in kinds]
+    assert radii == pytest.approx([60 * np.tan(np.radians(a)) for a in (20, 35, 50)], rel=0.02)
+    steep = run_sortie(fleet(", camera: {pitch_deg: 65}"), "silence")
+    assert seen(steep, 2, Coverage.POOR) < covered[1]
+    assert all(k.tables["trust"].num_rows == 0 for k in (*kinds, steep)), "peers know each other's cameras"
+
+
+def test_coarser_pictures_show_less_ground_well_and_the_rest_as_before() -> None:
+    fine, coarse = (
+        run_sortie(fleet(more, "perception.detector=none"), "silence") for more in ("", ", camera: {width_px: 96}")
+    )
+    assert seen(coarse, 2, Coverage.POOR) == pytest.approx(seen(fine, 2, Coverage.POOR), rel=0.02)
+    assert seen(coarse, 2, Coverage.WELL) < 0.5 * seen(fine, 2, Coverage.WELL)
+    assert seen(coarse, 0, Coverage.WELL) == seen(fine, 0, Coverage.WELL)
+
+
+@pytest.mark.slow
+def test_a_torch_drone_finds_less_in_coarser_pictures_and_in_narrower_ones() -> None:
+    def found(more: str) -> tuple[int, list[tuple[float, ...]]]:
+        record = run_sortie(fleet(more, *TORCH, "perception.score_threshold=0.3"), "silence")
+        return len(boxes(record, 2)), boxes(record, 0)
+
+    usual, coarse, narrow = (found(m) for m in ("", ", camera: {width_px: 64}", ", camera: {field_of_view_deg: 40}"))
+    assert coarse[0] < 0.7 * usual[0]
+    assert narrow[0] < 0.9 * usual[0]
+    assert coarse[1] == narrow[1] == usual[1]
+
+
+def test_drones_of_one_formation_fly_at_several_heights() -> None:
+    plain, mixed = run_sortie(fleet(), "silence"), run_sortie(fleet(", altitude_offset_m: 25"), "silence")
+    for drone, offset_m in ((0, 0.0), (1, 0.0), (2, 25.0)):
+        np.testing.assert_allclose(
+            column(mixed, "states", "z_m", drone), np.add(column(plain, "states", "z_m", drone), offset_m), rtol=1e-12
+        )
+        for axis in ("x_m", "y_m"):
+            assert column(mixed, "states", axis, drone) == column(plain, "states", axis, drone)
+    assert boxes(mixed, 0) == boxes(plain, 0)
+    assert boxes(mixed, 2) != boxes(plain, 2)
+
+
+def test_an_antenna_of_its_own_hears_and_is_heard_less_from_above() -> None:
+    def snr_db(antenna: str) -> dict[tuple[int, int], float]:
+        record = run_sortie(
+            fleet(f", altitude_offset_m: 40, antenna: {antenna}", "radio.shadowing_sigma_db=0"), "boxes"
+        )
+        rows = record.tables["transmissions"].to_pylist()
+        each: dict[tuple[int, int], list[float]] = {}
+        for r in rows:
+            each.setdefault((r["drone"], r["peer"]), []).append(r["snr_db"])
+        return {pair: float(np.median(db)) for pair, db in each.items()}
+
+    all_round, dipole = snr_db("isotropic"), snr_db("dipole")
+    drop_db = {pair: all_round[pair] - dipole[pair] for pair in all_round}
+    assert drop_db[0, 1] == pytest.approx(0.0, abs=0.5)
+    assert all(drop_db[pair] > 3.0 for pair in ((0, 2), (2, 0), (1, 2), (2, 1)))
+
+
+def test_a_slower_computer_sends_later_and_is_busier() -> None:
+    plain, slow = run_sortie(fleet()), run_sortie(fleet(", compute_delay_s: 0.08"))
+
+    def in_frame_s(record: SortieRecord, drone: int) -> float:
+        rows = record.tables["transmissions"].to_pylist()
+        return float(np.median([r["t_sent_s"] % 0.1 for r in rows if r["drone"] == drone]))
+
+    assert in_frame_s(slow, 2) - in_frame_s(plain, 2) == pytest.approx(0.05, abs=1e-6)
+    assert in_frame_s(slow, 0) == pytest.approx(in_frame_s(plain, 0), abs=1e-6)
+    assert column(slow, "descriptors", "gpu_headroom", 2)[-1] < column(plain, "descriptors", "gpu_headroom", 2)[-1]
+    assert column(slow, "states", "spent_j", 2)[-1] > column(plain, "states", "spent_j", 2)[-1]
+    assert column(slow, "states", "spent_j", 1)[-1] == pytest.approx(
+        column(plain, "states", "spent_j", 1)[-1], rel=5e-4
+    )
+    assert slow.tables["trust"].num_rows == 0, "its peers know that it takes longer"
 
 
 def test_a_weaker_sender_is_heard_worse_and_hears_as_before() -> None:
@@ -241,6 +422,52 @@ def test_a_make_has_a_policy_of_its_own_until_another_is_asked_for() -> None:
             "{name: a, drones: [1], tx_power_dbm: 3}",
             ("radio.trace=links.csv",),
             "fleet.makes.0.tx_power_dbm: 3, must be left out where radio.trace says what links are worth",
+        ),
+        (
+            "{name: a, drones: [1], antenna: dipole}",
+            ("radio.trace=links.csv",),
+            "fleet.makes.0.antenna: 'dipole', must be left out where radio.trace says what links are worth",
+        ),
+        (
+            "{name: a, drones: [1], altitude_offset_m: -55}",
+            (),
+            "fleet.makes.0.altitude_offset_m: -55, must be such that its drones fly at 10 to 400 m, "
+            "formation.altitude_m is 60",
+        ),
+        (
+            "{name: a, drones: [1], camera: {width_px: 100}}",
+            (),
+            "fleet.makes.0.camera.width_px: 100, must be a multiple of 16, as pictures are 16:9",
+        ),
+        (
+            "{name: a, drones: [1], camera: {width_px: 320}}",
+            (),
+            "fleet.makes.0.camera.width_px: 320, must be 160 for the surrogate, which was fitted to such pictures",
+        ),
+        (
+            "{name: a, drones: [1], camera: {field_of_view_deg: 130}}",
+            (),
+            "fleet.makes.0.camera.field_of_view_deg: 130",
+        ),
+        (
+            "{name: a, drones: [1], detector: surrogate}",
+            ("perception.detector=none",),
+            "fleet.makes.0.detector: 'surrogate', must be left out where perception.detector is none",
+        ),
+        (
+            "{name: a, drones: [1], detector: none, weights: x}",
+            (),
+            "fleet.makes.0.weights: 'x', must be left out for none",
+        ),
+        (
+            "{name: a, drones: [1], detector: torch, feature_space: ''}",
+            (),
+            "fleet.makes.0.feature_space: '', must be another name than that of drone 0, which has another network",
+        ),
+        (
+            "{name: a, drones: [1], weights: x, feature_space: s}, {name: b, drones: [2], feature_space: s}",
+            (),
+            "fleet.makes.1.feature_space: 's', must be another name than that of drone 1, which has another network",
         ),
         (
             "{name: a, drones: [1], battery: {life_cycles: 10}}",
