@@ -38,7 +38,7 @@ class BurstSettings:
 class AirSettings:
     """Radio, channel and transport of a whole fleet.
 
-    Fields, units and defaults are those of a scenario's `radio` section. The exception is `framing`: there the caller
+    Fields, units and defaults are those of a scenario's `radio` section, and `own_antennas` are its makes'. The exception is `framing`: there the caller
     of `Air.send` decides, with `piece_bytes`. The section checks every bound; this class checks names and channel
     widths only.
 
@@ -56,7 +56,7 @@ class AirSettings:
     noise_figure_db: float = 7.0
     antenna: AntennaName = "isotropic"
     """Of every drone that `own_antennas` does not name."""
-    own_antennas: Mapping[int, AntennaName] = field(default_factory=dict)
+    own_antennas: Mapping[int, AntennaName] = field(default_factory=dict, hash=False)
     """Antennas of single drones, by id."""
     path_loss: PathLossName = "log_distance"
     path_loss_exponent: float = 2.1

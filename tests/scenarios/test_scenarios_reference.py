@@ -126,6 +126,7 @@ def test_units_stand_in_names() -> None:
         "mohm",
         "deg",
         "bytes",
+        "px",
         "kg",
         "m2",
         "kgpm3",
