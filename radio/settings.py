@@ -38,9 +38,9 @@ class BurstSettings:
 class AirSettings:
     """Radio, channel and transport of a whole fleet.
 
-    Fields, units and defaults are those of a scenario's `radio` section, and `own_antennas` are its makes'. The exception is `framing`: there the caller
-    of `Air.send` decides, with `piece_bytes`. The section checks every bound; this class checks names and channel
-    widths only.
+    Fields, units and defaults are those of a scenario's `radio` section; `own_antennas` are those of its makes. The exception
+    is `framing`: there the caller of `Air.send` decides, with `piece_bytes`. The section checks every bound; this class
+    checks names and channel widths only.
 
     Raises:
         ValueError: a field with a fixed set of values has another value.
