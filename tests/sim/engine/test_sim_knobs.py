@@ -404,7 +404,8 @@ def test_a_knob_of_perception_changes_the_record(
     before = run_sortie(example(*SHORT, *shared)).fingerprint if shared else seen
     if value == "WEIGHTS":
         value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
-    assert run_sortie(example(*SHORT, *shared, f"{field}={value}")).fingerprint != before
+    change = f"{place(field, tuple(shared))}={value}"
+    assert run_sortie(example(*SHORT, *shared, change)).fingerprint != before
 
 
 def recorded(folder: Path, *texts: str) -> list[str]:
