@@ -111,7 +111,9 @@ class People:
         if camera is None:
             return Boxes.empty()
         known = (
-            its for its in reversed(self._looks[here.drone]) if its.capture.t_s + self._delays_s[here.drone] <= now_s + _INSTANT_S
+            its
+            for its in reversed(self._looks[here.drone])
+            if its.capture.t_s + self._delays_s[here.drone] <= now_s + _INSTANT_S
         )
         sources = []
         if (last := next(known, None)) is not None:
