@@ -204,11 +204,15 @@ class Agent:
         return sensed
 
     def decide(self, frame: int) -> None:
-        """The policy node's part: judge the peers' claims once a second, and decide on every link."""
+        """The policy node's part: judge the peers' claims, and decide on every link."""
+        self.judge(frame)
+        self._decide()
+
+    def judge(self, frame: int) -> None:
+        """Judge the peers' claims, once a second."""
         if self._rules.trust and frame % self._judged_every == 0:
             for peer, standing in self.memory.judge(self._env.now):
                 self._log.trust(self._env.now, self.drone, peer, standing)
-        self._decide()
 
     def look(self, frame: int, sensed: Sensed) -> None:
         """The gate's part: look in as many frames as its directives want, and send what the look gives."""

@@ -101,13 +101,13 @@ class PeerMemory:
         if self.status.airborne and (held is None or received.capture.t_s >= held.capture.t_s):
             self.held[peer] = received
 
-    def _in_own_time(self, peer: int, stamp_s: float) -> float:
+    def in_own_time(self, peer: int, stamp_s: float) -> float:
         """A moment of a peer's clock in this drone's time, which the air's times are in."""
         return stamp_s - self.status.clock_skew_s + self.clocks.offset_s.get(peer, 0.0)
 
     def payload_age_s(self, received: Received, now_s: float) -> float:
         """A payload's age as this drone knows it: by its stamp and the two clocks, and at least the time since it arrived."""
-        return max(now_s - self._in_own_time(received.capture.drone, received.stamp_s), now_s - received.t_done_s)
+        return max(now_s - self.in_own_time(received.capture.drone, received.stamp_s), now_s - received.t_done_s)
 
     @property
     def peers(self) -> list[int]:
@@ -155,11 +155,12 @@ class PeerMemory:
         before = self._standings
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
         looking: set[int] = set()
-        heard = {i: d for i, d in self._known.items() if self._heard_at_s[i] > since_s}
+        # its own claims stand, however long ago another of its nodes published them
+        heard = {i: d for i, d in self._known.items() if i == self.drone or self._heard_at_s[i] > since_s}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             claimed_s = (
-                min(self._heard_at_s[i], self._in_own_time(i, heard[i].stamp_ns * 1e-9)) if i in heard else too_old_s
+                min(self._heard_at_s[i], self.in_own_time(i, heard[i].stamp_ns * 1e-9)) if i in heard else too_old_s
             )
             arrivals[i], later = split_arrivals(came, claimed_s)
             if any(claimed_s - a.sent_s < LOOK_STANDS_S / 2 for a in arrivals[i]):

@@ -8,10 +8,13 @@ of the origin the error stays below 2 m · tan(latitude) horizontally, and heigh
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import hmac
 import math
 import os
 import struct
 import tempfile
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +42,8 @@ _STAMP_BYTES = 8
 _MARKS = {0xFE: 8, 0xFD: 12}
 """First byte of a MAVLink 1 and 2 frame, and what stands around its payload; a signature adds 13."""
 _SIGNED, _SIGNATURE_BYTES = 0x01, 13
+_BAD_SIGNATURE = "Invalid signature"
+"""pymavlink's reason."""
 _YEARS_US = (0, 4_000_000_000_000_000)  # 1970 … 2096
 
 
@@ -193,6 +198,15 @@ STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_ST
 KEY_BYTES = 32
 
 
+def _sign(mav: mavlink2.MAVLink, key: bytes, now_us: int) -> None:
+    """Sign what goes out, and ask for valid signatures of what comes in; `now_us` is in µs since 1970."""
+    if len(key) != KEY_BYTES:
+        raise ValueError(f"the signing key has {len(key)} B, must have {KEY_BYTES}")
+    signing = mav.signing
+    signing.secret_key, signing.link_id, signing.sign_outgoing = key, 0, True
+    signing.timestamp = max(signing.timestamp, (now_us - SIGNING_EPOCH_US) // 10)
+
+
 class Transmitter:
     """One vehicle's MAVLink 2 stream: system id = drone id + 1 (0 means everybody), frames numbered in a row.
 
@@ -202,11 +216,7 @@ class Transmitter:
     def __init__(self, drone: int, key: bytes | None = None, signed_at_us: int = SIGNING_EPOCH_US) -> None:
         self._mav = mavlink2.MAVLink(None, srcSystem=drone + 1, srcComponent=mavlink2.MAV_COMP_ID_AUTOPILOT1)
         if key is not None:
-            if len(key) != KEY_BYTES:
-                raise ValueError(f"the signing key has {len(key)} B, must have {KEY_BYTES}")
-            signing = self._mav.signing
-            signing.secret_key, signing.link_id, signing.sign_outgoing = key, 0, True
-            signing.timestamp = (signed_at_us - SIGNING_EPOCH_US) // 10
+            _sign(self._mav, key, signed_at_us)
 
     def pack(self, message: mavlink2.MAVLink_message) -> bytes:
         """The next frame."""
@@ -216,13 +226,16 @@ class Transmitter:
 
 
 class Companion:
-    """A drone's companion computer on the telemetry link: what it sends to its vehicle."""
+    """A drone's companion computer on the telemetry link: what it sends to its vehicle, signed where it has a key."""
 
-    def __init__(self) -> None:
+    def __init__(self, key: bytes | None = None) -> None:
         self._mav = mavlink2.MAVLink(None, srcComponent=mavlink2.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._key = key
 
     def ask(self, vehicle: int, rates_hz: Mapping[int, float]) -> bytes:
         """A heartbeat, and a request for messages at their rates, by message id; MAV_CMD_SET_MESSAGE_INTERVAL."""
+        if self._key is not None:
+            _sign(self._mav, self._key, time.time_ns() // 1000)  # a vehicle that restarted wants the present time
         self._mav.srcSystem = vehicle
         said: list[mavlink2.MAVLink_message] = [
             mavlink2.MAVLink_heartbeat_message(
@@ -243,17 +256,38 @@ class Companion:
         return frames
 
 
-class Listener:
-    """Takes what ground stations say; bytes that are no frame are passed over."""
+class _Verifier(mavlink2.MAVLink):  # type: ignore[misc]
+    """A parser that judges a signature before its time.
 
-    def __init__(self) -> None:
-        self._mav = mavlink2.MAVLink(None)
+    pymavlink keeps the time of a frame before it looks at the signature. A stranger's frame from the future would
+    therefore refuse all later frames of the vehicle.
+    """
+
+    def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:  # noqa: N803 - pymavlink's
+        made = hashlib.sha256((self.signing.secret_key or b"") + bytes(msgbuf[:-6])).digest()[:6]
+        fits = hmac.compare_digest(made, bytes(msgbuf[-6:]))
+        return fits and bool(super().check_signature(msgbuf, srcSystem, srcComponent))
+
+
+class Listener:
+    """Takes what vehicles and ground stations say; bytes that are no frame are passed over.
+
+    With a key of 32 B, frames are taken only with a valid signature that was not used.
+    """
+
+    def __init__(self, key: bytes | None = None) -> None:
+        self._mav = _Verifier(None)
         self._mav.robust_parsing = True
+        self.refused = 0
+        """Frames without a valid signature."""
+        if key is not None:
+            _sign(self._mav, key, time.time_ns() // 1000)
 
     def heard(self, data: bytes) -> list[mavlink2.MAVLink_message]:
         """The messages that these bytes complete."""
         with contextlib.suppress(mavlink2.MAVError):
             known = self._mav.parse_buffer(data) or []
+            self.refused += sum(m.get_type() == "BAD_DATA" and m.reason == _BAD_SIGNATURE for m in known)
             return [m for m in known if m.get_type() != "BAD_DATA" and not m.get_type().startswith("UNKNOWN")]
         return []
 

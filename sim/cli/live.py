@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from sortie.scenarios.reading.load import load
 from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.options import PolicyOption, SetOption, loaded
 from sortie.sim.folders import RunError, ensure_files, write_text
-from sortie.sim.policy_text import policy_overrides
 from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
@@ -27,9 +26,7 @@ SHOWN = 20
 
 def live(
     scenario: Annotated[str, typer.Argument(help="A scenario file or a library scenario's name.")] = "paper_replay",
-    policy: Annotated[
-        str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
-    ] = None,
+    policy: PolicyOption = None,
     begin: Annotated[float, typer.Option(help="Time of the scenario at which the flight begins, s.", min=0)] = 0.0,
     duration: Annotated[
         float | None, typer.Option(help="Length of the flight, s; default: to the scenario's end.")
@@ -69,9 +66,14 @@ def live(
         str | None,
         typer.Option(metavar="LAT,LON[,ALT]", help="With --mavlink: where (0, 0, 0) lies; default: local positions."),
     ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a field: fleet.drones=4")
+    mavlink_key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="With --mavlink: refuse messages that are not signed with this key (32 bytes or 64 hex digits; mode 600).",
+        ),
     ] = None,
+    set_: SetOption = None,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write all measurements to this JSON file.")] = None,
 ) -> None:
     """Run the context plane in real time over DDS: one process a drone, with publisher, policy node and gate.
@@ -88,15 +90,15 @@ def live(
     killed, started = (
         None if text is None else _drone_at(option, text) for option, text in (("--kill", kill), ("--start", start))
     )
-    flown = load(scenario, set_ or [])
-    if policy is not None:
-        flown = load(scenario, [*(set_ or []), *policy_overrides(policy, flown.policy.name)])
+    flown = loaded(scenario, set_, policy)
     with user_errors():
         from sortie.sim.export.telemetry import parse_origin
-        from sortie.sim.live.seals import find_key
+        from sortie.sim.live.seals import find_key, read_own_key
         from sortie.sim.live.session import fly_live
         from sortie.sim.live.watchdog import parse_fallback
 
+    if mavlink_key is not None and not mavlink:
+        raise RunError("--mavlink-key without --mavlink: there is no telemetry to check")
     ensure_files(out_file)
     with stages() as report:
         result = fly_live(
@@ -112,6 +114,8 @@ def live(
             decide_within_s=decide_within,
             mavlink=mavlink or (),
             origin=None if origin is None else parse_origin(origin),
+            mavlink_key=None if mavlink_key is None else read_own_key(mavlink_key),
+            warn=lambda text: err.print(text, soft_wrap=True, markup=False),
             progress=lambda what, done, of: report(what, round(done), round(of)),
         )
     _show(result)

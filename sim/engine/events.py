@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Generator, Sequence
-from functools import partial
+from collections.abc import Generator
 from typing import Any
 
 import numpy as np
 import simpy
 
-from sortie.fleet.lies import falsified
 from sortie.fleet.messages.auth import TRAILER_BYTES, Sealer
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.scenarios.schema import (
@@ -32,6 +30,7 @@ from sortie.scenarios.schema import (
 )
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.membership import Membership
+from sortie.sim.engine.own_state import whom
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import World, at, with_frame
 
@@ -113,28 +112,19 @@ class _Begin:
                     world.batteries.drop_cell(event.drone)
                     world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
                     world.ground_landed()
-            case ClockSkew():
-                world.note(event.drone, "clock_skew", f"clock off by {event.skew_s:g} s")
-                world.set_clock(event.drone, offset_s=event.skew_s)
-            case ClockDrift():
-                world.note(event.drone, "clock_drift", f"clock drifts by {event.drift_ppm:g} ppm")
-                world.set_clock(event.drone, rate_ppm=event.drift_ppm, growth_ppm_per_min=0.0)
-            case GnssLoss():
-                for drone in self._of(event):
-                    own = world.oscillators[drone]
-                    world.note(drone, "gnss_loss", f"no GNSS: the clock drifts by {own.rate_ppm:.3g} ppm")
-                    world.set_clock(drone, rate_ppm=own.rate_ppm, growth_ppm_per_min=own.growth_ppm_per_min)
+            case ClockSkew() | ClockDrift() | GnssLoss() | Lie():
+                for drone in whom(event, self.scenario.fleet.drones):
+                    world.note(drone, *world.own[drone].begin(event, self.index, env.now))
+                if not isinstance(event, Lie):
+                    world.read_clocks()
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
-            case Lie():
-                world.note(event.drone, "lie", f"claims {event.claim} {event.about}")
-                lie = partial(falsified, about=event.about, claim=event.claim)
-                world.drones[event.drone].lies[self.index] = lie
 
     def end(self) -> None:
         """End an event that lasts."""
         world, event = self.world, self.event
+        env = world.env
         match event:
             case LinkDrop():
                 world.add_loss(event.drone, event.peer, -event.loss_db)
@@ -142,17 +132,11 @@ class _Begin:
             case Jam():
                 del world.jammers[self.index]
                 world.note(-1, "jam_over", "the jammer is off")
-            case GnssLoss():
-                for drone in self._of(event):
-                    world.note(drone, "gnss_back", "the clock follows GNSS again")
-                    own = world.oscillators[drone]
-                    world.set_clock(drone, offset_s=own.offset_s, rate_ppm=0.0, growth_ppm_per_min=0.0)
-            case Lie():
-                del world.drones[event.drone].lies[self.index]
-                world.note(event.drone, "lie_over", "tells the truth again")
-
-    def _of(self, event: GnssLoss) -> Sequence[int]:
-        return range(self.scenario.fleet.drones) if event.drone is None else [event.drone]
+            case GnssLoss() | Lie():
+                for drone in whom(event, self.scenario.fleet.drones):
+                    world.note(drone, *world.own[drone].end(event, self.index, env.now))
+                if not isinstance(event, Lie):
+                    world.read_clocks()
 
     def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
         """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""

@@ -37,6 +37,7 @@ from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
+from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
@@ -97,7 +98,7 @@ def run_sortie(
     name, policies = _policy(scenario, policy)
     parts = build(scenario, policies, seed, replication, detector_of)
     files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited while the sortie flies
-    _fly(parts, progress, observer)
+    fly(parts, progress, observer)
     record = _collect(parts, policies, name, seed, replication)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, wall=wall)
@@ -170,9 +171,10 @@ def build(
         scenario.perception.people,
     )
     plan = MissionPlan(mission, len(drones))
-    clocks = oscillators(scenario.fleet.clock, len(drones), seed, replication)
+    gnss, drawn = scenario.fleet.clock.gnss, oscillators(scenario.fleet.clock, len(drones), seed, replication)
+    own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks, people)
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)
@@ -225,7 +227,7 @@ def build(
     )  # fmt: skip
 
 
-def _fly(parts: Parts, progress: Callable[[float], None] | None, observer: Observer | None) -> None:
+def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer: Observer | None = None) -> None:
     """Start every process, run the clock to the end, and record what is still in flight."""
     world, scorer, recorder = parts.world, parts.scorer, parts.recorder
 

@@ -16,7 +16,6 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Platform, Task
-from sortie.fleet.clock import Oscillator
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import RANGE_M, cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
@@ -34,6 +33,7 @@ from sortie.radio import Air
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.tracking import FleetTracking
 from sortie.sim.results.record import Recorder
@@ -104,7 +104,7 @@ class World:
         scene: SceneModel,
         plan: MissionPlan,
         recorder: Recorder,
-        oscillators: Sequence[Oscillator],
+        own: Sequence[OwnState],
         people: People,
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
@@ -114,9 +114,7 @@ class World:
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
         """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
-        self.oscillators, self.people = oscillators, people
-        self._clocks = [each.at_start(scenario.fleet.clock.gnss) for each in oscillators]
-        self._read_clocks()
+        self.own, self.people = own, people
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self._scenario, self._recorder = scenario, recorder
         self._computers = scenario.fleet.computers
@@ -163,7 +161,7 @@ class World:
             if frame:
                 self._measure_headrooms()
             self._frame = frame
-            self._read_clocks()
+            self.read_clocks()
             self.now = self.plan.at(env.now)
             for prepare in before_frame:
                 prepare(frame)
@@ -185,14 +183,10 @@ class World:
             )
         ]
 
-    def _read_clocks(self) -> None:
-        for status, clock in zip(self.drones, self._clocks, strict=True):
-            status.clock_skew_s = clock.error_s(self.env.now)
-
-    def set_clock(self, drone: int, **changes: float) -> None:
-        """Change some values of a drone's clock from now on."""
-        self._clocks[drone] = self._clocks[drone].at(self.env.now)._replace(**changes)
-        self._read_clocks()
+    def read_clocks(self) -> None:
+        """Bring every drone's clock to the present."""
+        for each in self.own:
+            each.read(self.env.now)
 
     def reroute(self, motion: Trajectories) -> None:
         """Replace the motion from the present frame on; earlier frames must be equal."""

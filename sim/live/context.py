@@ -1,94 +1,173 @@
 """The senses of each drone of a live fleet: a sortie flown before, replayed at the wall clock's pace.
 
-The paper's publishers replay context traces; here the trace is a flown scenario. Poses are the motion model's, the
-mission is the plan's; charge, headrooms and goodput are those that the drone published in the simulated flight, under
-the same policy, since on loopback there is neither a pack to drain nor a radio to measure.
+The paper's publishers replay context traces; here the trace is a flown scenario. Poses, charge, headrooms and goodput are
+those of the simulated flight, under the same policies, since on loopback there is neither a pack to drain nor a radio to
+measure. So are joins, departures and losses: `sortie.sim.engine.membership` decided them there. Lies and faults of clocks
+are no part of a trace, because a live drone has them itself (`sortie.sim.live.own_events`).
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.coverage import cameras_of
+from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import flown_motion
 from sortie.perception.geometry import Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
-from sortie.policies.contract import Disc
-from sortie.scenarios.schema import Scenario
+from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase
+from sortie.scenarios.schema import Lie, Scenario
 from sortie.sim.engine.mission import MissionPlan
-from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.pilot import plan_for
+from sortie.sim.engine.sortie import build, fly
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
-from sortie.sim.engine.world import cars_in_reach, route_bounds
+from sortie.sim.engine.world import INSTANT_S, cars_in_reach, route_bounds
+
+_REPLAYED_EVENTS = frozenset(
+    {"drone_joins", "drone_leaves", "drone_lost", "landed", "stays_down", "battery_fault", "cell_failure", "link_drop", "link_back"}
+)  # fmt: skip
+_RESTED = Platform(1.0, 1.0, 1.0)
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What a drone published in one frame of the simulated flight, as far as it does not follow from its pose."""
+
+    platform: Platform = _RESTED
+    goodput_mbps: tuple[float, ...] = ()
+    homebound: bool = False
+    """Whether it published LANDING without a region."""
+    person: bool = False
+    """Whether its thermal camera had found a person in its region lately."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """What one drone published in the simulated flight, by rising time."""
+    """One drone in the simulated flight."""
 
-    t_s: tuple[float, ...]
-    platform: tuple[Platform, ...]
-    goodput_mbps: tuple[tuple[float, ...], ...]
-    end_s: float
-    """From when on it is silent: it landed or was lost; infinite where it flew to the end."""
+    motion: Trajectories
+    """Its own, as the only drone."""
+    bounds: Bounds
+    """x_min, y_min, x_max, y_max of what the fleet was to fly, ENU; the scene follows from them."""
+    t_s: tuple[float, ...] = (0.0,)
+    """When the frames of `published` began."""
+    published: tuple[Published, ...] = (Published(),)
+    aloft: tuple[tuple[float, float], ...] = ((0.0, float("inf")),)
+    """From when until when it was in the fleet."""
+    events: tuple[tuple[float, str], ...] = ()
+    """What happened to it."""
 
-    def at(self, t_s: float) -> int:
-        """Index of the latest row at `t_s`, the first one before there is any."""
-        return max(0, bisect_right(self.t_s, t_s) - 1)
+    def at(self, t_s: float) -> Published:
+        """The latest that it published by `t_s`; the first one before there is any."""
+        return self.published[max(0, bisect_right(self.t_s, t_s + INSTANT_S) - 1)]
+
+
+def unflown(scenario: Scenario, drone: int) -> Trace:
+    """The trace of a drone that is never sensed: its way by the plan, nothing published."""
+    motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
+    return Trace(_only(motion, drone), route_bounds(motion))
 
 
 def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) -> list[Trace]:
-    """Fly the scenario without a detector and keep each drone's trace.
+    """Fly the scenario without a detector and without lies, and keep each drone's trace.
 
     Raises:
         PolicyError: its policy is unknown or breaks its contract.
     """
     perception = scenario.perception.model_copy(update={"detector": "none"})
-    record = run_sortie(scenario.model_copy(update={"perception": perception}), progress=progress)
-    rows, drones = record.tables["descriptors"], []
-    for drone in range(scenario.fleet.drones):
-        own = rows.filter(pc.equal(rows["drone"], drone)).to_pylist()
-        t_s = tuple(row["t_s"] for row in own)
-        silent_s = t_s[-1] + 1.5 * scenario.frame_s * scenario.context.publish_every if t_s else 0.0
-        drones.append(
-            Trace(
-                t_s,
-                tuple(Platform(row["soc"], row["cpu_headroom"], row["gpu_headroom"]) for row in own),
-                tuple(tuple(row["goodput_mbps"]) for row in own),
-                silent_s if silent_s < scenario.duration_s else float("inf"),
-            )
+    honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
+    flown = scenario.model_copy(update={"perception": perception, "events": honest})
+    parts = build(flown, plan_for(flown), flown.seed)
+    bounds = route_bounds(parts.world.motion)
+    fly(parts, progress)
+    tables = parts.recorder.tables()
+    return [
+        _trace(scenario, drone, _only(parts.world.motion, drone), bounds, tables)
+        for drone in range(scenario.fleet.drones)
+    ]
+
+
+def _trace(scenario: Scenario, drone: int, motion: Trajectories, bounds: Bounds, tables: dict[str, pa.Table]) -> Trace:
+    frame_s = scenario.frame_s
+    own = {
+        name: tables[name].filter(pc.equal(tables[name]["drone"], drone))
+        for name in ("states", "descriptors", "events")
+    }
+    published = [
+        Published(
+            Platform(row["soc"], row["cpu_headroom"], row["gpu_headroom"]),
+            tuple(row["goodput_mbps"]),
+            row["phase"] == PHASE_NAMES[TaskPhase.LANDING] and np.isnan(row["region_x_m"]),
+            bool(row["novelty_flags"] & PERSON_FLAG),
         )
-    return drones
+        for row in own["descriptors"].to_pylist()
+    ]
+    frames = np.floor(np.array(own["descriptors"]["t_s"]) / frame_s + INSTANT_S)  # it publishes within its frame
+    never = Published(goodput_mbps=(0.0,) * (scenario.fleet.drones - 1))
+    return Trace(
+        motion,
+        bounds,
+        tuple((frames * frame_s).tolist()) or (0.0,),
+        tuple(published) or (never,),
+        _runs(np.array(own["states"]["airborne"]), frame_s),
+        tuple((row["t_s"], row["text"]) for row in own["events"].to_pylist() if row["kind"] in _REPLAYED_EVENTS),
+    )
+
+
+def _runs(airborne: np.ndarray, frame_s: float) -> tuple[tuple[float, float], ...]:
+    """From when until when a row of frames is true; without an end where the last one is."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], airborne, [False]])))
+    ends = [float("inf") if until == len(airborne) else until * frame_s for until in edges[1::2].tolist()]
+    return tuple(zip((edges[::2] * frame_s).tolist(), ends, strict=True))
+
+
+def _only(motion: Trajectories, drone: int) -> Trajectories:
+    """One drone's motion."""
+    n = motion.position_m.shape[1]
+    values = {f.name: getattr(motion, f.name) for f in fields(motion)}
+    fleet_wide = {"time_s", "frame_position_m", "frame_yaw_rad"}
+    assert all(value.shape[1] == n for name, value in values.items() if name not in fleet_wide)  # noqa: S101
+    return Trajectories(**{
+        name: value if name in fleet_wide else value[:, drone : drone + 1].copy() for name, value in values.items()
+    })  # fmt: skip
 
 
 class ReplaySenses:
     """One drone's own sensors (sortie.fleet.agent.Senses), frame 0 being the one of `begin_s`."""
 
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
-        motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
         mission = scenario.mission
-        self._scene = SceneModel(scenario.perception.scene, mission.target, route_bounds(motion), mission.more_targets)
+        self._scene = SceneModel(scenario.perception.scene, mission.target, trace.bounds, mission.more_targets)
         self._cameras = cameras_of(scenario.fleet)
-        self._flight = FlightSenses(motion, scenario.frame_s, self._scene.height_field, self._cameras)
+        self._flight = FlightSenses(trace.motion, scenario.frame_s, self._scene.height_field, self._cameras)
         self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace
         self._first = round(begin_s / scenario.frame_s)
-        self._sensed = self._flight.at(self._first)[drone]
-        self._row = trace.at(begin_s)
+        self.sense(0)
 
     def sense(self, frame: int) -> Sensed:
         """The drone in a frame; the other methods then answer for the same moment."""
-        self._sensed = sensed = self._flight.at(self._first + frame)[self._drone]
-        self._row = self._trace.at(sensed.capture.t_s)
-        return sensed
+        (alone,) = self._flight.at(self._first + frame)
+        self._sensed = alone._replace(capture=alone.capture._replace(drone=self._drone))
+        self._published = self._trace.at(alone.capture.t_s)
+        return self._sensed
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Nothing: a replay is not heard."""
+        return {}
 
     @property
     def height_field(self) -> HeightField:
@@ -102,17 +181,20 @@ class ReplaySenses:
 
     def platform(self) -> Platform:
         """Charge and headrooms."""
-        return self._trace.platform[self._row]
+        return self._published.platform
 
     def goodput_mbps(self) -> tuple[float, ...]:
         """To every other drone by ascending id."""
-        return self._trace.goodput_mbps[self._row]
+        return self._published.goodput_mbps
 
     def task(self) -> Task:
-        """Phase, region and targets."""
+        """Phase, region, targets, and whether a person is in the region."""
         now_s = self._sensed.capture.t_s
+        if self._published.homebound:
+            return Task(TaskPhase.LANDING, None)
         now = self._plan.at(now_s)[self._plan.group_of[self._drone]]
-        return now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
+        task = now.task(lambda target, cue_m: self._tracking.follows(self._drone, target, cue_m, now_s))
+        return task._replace(person_in_region=self._published.person)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """Cars in range: no detector runs here."""

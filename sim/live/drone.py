@@ -11,23 +11,18 @@ from multiprocessing.connection import Connection
 from sortie.fleet.agent import Agent
 from sortie.fleet.logs.mavlink import Origin
 from sortie.fleet.memory import PeerMemory
-from sortie.fleet.plane import DroneStatus
-from sortie.policies.catalogue.baselines import silence
 from sortie.policies.contract import Directive, FleetView, PolicyError
-from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.audit import Audit
-from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan
-from sortie.sim.engine.world import at
 from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
 from sortie.sim.live.node import LiveNode
+from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Failed, Go, Home, Ready
-from sortie.sim.live.rules import phase_of, rules_of
+from sortie.sim.live.rules import guard_of, phase_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
 from sortie.sim.results.record import Recorder
@@ -59,6 +54,8 @@ class Orders:
     """Where the drone's vehicle is heard; None: its poses and charge are replayed."""
     origin: Origin | None = None
     """Where ENU (0, 0, 0) lies for vehicles; None: each vehicle's own local origin."""
+    mavlink_key: bytes | None = None
+    """The signing key of the vehicle's link; None: signatures are not checked."""
     late: bool = False
     """Whether it starts when others are in the air."""
 
@@ -71,7 +68,7 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
     link: MavlinkLink | None = None
     try:
         policy = Watchdog(
-            PolicyOrders(scenario.policy, drone, scenario.frame_s),
+            PolicyOrders(scenario, drone),
             fallback=orders.fallback,
             deadline_s=scenario.frame_s if orders.decide_within_s is None else orders.decide_within_s,
         )
@@ -88,7 +85,7 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
         )  # fmt: skip
         senses: ReplaySenses | MavlinkSenses = replay
         if orders.mavlink is not None:
-            link = MavlinkLink(orders.mavlink, orders.origin)
+            link = MavlinkLink(orders.mavlink, orders.origin, orders.mavlink_key)
             link.wait_until_found()
             senses = MavlinkSenses(link, replay, drone, node.note)
         if go is None:
@@ -132,14 +129,8 @@ def _fly(
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
     phase_s = phase_of(scenario, drone)
     # stamps are nanoseconds since 1970, as in ROS 2
-    memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=go.unix_ns * 1e-9 - orders.begin_s))
-
+    memory = PeerMemory(drone, rules, status_of(scenario, drone, go.unix_ns * 1e-9 - orders.begin_s))
     recorder = Recorder()
-    # The policy decides in a process of its own, and what the gates enforce is judged here. Invariants about what the
-    # policy would decide on fresh descriptors are left to that process.
-    rules_here = tuple(rule for rule in parse(scenario.policy.invariants) if not rule.needs_fresh)
-    named = NamedPolicy(scenario.policy.name, silence)
-    guard = Pilot(drone, PolicyPlan(named, rules=rules_here, shielded=scenario.policy.shield), Audit(clock, recorder))
 
     def decide(view: FleetView) -> Sequence[Directive]:
         node.note_health(view)
@@ -157,14 +148,15 @@ def _fly(
         sealer=None,  # the node seals what it writes
         phase_s=orders.begin_s + phase_s,
         handshake_bytes=lambda: policy.handshake_bytes,
-        guard=guard.guard,
+        guard=guard_of(scenario, drone, clock, recorder),
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
-    if isinstance(senses, MavlinkSenses):
+    events = OwnEvents(scenario, drone, clock, memory.status, node.note)
+    if isinstance(senses, MavlinkSenses):  # its vehicle says where it is, and whether it flies
         senses.begin(orders.begin_s - go.monotonic_s, rules)
         node.is_muted = lambda: senses.muted
-    elif orders.trace.end_s < orders.end_s:
-        at(clock, orders.trace.end_s, memory.status.leave)
+    else:
+        events.follow(orders.trace)
     agent.start()
     if orders.late:
         node.note("its process started")
@@ -172,6 +164,7 @@ def _fly(
     def send_report() -> None:
         report = node.report(clock.now)
         report.new.notices.extend(take_notices(recorder))
+        report.refused.update(senses.refused)
         pipe.send(
             replace(
                 report, cpu_s=report.cpu_s + policy.cpu_s, fallbacks=policy.fallbacks, policy_restarts=policy.restarts
@@ -181,6 +174,7 @@ def _fly(
     reported_s = orders.begin_s
     while clock.now < orders.end_s and not pipe.poll():
         node.wait(min(clock.peek(), orders.end_s) - clock.now)
+        events.read()
         node.take()
         clock.catch_up()
         if clock.now - reported_s >= 1.0:

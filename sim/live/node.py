@@ -45,6 +45,8 @@ _HEADER = struct.Struct("<qI3f4f")
 """Capture stamp (ns since 1970), sender, estimated position, attitude: the 40 B of `sortie.fleet.gate`."""
 DIRECTIVE_DEPTH, PAYLOAD_DEPTH = 16, 4
 """Samples that a reader stores until they are read. With one, a stranger's sample would push a genuine one out."""
+MOST_PEERS = 200
+"""As many drones as a scenario may have. Each costs readers and writers, so a member cannot name ever more of them."""
 
 
 class Role(Flag):
@@ -150,7 +152,8 @@ class LiveNode:
 
     def decided(self, decision: Decision) -> None:
         """Keep a decision's processor time and events for the next report."""
-        self._new.decide_ns.append(decision.elapsed_ns)
+        if decision.elapsed_ns:
+            self._new.decide_ns.append(decision.elapsed_ns)
         self._new.notices += decision.notices
 
     def note(self, text: str) -> None:
@@ -162,7 +165,14 @@ class LiveNode:
         self._bus.wait(timeout_s)
 
     def take(self) -> None:
-        """Handle the samples that have arrived, directives first, because the gate may need them at once."""
+        """Handle the samples that have arrived, directives first, because the gate may need them at once.
+
+        A drone on the ground hears nothing.
+        """
+        if not self._memory.status.airborne:
+            for reader in (self._fleet, *(reader for link in self._links.values() for reader in link.readers)):
+                reader.take()
+            return
         for link in list(self._links.values()):
             for reader in link.readers:
                 for cdr in reader.take():
@@ -202,6 +212,8 @@ class LiveNode:
         self._write(peer, TopicKind.of(payload.representation), content)
 
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
+        if self.is_muted():
+            return
         self._write(peer, TopicKind.FEATURES, bytes(size_bytes))
 
     # --- sortie.fleet.agent.AgentLog --------------------------------------------------------------------
@@ -243,13 +255,18 @@ class LiveNode:
             if self._loss and self._loss_stream(sender).random() < self._loss:
                 self._lost += 1
                 return
-            if sender not in self._links:
-                self._add_peer(sender)
+            if sender not in self._links and len(self._links) >= MOST_PEERS:
+                self._refuse(
+                    "descriptor", "of too many drones", f"drone {sender}, there are {MOST_PEERS} others already"
+                )
+                return
         refused = self._memory.hear(heard, self._clock.now)
         if isinstance(refused, DropReason):
             self._refuse("descriptor", refused, heard.detail if isinstance(heard, Dropped) else "its counter was used")
-        else:
-            self._heard += 1
+            return
+        self._heard += 1
+        if isinstance(heard, Opened) and heard.descriptor.agent_id not in self._links:
+            self._add_peer(heard.descriptor.agent_id)
 
     def _on_own(self, heard: Opened) -> None:
         """Keep the drone's own descriptor, which another of its nodes published."""
@@ -303,7 +320,7 @@ class LiveNode:
         directive = decode_directive(content[HEADER_BYTES : HEADER_BYTES + DIRECTIVE_BYTES])
         if (sender, directive.source, directive.destination) != (topic.source, topic.source, topic.destination):
             return "of another link", f"{directive.source}→{directive.destination} on {topic.name}"
-        age_s = self._clock_s() - stamp_ns * 1e-9
+        age_s = self._clock.now - self._memory.in_own_time(sender, stamp_ns * 1e-9)
         ready_s = self._rules.equipment(sender).compute_delay_s + PHASE_SHARE * self._rules.period_s
         if age_s > ready_s + directive.deadline_s:
             late_s = age_s - ready_s
@@ -319,10 +336,6 @@ class LiveNode:
         if kind not in self._refused:
             self.note(f"refused a {kind}: {detail}")
         self._refused[kind] += 1
-
-    def _clock_s(self) -> float:
-        """The drone's clock, s since 1970."""
-        return self._clock.now + self._memory.status.clock_skew_s
 
     # --- helpers ---------------------------------------------------------------------------------
 

@@ -34,8 +34,12 @@ _DATAGRAM = 65_535
 class MavlinkLink:
     """The socket to a vehicle, and a thread that reads it: a message is timed as it comes in."""
 
-    def __init__(self, address: str, origin: Origin | None) -> None:
-        """Args: `address` is `udpin:HOST:PORT`, where the vehicle sends to, or `udpout:HOST:PORT`, where it waits.
+    def __init__(self, address: str, origin: Origin | None, key: bytes | None = None) -> None:
+        """Args:
+            address: `udpin:HOST:PORT`, where the vehicle sends to, or `udpout:HOST:PORT`, where it waits.
+            origin: where ENU (0, 0, 0) lies; None: at the vehicle's own origin.
+            key: the link's signing key. With it, frames without a valid signature are refused, and what goes to the
+                vehicle is signed.
 
         Raises:
             RunError: an address that is none, or one that is taken.
@@ -43,7 +47,7 @@ class MavlinkLink:
         waits, host, port = parse_address(address)
         self.address, self._origin = address, origin
         self.state = VehicleState()
-        self._listener, self._companion = Listener(), Companion()
+        self._listener, self._companion = Listener(key), Companion(key)
         self._peer: tuple[str, int] | None = None if waits else (host, port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -68,8 +72,14 @@ class MavlinkLink:
         while math.isinf(self.state.pose_s):
             if time.monotonic() > until_s:
                 missing = "vehicle" if self.state.system is None else "position and attitude"
-                raise RunError(f"{self.address}: no {missing} heard within {wait_s:g} s")
+                bad = f"; {self.refused} messages had no valid signature" if self.refused else ""
+                raise RunError(f"{self.address}: no {missing} heard within {wait_s:g} s{bad}")
             time.sleep(0.02)
+
+    @property
+    def refused(self) -> int:
+        """Messages without a valid signature."""
+        return self._listener.refused
 
     def close(self) -> None:
         """End the thread and let go of the socket."""
@@ -94,8 +104,8 @@ class MavlinkLink:
             state, now_s = self.state, time.monotonic()
             for message in self._listener.heard(data):
                 state = after(state, message, now_s, self._origin)
-            if state.system is not None and state.others == self.state.others:
-                self._peer = sender
+                if message.get_srcSystem() == state.system:
+                    self._peer = sender
             self.state = state
 
 
@@ -110,7 +120,7 @@ class MavlinkSenses:
         self._link, self._replay, self._drone, self._note = link, replay, drone, note
         self._offset_s = 0.0
         self._rules: PlaneRules | None = None
-        self._stale = False
+        self._stale = self._doubted = False
         self.muted = False
         """Whether telemetry is so old that the drone publishes and sends nothing."""
 
@@ -122,6 +132,9 @@ class MavlinkSenses:
         """The drone as its vehicle last described it."""
         self._replay.sense(frame)
         state = self._link.state
+        if self.refused and not self._doubted:
+            self._doubted = True
+            self._note("refused telemetry: a message had no valid signature")
         self._judge_age(time.monotonic() - state.pose_s)
         cameras = self._replay.cameras
         radius_m = float(footprint_radius_m(state.position_m[2], cameras))
@@ -133,6 +146,11 @@ class MavlinkSenses:
             float(yaw), cameras=cameras,
         )  # fmt: skip
         return Sensed(capture, state.velocity_mps, radius_m, view)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Messages of telemetry that were refused, by reason."""
+        return {"telemetry unsigned or forged": self._link.refused} if self._link.refused else {}
 
     def platform(self) -> Platform:
         """The vehicle's charge, where it knows it; headrooms are replayed."""

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation, check_directives
 from sortie.policies.registry import describe_error
-from sortie.scenarios.schema import PolicySection
+from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.audit import Audit
-from sortie.sim.engine.pilot import Pilot, plan_of, schedule_policies
+from sortie.sim.engine.pilot import Pilot, plan_for, schedule_policies
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.reports import Notice
 from sortie.sim.results.record import Recorder
@@ -28,9 +28,8 @@ from sortie.sim.results.record import Recorder
 class PolicyOrders:
     """What a policy's process is started with."""
 
-    policy: PolicySection
+    scenario: Scenario
     drone: int
-    frame_s: float
 
 
 class Begin(NamedTuple):
@@ -74,7 +73,7 @@ def serve(orders: PolicyOrders, pipe: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         try:
-            plan = plan_of(orders.policy)._replace(replays=())
+            plan = plan_for(orders.scenario)._replace(replays=())
         except PolicyError as error:
             pipe.send(Loaded(str(error)))
             return
@@ -82,7 +81,7 @@ def serve(orders: PolicyOrders, pipe: Connection) -> None:
         begin: Begin = pipe.recv()
         clock, recorder = WallClock(*begin), Recorder()
         pilot = Pilot(orders.drone, plan, Audit(clock, recorder))
-        schedule_policies(clock, plan, [pilot], orders.frame_s)
+        schedule_policies(clock, plan, [pilot], orders.scenario.frame_s)
         began_s = time.process_time()
         while True:
             ask: Ask = pipe.recv()

@@ -7,7 +7,8 @@
     policy node  reads all descriptors, its own drone's too; decides on every link in each frame, and repeats its directives
     gate         takes the pose from its own drone's descriptor, and sends what the directives allow
 
-A gate that hears no directive for as long as peers would detach a silent drone applies the fallback to every link.
+A gate that hears no directive for as long as peers would detach a silent drone applies the fallback to every link. A policy
+node that hears no descriptor of its own drone for as long decides nothing.
 """
 
 from __future__ import annotations
@@ -25,24 +26,29 @@ from sortie.fleet.coverage import View
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.mavlink import Origin
 from sortie.fleet.memory import PeerMemory
-from sortie.fleet.plane import DroneStatus
 from sortie.fleet.senses import Sensed
+from sortie.fleet.staleness import cap_by_age, health
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.schema import Scenario
 from sortie.sim.live.clock import WallClock
-from sortie.sim.live.context import ReplaySenses, Trace, traces
+from sortie.sim.live.context import ReplaySenses, traces, unflown
 from sortie.sim.live.node import LiveNode, Role
+from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
-from sortie.sim.live.policy_process import Begin, PolicyOrders
+from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Report
-from sortie.sim.live.rules import phase_of, rules_of
+from sortie.sim.live.rules import guard_of, phase_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.transport import Bus
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
+from sortie.sim.results.record import Recorder
 
 LONGEST_WAIT_S = 0.05
-_NO_TRACE = Trace((), (), (), math.inf)
+
+
+def _silent(text: str) -> None:
+    """The publisher says what happens to the drone; its other nodes do not repeat it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +64,8 @@ class RoleOrders:
     fallback: Fallback = DETECTIONS
     mavlink: str | None = None
     origin: Origin | None = None
+    mavlink_key: bytes | None = None
+    """The signing key of the vehicle's link; None: signatures are not checked."""
 
 
 class RoleNode:
@@ -67,11 +75,11 @@ class RoleNode:
         scenario, drone = orders.scenario, orders.drone
         self._role, self._fallback = role, orders.fallback
         self._bus, self._link, self._policy = bus, None, None
-        trace = traces(scenario)[drone] if role == Role.PUBLISHER and orders.mavlink is None else _NO_TRACE
+        trace = traces(scenario)[drone] if role == Role.PUBLISHER else unflown(scenario, drone)
         replay = ReplaySenses(scenario, drone, trace, 0.0)
         if role == Role.POLICY:
             self._policy = Watchdog(
-                PolicyOrders(scenario.policy, drone, scenario.frame_s),
+                PolicyOrders(scenario, drone),
                 fallback=orders.fallback,
                 deadline_s=scenario.frame_s,
             )
@@ -79,17 +87,19 @@ class RoleNode:
         begin_monotonic_s = time.monotonic() + orders.begin_unix_s - time.time()
         self._clock = clock = WallClock(0.0, begin_monotonic_s)
         self._rules = rules = rules_of(scenario, 0.0, scenario.duration_s)
-        self._memory = memory = PeerMemory(drone, rules, DroneStatus(clock_skew_s=orders.begin_unix_s))
+        self._memory = memory = PeerMemory(drone, rules, status_of(scenario, drone, orders.begin_unix_s))
+        self._recorder = Recorder()
         self.node = node = LiveNode(
             bus, Seals(orders.secrets, drone), drone, scenario.fleet.drones, seed=scenario.seed, role=role
         )
         senses: ReplaySenses | MavlinkSenses = replay
         if role == Role.PUBLISHER and orders.mavlink is not None:
-            self._link = MavlinkLink(orders.mavlink, orders.origin)
+            self._link = MavlinkLink(orders.mavlink, orders.origin, orders.mavlink_key)
             self._link.wait_until_found()
             senses = MavlinkSenses(self._link, replay, drone, node.note)
             senses.begin(-begin_monotonic_s, rules)
             node.is_muted = lambda: isinstance(senses, MavlinkSenses) and senses.muted
+        self._senses = senses
         self._agent = Agent(
             clock,
             memory,
@@ -102,12 +112,18 @@ class RoleNode:
             sealer=None,  # the node seals what it writes
             phase_s=phase_of(scenario, drone),
             handshake_bytes=lambda: 0,
+            guard=guard_of(scenario, drone, clock, self._recorder) if role == Role.POLICY else None,
         )
         node.fly(clock, memory, rules, senses.goodput_mbps)
+        self._events = OwnEvents(
+            scenario, drone, clock, memory.status, node.note if role == Role.PUBLISHER else _silent
+        )
+        if role == Role.PUBLISHER and orders.mavlink is None:
+            self._events.follow(trace)
         if self._policy is not None:
             self._policy.begin(Begin(0.0, begin_monotonic_s), node.note, node.decided)
         self._looked_ns = 0
-        self._by_fallback = False
+        self._by_fallback = self._alone = False
         clock.process(self._fly(phase_of(scenario, drone)))
 
     @property
@@ -118,12 +134,16 @@ class RoleNode:
     def step(self) -> None:
         """Wait for a message or the next moment to act, and handle what is due."""
         self._bus.wait(max(0.0, min(self._clock.peek() - self._clock.now, LONGEST_WAIT_S)))
+        self._events.read()
         self.node.take()
         self._clock.catch_up()
 
     def report(self) -> Report:
         """The counts, and the events since the last report."""
-        return self.node.report(self._clock.now)
+        report = self.node.report(self._clock.now)
+        report.new.notices.extend(take_notices(self._recorder))
+        report.refused.update(self._senses.refused)
+        return report
 
     def close(self) -> None:
         """End what the node has started."""
@@ -142,15 +162,27 @@ class RoleNode:
     def _tick(self, frame: int) -> None:
         agent, own = self._agent, self.node.own
         if self._role == Role.PUBLISHER:
-            agent.look(frame, agent.publish(frame))
+            if self._memory.status.airborne:
+                agent.look(frame, agent.publish(frame))
         elif own is not None and self._role == Role.POLICY:
-            self.node.note_health(self._memory.view(self._clock.now))
-            agent.decide(frame)
+            if self._hears_itself():
+                self.node.note_health(self._memory.view(self._clock.now))
+                agent.decide(frame)
         elif own is not None and self._role == Role.GATE:
+            agent.judge(frame)
             self._hold_links()
             if own.stamp_ns > self._looked_ns:  # without a new pose there is nothing to send
                 self._looked_ns = own.stamp_ns
                 agent.look(frame, self._sensed(own))
+
+    def _hears_itself(self) -> bool:
+        """Whether the drone's own descriptor is one that peers would still decide on. Without it, nothing is decided."""
+        limit_s = self._rules.descriptor_period_s * self._rules.detached_after_periods
+        alone = self._memory.heard_ago_s(self.node.drone, self._clock.now) > limit_s
+        if alone and not self._alone:
+            self.node.note("decides nothing: the drone's own descriptor does not come")
+        self._alone = alone
+        return not alone
 
     def _decide(self, view: FleetView) -> Sequence[Directive]:
         return () if self._policy is None else self._policy(view)
@@ -164,8 +196,11 @@ class RoleNode:
         if not self._by_fallback:
             self._by_fallback = True
             self.node.note("fallback: no directive from the policy node")
-        for directive in self._fallback.directives(self._memory.view(self._clock.now), "the policy node is silent"):
-            self.node.gate.apply(directive)
+        rules, view = self._rules, self._memory.view(self._clock.now)
+        for directive in self._fallback.directives(view, "the policy node is silent"):
+            age_s = view.age_s[directive.destination]
+            link = health(age_s, rules.descriptor_period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            self.node.gate.apply(cap_by_age(directive, link, age_s))
 
     def _sensed(self, own: Descriptor) -> Sensed:
         """The drone as its own descriptor states it; the look's coverage is the publisher's."""

@@ -1,11 +1,19 @@
-"""The plane's rules on a bus, and when in a frame each drone acts."""
+"""The plane's rules on a bus, when in a frame each drone acts, and what the gates may not break."""
 
 from __future__ import annotations
 
+import simpy
+
+from sortie.fleet.agent import Guard
 from sortie.fleet.plane import PlaneRules, equipment_of
+from sortie.policies.catalogue.baselines import silence
+from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.audit import Audit
+from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan
 from sortie.sim.engine.sortie import PHASE_SHARE
+from sortie.sim.results.record import Recorder
 
 
 def phase_of(scenario: Scenario, drone: int) -> float:
@@ -27,4 +35,17 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         trust=scenario.context.trust,
         roster=scenario.context.roster,
         makes=equipment_of(scenario),
+        people=scenario.perception.thermal is not None,
     )
+
+
+def guard_of(scenario: Scenario, drone: int, env: simpy.Environment, recorder: Recorder) -> Guard | None:
+    """Judges what the drone's gates enforce, and writes down what breaks the scenario's invariants.
+
+    Invariants about what the policy would decide on fresh descriptors are left to the policy's own process.
+    """
+    section, make = scenario.policy, scenario.fleet.make_of(drone)
+    name = make.policy if make is not None and make.policy and section.of_makes else section.name
+    rules = tuple(rule for rule in parse(section.invariants) if not rule.needs_fresh)
+    plan = PolicyPlan(NamedPolicy(name, silence), rules=rules, shielded=section.shield)
+    return Pilot(drone, plan, Audit(env, recorder)).guard

@@ -11,7 +11,8 @@ of another drone. Who has the master key, or may read the memory of a drone's pr
 
 A sealed message is the message as it is, then 28 B as `sortie.fleet.messages.auth` writes them. The counter is the time in
 nanoseconds since 1970, and rises with every message of a sender. A node that was restarted therefore goes on above its
-old counters, and a node that starts late refuses what was recorded before it started.
+old counters, and a node that starts late refuses what was recorded before it started. A counter that is ahead of the
+receiver's clock is refused too: one such message would otherwise refuse all later ones of its sender.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ KEY_VARIABLE = "SORTIE_KEY"
 """The environment variable with the master key as 64 hexadecimal digits."""
 KEY_ID = 1
 CLOCKS_AGREE_S = 2.0
-"""A node accepts messages that were sealed this long before it started: clocks of drones differ."""
+"""Clocks of drones differ by so much at most. A node accepts messages that were sealed this long before it started, and
+messages from this far in the future."""
 _MOST_PADDING = 3
 """DDS fills a sample to a multiple of 4 B."""
 _OWN_COUNTERS = 64
@@ -60,8 +62,7 @@ def find_key(path: Path | None) -> bytes:
         RunError: a file that others may read, or a key that is none.
     """
     if path is not None:
-        _check_mode(path)
-        return read_key(path)
+        return read_own_key(path)
     text = os.environ.get(KEY_VARIABLE)
     if text is None:
         return secrets.token_bytes(32)
@@ -72,6 +73,16 @@ def find_key(path: Path | None) -> bytes:
     if len(key) != 32:
         raise RunError(f"{KEY_VARIABLE} has {len(text)} characters, must be 64 hexadecimal digits")
     return key
+
+
+def read_own_key(path: Path) -> bytes:
+    """A key of 32 B from a file that only its owner may read.
+
+    Raises:
+        RunError: a file that others may read, or one that holds no key.
+    """
+    _check_mode(path)
+    return read_key(path)
 
 
 def _check_mode(path: Path) -> None:
@@ -92,6 +103,8 @@ def read_secrets(path: Path) -> Secrets:
     _check_mode(path)
     try:
         both = bytes.fromhex(path.read_text("ascii"))
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from error
     except ValueError:
         both = b""
     if len(both) != 64:
@@ -151,14 +164,20 @@ class Seals:
         opened = unseal(data, {KEY_ID: self._key(topic)})
         if isinstance(opened, Dropped):
             return opened
-        highest = self._highest.get(topic, self._floor)
-        if opened.counter <= highest:
-            return Dropped(DropReason.REPLAYED, f"counter {opened.counter}, must be above {highest}")
+        fault = self._wrong_time(opened.counter, self._highest.get(topic, self._floor))
+        if fault is not None:
+            return fault
         self._highest[topic] = opened.counter
         return opened.content
 
     def open_descriptor(self, cdr: bytes) -> Opened | Dropped:
-        """Check a descriptor as it came over the bus. Its counter is left to the inbox, which knows its sender."""
+        """Check a descriptor as it came over the bus. Whether its counter was used is left to the inbox, which knows its sender."""
+        whole = self._open_padded(cdr)
+        if isinstance(whole, Opened) and whole.key_id is not None:
+            return self._wrong_time(whole.counter, self._floor) or whole
+        return whole
+
+    def _open_padded(self, cdr: bytes) -> Opened | Dropped:
         keys = None if self._own is None else {KEY_ID: self._key(CONTEXT)}
         whole = open_datagram(cdr, keys)
         if isinstance(whole, Dropped):
@@ -169,6 +188,16 @@ class Seals:
                 if isinstance(shorter, Opened):
                     return shorter
         return whole
+
+    def _wrong_time(self, counter: int, above: int) -> Dropped | None:
+        """Why a counter is refused: it was used, or no clock of the fleet shows it yet."""
+        if counter <= above:
+            return Dropped(DropReason.REPLAYED, f"counter {counter}, must be above {above}")
+        ahead_s = (counter - self._clock_ns()) * 1e-9
+        if ahead_s > CLOCKS_AGREE_S:
+            detail = f"its counter is {ahead_s:.1f} s ahead of this clock, must be at most {CLOCKS_AGREE_S:g} s"
+            return Dropped(DropReason.MALFORMED, detail)
+        return None
 
     def is_forged_self(self, opened: Opened) -> bool:
         """Whether a sealed descriptor in this drone's own name was made by somebody else."""

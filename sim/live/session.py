@@ -24,6 +24,7 @@ from sortie.sim.live.context import traces
 from sortie.sim.live.drone import Orders, fly_one
 from sortie.sim.live.reports import Failed, Go, Home, Ready, Report
 from sortie.sim.live.result import LiveResult, Lost, summarise
+from sortie.sim.live.scope import left_out
 from sortie.sim.live.seals import secrets_of
 from sortie.sim.live.watchdog import DETECTIONS, Fallback
 
@@ -60,6 +61,8 @@ def fly_live(
     decide_within_s: float | None = None,
     mavlink: Sequence[str] = (),
     origin: Origin | None = None,
+    mavlink_key: bytes | None = None,
+    warn: Callable[[str], None] | None = None,
     progress: Progress | None = None,
     begun: Callable[[dict[int, int]], None] | None = None,
 ) -> LiveResult:
@@ -81,6 +84,9 @@ def fly_live(
         mavlink: where the vehicles of drones 0, 1, … are heard: `udpin:HOST:PORT` or `udpout:HOST:PORT`. Further drones
             replay.
         origin: where ENU (0, 0, 0) lies for these vehicles; None: at the origin of each vehicle's own estimator.
+        mavlink_key: the signing key of these links, 32 B; messages without a valid signature are refused. None: signatures
+            are not checked.
+        warn: called with one line that names what of the scenario the flight does not use, if it sets any such thing.
         progress: called with (what is done, how much of it, of how much).
         begun: called with the process ids by drone when the fleet begins to fly.
 
@@ -93,6 +99,9 @@ def fly_live(
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
     _check(scenario, begin_s, end_s, loss, kill, start, decide_within_s, mavlink)
+    unused = left_out(scenario, range(len(mavlink)))
+    if unused and warn is not None:
+        warn(unused)
     report_progress = progress or (lambda what, done, of: None)
     found = traces(
         scenario.model_copy(update={"duration_s": end_s}),
@@ -115,7 +124,7 @@ def fly_live(
         vehicle = mavlink[drone] if drone < len(mavlink) else None
         return Orders(
             scenario, drone, found[drone], from_s, end_s, loss, domain, present, held, fallback or DETECTIONS,
-            decide_within_s, vehicle, origin, late,
+            decide_within_s, vehicle, origin, mavlink_key, late,
         )  # fmt: skip
 
     try:

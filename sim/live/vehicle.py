@@ -9,12 +9,14 @@ import math
 import socket
 import threading
 import time
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sortie.fleet.logs.mavlink import STATUS, Origin, Telemetry, Transmitter, messages
 from sortie.sim.export.telemetry import ORIGIN, parse_address
+from sortie.sim.live.seals import read_own_key
 
 TELEMETRY_HZ = 20.0
 
@@ -42,11 +44,11 @@ def circle(t_s: float, *, radius_m: float = 30.0, height_m: float = 60.0, speed_
 class CirclingVehicle:
     """The vehicle as a thread. `pause` stops its telemetry, not its flight."""
 
-    def __init__(self, address: str, system: int = 1, origin: Origin = ORIGIN) -> None:
-        """Args: `address` is `udpout:HOST:PORT`."""
+    def __init__(self, address: str, system: int = 1, origin: Origin = ORIGIN, key: bytes | None = None) -> None:
+        """Args: `address` is `udpout:HOST:PORT`; with a `key` of 32 B its messages are signed."""
         _, host, port = parse_address(address)
         self._to, self._origin = (host, port), origin
-        self._transmitter = Transmitter(system - 1)
+        self._transmitter = Transmitter(system - 1, key, time.time_ns() // 1000)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._began_s = time.monotonic()
         self._paused, self._stop = threading.Event(), threading.Event()
@@ -78,9 +80,12 @@ class CirclingVehicle:
 def main(
     address: Annotated[str, typer.Argument(help="Where to send: udpout:127.0.0.1:14550")],
     system: Annotated[int, typer.Option(help="Its MAVLink system id.", min=1, max=255)] = 1,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Sign messages with this key (32 bytes or 64 hex digits).")
+    ] = None,
 ) -> None:
     """Fly a circle of 30 m at 60 m until Ctrl-C."""
-    vehicle = CirclingVehicle(address, system)
+    vehicle = CirclingVehicle(address, system, key=None if key is None else read_own_key(key))
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

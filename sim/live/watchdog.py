@@ -25,7 +25,7 @@ HANGS_S = 1.0
 RESTART_S = 1.0
 """The shortest time from one start of the process to the next."""
 LOAD_S = 60.0
-"""The longest time for a policy to load before the flight."""
+"""The longest time for a policy to load."""
 _EXIT_S = 2.0
 
 
@@ -128,7 +128,7 @@ class Watchdog:
         Args:
             begin: the time.
             note: called with each event as text.
-            decided: called with each decision that came in time.
+            decided: called with each answer; one that was late or gave no directives comes without its processor time.
         """
         self._note, self._decided = note, decided
         assert self._pipe is not None  # noqa: S101 - it was loaded just now
@@ -150,6 +150,7 @@ class Watchdog:
                     )
                 self._decided(answer)
                 return answer.directives
+            self._decided(answer._replace(elapsed_ns=0))
         reason = answer.fault if isinstance(answer, Decision) else answer
         if self._down_since is None:
             self._down_since = time.monotonic(), self.fallbacks
@@ -169,8 +170,10 @@ class Watchdog:
         try:
             if self._pipe is None:
                 return self._restart()
-            if not self._loaded and not self._finish_loading():
-                return "the policy's process is starting"
+            if not self._loaded:
+                why_not = self._finish_loading()
+                if why_not:
+                    return why_not
             if self._asked_s is not None:
                 return self._late(view)
             return self._ask_now(view)
@@ -192,7 +195,8 @@ class Watchdog:
         assert self._pipe is not None  # noqa: S101 - `_ask` has checked
         assert self._asked_s is not None  # noqa: S101 - `_ask` has checked
         if self._pipe.poll():
-            self._pipe.recv()
+            late: Decision = self._pipe.recv()
+            self._decided(late._replace(elapsed_ns=0))
             self._asked_s = None
             return self._ask_now(view)
         waited_s = time.monotonic() - self._asked_s
@@ -201,15 +205,22 @@ class Watchdog:
             self._note(f"the policy's process was killed: no answer for {waited_s:.1f} s")
         return f"the policy did not answer within {self._deadline_s:g} s"
 
-    def _finish_loading(self) -> bool:
+    def _finish_loading(self) -> str:
+        """Why a new process cannot decide yet; empty once it can."""
         assert self._pipe is not None  # noqa: S101 - `_ask` has checked
         assert self._begin is not None  # noqa: S101 - a process is restarted in flight alone
         if not self._pipe.poll():
-            return False
-        self._pipe.recv()
+            if time.monotonic() - self._started_s > LOAD_S:
+                self._end(kill=True)
+                self._note(f"the policy's process was killed: it did not load within {LOAD_S:g} s")
+            return "the policy's process is starting"
+        loaded: Loaded = self._pipe.recv()
+        if loaded.fault:
+            self._end(kill=True)
+            return loaded.fault
         self._pipe.send(self._begin)
         self._loaded = True
-        return True
+        return ""
 
     def _restart(self) -> str:
         if time.monotonic() - self._started_s >= RESTART_S:

@@ -15,6 +15,7 @@ ARGUMENTS = {
     "fallback": ("detections@2", str),
     "mavlink": ("", str),
     "origin": ("", str),
+    "mavlink_key_file": ("", str),
 }
 
 

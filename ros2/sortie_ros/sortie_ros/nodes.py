@@ -17,7 +17,8 @@ from sortie.sim.export.topics import TopicKind
 from sortie.sim.live.bench import Bench
 from sortie.sim.live.node import Role
 from sortie.sim.live.roles import RoleNode, RoleOrders
-from sortie.sim.live.seals import read_secrets
+from sortie.sim.live.scope import left_out
+from sortie.sim.live.seals import read_own_key, read_secrets
 from sortie.sim.live.watchdog import parse_fallback
 from sortie_ros.bus import RosBus
 
@@ -43,10 +44,10 @@ def benchmark(args: list[str] | None = None) -> None:
     """Count the serialised bytes on every topic, and log them once a second."""
     rclpy.init(args=args)
     node = Node("benchmark")
-    bench = Bench(RosBus(node), _scenario(node).fleet.drones)
-    bench.begin()
-    began_s = reported_s = time.monotonic()
     try:
+        bench = Bench(RosBus(node), _scenario(node).fleet.drones)
+        bench.begin()
+        began_s = reported_s = time.monotonic()
         while rclpy.ok():
             bench.wait(0.05)
             bench.take()
@@ -55,6 +56,9 @@ def benchmark(args: list[str] | None = None) -> None:
                 reported_s, over_s = now_s, now_s - began_s
                 rates = (f"{kind} {bench.of(kind).bytes / over_s / 1e3:.1f} kB/s" for kind in TopicKind)
                 node.get_logger().info(f"{', '.join(rates)}; {100 * bench.cpu_s / over_s:.1f} % of one core")
+    except SortieError as error:
+        node.get_logger().error(str(error))
+        raise SystemExit(1) from error
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -74,6 +78,10 @@ def make(role: Role, node: Node) -> RoleNode:
     if scenario.context.authentication and not key_file:
         raise SortieError("key_file is empty, must name the drone's secrets, or set context.authentication=false")
     mavlink, origin = _text(node, "mavlink", ""), _text(node, "origin", "")
+    mavlink_key_file = _text(node, "mavlink_key_file", "")
+    unused = left_out(scenario, {drone} if mavlink else ())
+    if unused and role == Role.PUBLISHER:
+        node.get_logger().warning(unused)
     orders = RoleOrders(
         scenario,
         drone,
@@ -82,6 +90,7 @@ def make(role: Role, node: Node) -> RoleNode:
         parse_fallback(_text(node, "fallback", "detections@2")),
         mavlink or None,
         parse_origin(origin) if origin else None,
+        read_own_key(Path(mavlink_key_file)) if mavlink_key_file else None,
     )
     return RoleNode(role, RosBus(node), orders)
 

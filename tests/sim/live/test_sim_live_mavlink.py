@@ -9,14 +9,17 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from scipy.spatial.transform import Rotation
 from sim_examples import example
+from typer.testing import CliRunner
 
 from sortie.fleet.logs.mavlink import Companion, Listener, Origin, Transmitter, geodetic, local_enu, messages
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.policies.contract import TaskPhase
+from sortie.sim.cli.app import app
 from sortie.sim.export.telemetry import ORIGIN
 from sortie.sim.folders import RunError
 from sortie.sim.live import platform
@@ -169,3 +172,102 @@ def test_a_fleet_flies_with_a_vehicle_and_notices_that_it_falls_silent() -> None
     text = "\n".join(describe_changes(result))
     assert "drone 0: telemetry is stale: the vehicle's last pose is 0." in text
     assert "drone 0: publishes nothing: the vehicle's last pose is 1." in text
+
+
+# --- signed telemetry ------------------------------------------------------------------------------------
+
+KEY = bytes(range(32))
+NOW_US = time.time_ns() // 1000
+
+
+def frames(transmitter: Transmitter, t_s: float = 3.0) -> list[bytes]:
+    """One round of the circling vehicle's messages."""
+    return [transmitter.pack(message) for message in messages(circle(t_s), ORIGIN)]
+
+
+@pytest.mark.parametrize("key", [None, bytes(32)], ids=["unsigned", "another key"])
+def test_telemetry_without_a_valid_signature_is_refused_and_counted(key: bytes | None) -> None:
+    listener = Listener(KEY)
+    wrong = frames(Transmitter(0, key, NOW_US))
+    assert [m for frame in wrong for m in listener.heard(frame)] == []
+    assert listener.refused == len(wrong)
+    good = frames(Transmitter(0, KEY, NOW_US))
+    assert len([m for frame in good for m in listener.heard(frame)]) == len(good)
+    assert [m for frame in good for m in listener.heard(frame)] == []  # a repetition
+    assert listener.refused == len(wrong) + len(good)
+    old = frames(Transmitter(0, KEY, NOW_US - 3_600_000_000))  # recorded an hour ago
+    assert [m for frame in old for m in Listener(KEY).heard(frame)] == []
+
+
+def test_a_stranger_s_frame_from_the_future_locks_no_vehicle_out() -> None:
+    """pymavlink keeps the time of a frame before it looks at its signature."""
+    listener, vehicle = Listener(KEY), Transmitter(0, KEY, NOW_US)
+    listener.heard(frames(vehicle)[0])
+    (forged, *_) = frames(Transmitter(0, bytes(32), NOW_US + 10**12))
+    assert listener.heard(forged) == []
+    assert len(listener.heard(frames(vehicle)[0])) == 1
+
+
+def test_without_a_key_signatures_are_not_checked() -> None:
+    listener = Listener()
+    signed = frames(Transmitter(0, KEY, NOW_US))
+    assert len([m for frame in signed for m in listener.heard(frame)]) == len(signed)
+    assert listener.refused == 0
+
+
+def test_a_companion_signs_what_it_asks() -> None:
+    asked = Companion(KEY).ask(1, WANTED_HZ)
+    assert len(Listener(KEY).heard(asked)) == 1 + len(WANTED_HZ)
+    unsigned = Listener(KEY)
+    assert unsigned.heard(Companion().ask(1, WANTED_HZ)) == []
+    assert unsigned.refused == 1 + len(WANTED_HZ)
+
+
+def test_a_drone_believes_signed_telemetry_alone() -> None:
+    scenario = example("fleet.drones=1")
+    link = MavlinkLink("udpin:127.0.0.1:0", None, KEY)
+    stranger = CirclingVehicle(f"udpout:127.0.0.1:{link.port}")
+    try:
+        with pytest.raises(RunError, match=r"no vehicle heard within 0.5 s; \d+ messages had no valid signature$"):
+            link.wait_until_found(0.5)
+        vehicle, notes = CirclingVehicle(f"udpout:127.0.0.1:{link.port}", key=KEY), []
+        try:
+            link.wait_until_found()
+            senses = MavlinkSenses(link, ReplaySenses(scenario, 0, traces(scenario)[0], 0.0), 0, notes.append)
+            senses.begin(0.0, rules_of(scenario, 0.0, 6.0))
+            senses.sense(0)
+            senses.sense(1)
+            assert notes.count("refused telemetry: a message had no valid signature") == 1
+            assert senses.refused["telemetry unsigned or forged"] > 0
+        finally:
+            vehicle.close()
+    finally:
+        stranger.close()
+        link.close()
+
+
+def test_junk_does_not_turn_the_drone_s_requests_to_a_stranger(link: MavlinkLink) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:  # fmt: skip
+        for frame in frames(Transmitter(0)):
+            vehicle.sendto(frame, ("127.0.0.1", link.port))
+        link.wait_until_found()
+        known = link._peer
+        assert known is not None
+        assert known[1] == vehicle.getsockname()[1]
+        stranger.sendto(b"junk", ("127.0.0.1", link.port))
+        stranger.sendto(Transmitter(6).pack(messages(circle(1.0), ORIGIN)[0]), ("127.0.0.1", link.port))
+        end_s = time.monotonic() + 20
+        while link.state.others == 0:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        assert link._peer == known
+
+
+def test_a_key_needs_telemetry_and_an_owner(tmp_path: Path) -> None:
+    path = tmp_path / "link.key"
+    path.write_text(KEY.hex())
+    done = CliRunner().invoke(app, ["live", "--mavlink-key", str(path)])
+    assert str(done.exception) == "--mavlink-key without --mavlink: there is no telemetry to check"
+    path.chmod(0o644)
+    done = CliRunner().invoke(app, ["live", "--mavlink", "udpin:127.0.0.1:0", "--mavlink-key", str(path)])
+    assert "its mode is 644, must be 600" in str(done.exception)

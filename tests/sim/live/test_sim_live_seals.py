@@ -22,6 +22,7 @@ from sortie.policies.contract import Directive, Representation
 from sortie.sim.cli.app import app
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import RunError
+from sortie.sim.live import node as node_module
 from sortie.sim.live.bus import LOOPBACK, Bus
 from sortie.sim.live.node import _HEADER, LiveNode
 from sortie.sim.live.payload_message import pack_bytes
@@ -218,3 +219,64 @@ def test_a_member_that_lies_loses_trust_and_its_payloads_are_dropped() -> None:
     assert memory.trust_in(0) == 0.0
     assert node._refused["payload not trusted"] >= 1
     assert any(n.text.startswith("trust in drone 0 is now 0.5: ") for n in told)
+
+
+# --- counters that no clock shows ------------------------------------------------------------------------
+
+
+def sealed_at(counter: int, topic: Topic, content: bytes) -> bytes:
+    """What a member of the fleet can seal: any counter."""
+    sealer = Sealer(seals(2)._key(topic), KEY_ID, counter - 1)
+    return sealer.seal(content)
+
+
+@pytest.mark.parametrize("counter", [2**64 - 1, round(1002.1e9)])
+def test_a_member_s_counter_from_the_future_locks_nobody_out(counter: int) -> None:
+    """One message refused all later ones of drone 0, for good."""
+    receiver, datagram = seals(1), encode_descriptor(fleet_of(2).descriptors[0])
+    found = receiver.open(PAYLOAD, sealed_at(counter, PAYLOAD, b"x"))
+    assert isinstance(found, Dropped)
+    assert "ahead of this clock, must be at most 2 s" in found.detail
+    assert receiver.open(PAYLOAD, seals(0).seal(PAYLOAD, b"x")) == b"x"
+    assert isinstance(receiver.open_descriptor(sealed_at(counter, CONTEXT, datagram)), Dropped)
+    assert isinstance(receiver.open_descriptor(seals(0).seal(CONTEXT, datagram)), Opened)
+    assert isinstance(receiver.open_descriptor(seals(0, 1001.9).seal(CONTEXT, datagram)), Opened)
+
+
+def test_a_descriptor_that_was_recorded_before_the_flight_is_refused() -> None:
+    """It was believed by a node that had not heard its sender yet, where the key was the same."""
+    datagram = encode_descriptor(fleet_of(2).descriptors[0])
+    found = seals(1).open_descriptor(seals(0, 990.0).seal(CONTEXT, datagram))
+    assert isinstance(found, Dropped)
+    assert found.reason == DropReason.REPLAYED
+
+
+def test_what_is_refused_makes_no_link_and_no_fleet_grows_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    node, _, memory = node_of(1)
+    claim = fleet_of(2).descriptors[0]
+    sealed = seals(0).seal(CONTEXT, encode_descriptor(claim._replace(agent_id=7)))
+    node._on_descriptor(sealed[:-1] + b"?")
+    node._on_descriptor(seals(0, 990.0).seal(CONTEXT, encode_descriptor(claim._replace(agent_id=8))))
+    assert sorted(node._links) == [0]
+    monkeypatch.setattr(node_module, "MOST_PEERS", 2)
+    node._on_descriptor(sealed)
+    assert sorted(node._links) == [0, 7]
+    node._on_descriptor(seals(0, 1000.1).seal(CONTEXT, encode_descriptor(claim._replace(agent_id=9))))
+    assert sorted(node._links) == [0, 7]
+    assert node._refused["descriptor of too many drones"] == 1
+    assert memory.peers == [7]
+
+
+def test_a_payload_of_a_peer_with_a_wrong_clock_is_judged_by_its_age() -> None:
+    """All payloads of a drone that was 0.3 s behind were refused as late, though its offset was known."""
+    node, clock, memory = node_of(1)
+    sender, reader = seals(0), node._links[0].readers[1]
+    for frame in range(12):
+        clock.now = 10.0 + 0.1 * frame
+        stamped = fleet_of(2).descriptors[0]._replace(stamp_ns=round((clock.now - 0.3) * 1e9))
+        node._on_descriptor(sender.seal(CONTEXT, encode_descriptor(stamped)))
+    assert memory.clocks.offset_s[0] == pytest.approx(0.25, abs=0.01)  # known to half a frame
+    node._on_payload(pack_bytes(payload(sender, clock.now - 0.3 - 0.05)), reader)
+    assert not node._refused
+    node._on_payload(pack_bytes(payload(sender, clock.now - 0.3 - 0.2)), reader)
+    assert node._refused["payload late"] == 1

@@ -15,7 +15,6 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from sortie.policies.contract import PolicyError, Representation
-from sortie.scenarios.schema import PolicySection
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.live import watchdog
@@ -72,7 +71,7 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
     """A policy that decides."""
     (tmp_path / "mine.py").write_text(POLICY)
     notes: list[str] = []
-    orders = PolicyOrders(PolicySection(name=f"{tmp_path}/mine.py:decide"), 0, 0.1)
+    orders = PolicyOrders(example(f"policy={{name: '{tmp_path}/mine.py:decide'}}"), 0)
     dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1)
     try:
         dog.wait_until_loaded()
@@ -156,7 +155,7 @@ def test_a_late_answer_is_dropped_and_the_policy_is_asked_again(watched: Watched
 
 
 def test_a_policy_that_cannot_be_loaded_is_an_error_before_the_flight() -> None:
-    orders = PolicyOrders(PolicySection(name="none-such"), 0, 0.1)
+    orders = PolicyOrders(example("policy={name: none-such}"), 0)
     dog = Watchdog(orders, fallback=DETECTIONS, deadline_s=0.1)
     with pytest.raises(PolicyError, match="none-such"):
         dog.wait_until_loaded()
@@ -222,7 +221,7 @@ def test_a_policy_that_hangs_ends_with_its_drone(tmp_path: Path) -> None:
 def ask_for_ever(folder: Path) -> None:
     """A drone's process, its policy hanging."""
     dog = Watchdog(
-        PolicyOrders(PolicySection(name=f"{folder}/mine.py:decide"), 0, 0.1), fallback=DETECTIONS, deadline_s=60
+        PolicyOrders(example(f"policy={{name: '{folder}/mine.py:decide'}}"), 0), fallback=DETECTIONS, deadline_s=60
     )
     dog.wait_until_loaded()
     dog.begin(Begin(0.0, time.monotonic()), str, lambda _: None)
@@ -230,3 +229,47 @@ def ask_for_ever(folder: Path) -> None:
     (folder / "part").write_text(str(dog.pid))
     (folder / "part").rename(folder / "pid")
     dog(VIEW)
+
+
+def test_events_of_answers_that_are_not_used_are_kept(tmp_path: Path) -> None:
+    """A change of policy was never told where the new policy failed, or answered late."""
+    (tmp_path / "mine.py").write_text(POLICY)
+    (tmp_path / "mode").write_text("raise")
+    mine = f"{tmp_path}/mine.py:decide"
+    scenario = example(f"policy={{name: silence, changes: [{{at_s: 0, name: '{mine}'}}]}}")
+    dog, answers = Watchdog(PolicyOrders(scenario, 0), fallback=DETECTIONS, deadline_s=0.1), []
+    try:
+        dog.wait_until_loaded()
+        dog.begin(Begin(1.0, time.monotonic()), str, answers.append)
+        end_s = time.monotonic() + 60
+        while not answers:
+            assert time.monotonic() < end_s
+            dog(VIEW)
+        assert [n.text for a in answers for n in a.notices if "mine.py" in n.text]
+        assert {a.elapsed_ns for a in answers} == {0}
+    finally:
+        dog.close()
+
+
+def test_a_new_process_that_does_not_load_is_killed_and_started_again(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its drone waited for it for ever."""
+    (watched.mode.parent / "mine.py").write_text("import time\ntime.sleep(3600)\n")
+    watched.mode.write_text("die")
+    monkeypatch.setattr(watchdog, "LOAD_S", 0.5)
+    rung(watched.watchdog)
+    watched.until(lambda: watched.watchdog.restarts == 2)
+    assert "the policy's process was killed: it did not load within 0.5 s" in watched.notes
+
+
+def test_a_new_process_says_why_it_cannot_load(watched: Watched) -> None:
+    (watched.mode.parent / "mine.py").write_text("decide = 3 +\n")
+    watched.mode.write_text("die")
+    rung(watched.watchdog)
+    reasons: list[str] = []
+    end_s = time.monotonic() + 60
+    while not any("mine.py" in reason for reason in reasons):
+        assert time.monotonic() < end_s
+        reasons += [d.reason for d in watched.watchdog(VIEW)]
+        time.sleep(0.02)

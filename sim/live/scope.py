@@ -1,0 +1,77 @@
+"""What of a scenario a live flight leaves out, so that it can say so before it flies."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+from pydantic import BaseModel
+
+from sortie.scenarios.schema import (
+    BatteryFault,
+    CellFailure,
+    DroneJoins,
+    DroneLeaves,
+    DroneLost,
+    Event,
+    Jam,
+    LinkDrop,
+    Scenario,
+    Spoof,
+)
+
+UNUSED = (
+    "context.form",  # descriptors have the paper's form
+    "radio.framing",  # payloads go whole
+    "perception.detector",  # no network runs, and nothing is scored
+    "perception.fusion",
+    "perception.weights",
+    "perception.recording",
+    "perception.recorded_fusion",
+    "perception.precision",
+    "perception.sample_rate_hz",
+    "perception.fusion_delay_s",
+    "perception.max_age_s",
+    "perception.motion_compensation",
+    "perception.join",
+    "perception.score_threshold",
+    "perception.cells_by",
+    "perception.unsent_cells",
+    "policy.replays",
+    "record.views",
+    "record.disagreement",
+    "expect",
+    "expect_decisions",
+)
+"""Fields that change nothing in a live flight."""
+
+
+def left_out(scenario: Scenario, vehicles: Collection[int] = ()) -> str:
+    """One line that names what the scenario sets and the flight does not use; empty where that is nothing.
+
+    Args:
+        vehicles: drones with a MAVLink vehicle, which flies as its pilot wants.
+    """
+    fields = [path for path in UNUSED if _is_set(scenario, path)]
+    fields += [f"fleet.makes.{k}.weights" for k, make in enumerate(scenario.fleet.makes) if make.weights is not None]
+    events = [f"events.{k} ({why})" for k, event in enumerate(scenario.events) for why in _why_not(event, vehicles)]
+    return f"a live flight does not use {', '.join([*fields, *events])}" if fields or events else ""
+
+
+def _is_set(scenario: Scenario, path: str) -> bool:
+    """Whether a field differs from its default; a detector does where there is one."""
+    section: BaseModel = scenario
+    *sections, name = path.split(".")
+    for each in sections:
+        section = getattr(section, each)
+    value = getattr(section, name)
+    return bool(value != ("none" if path == "perception.detector" else type(section).model_fields[name].get_default()))
+
+
+def _why_not(event: Event, vehicles: Collection[int]) -> Iterator[str]:
+    match event:
+        case Spoof():
+            yield "spoof: no attacker joins the bus"
+        case LinkDrop() | Jam():
+            yield f"{event.kind}: it changes the replayed goodput alone, the bus loses nothing"
+        case DroneJoins() | DroneLeaves() | DroneLost() | BatteryFault() | CellFailure() if event.drone in vehicles:
+            yield f"{event.kind}: drone {event.drone} does as its vehicle does"

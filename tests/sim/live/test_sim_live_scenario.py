@@ -1,0 +1,308 @@
+"""What a live flight takes of its scenario: makes, members, clocks, lies and people, and what it says it leaves out."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+import simpy
+from memory_bus import MemoryBus
+from policies_examples import fleet_of
+from pydantic import BaseModel
+from sim_examples import example
+from typer.testing import CliRunner
+
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.messages.wire import encode_descriptor
+from sortie.fleet.plane import DroneStatus
+from sortie.fleet.staleness import LinkHealth
+from sortie.policies.contract import PERSON_FLAG, Representation, TaskPhase
+from sortie.scenarios.reading.load import load
+from sortie.scenarios.schema import Scenario
+from sortie.sim.cli.app import app
+from sortie.sim.engine.pilot import plan_for
+from sortie.sim.engine.sortie import build, run_sortie
+from sortie.sim.export.topics import CONTEXT
+from sortie.sim.live import session
+from sortie.sim.live.context import ReplaySenses, Trace, traces
+from sortie.sim.live.node import LiveNode
+from sortie.sim.live.own_events import OwnEvents, status_of
+from sortie.sim.live.policy_process import Begin, PolicyOrders
+from sortie.sim.live.result import LiveResult
+from sortie.sim.live.rules import rules_of
+from sortie.sim.live.scope import UNUSED, left_out
+from sortie.sim.live.seals import Seals
+from sortie.sim.live.session import fly_live
+from sortie.sim.live.watchdog import DETECTIONS, Watchdog
+
+DOMAIN = os.getpid() % 200 + 27
+NONE = "perception.detector=none"
+OTHER = "fleet.makes=[{name: other, drones: [1], policy: all-4, policy_params: {received_budget: 0.03125}, feature_space: other}]"
+MEMBERS = "events=[{kind: drone_joins, at_s: 1.5, drone: 1}, {kind: drone_lost, at_s: 4, drone: 1}]"
+
+
+def frames_in_the_fleet(trace: Trace, scenario: Scenario) -> list[bool]:
+    """Whether a drone of a live flight is in the fleet, by frame."""
+    env, status = simpy.Environment(), status_of(scenario, 1, 0.0)
+    OwnEvents(scenario, 1, env, status, lambda _: None).follow(trace)  # type: ignore[arg-type]
+    found = []
+    for frame in range(scenario.frames):
+        env.run(until=frame * scenario.frame_s + 0.001)
+        found.append(status.airborne)
+    return found
+
+
+# --- makes ---------------------------------------------------------------------------------------------
+
+
+def test_a_make_s_own_policy_decides() -> None:
+    scenario = example(
+        "fleet.drones=3", "fleet.makes=[{name: quiet, drones: [1], policy: silence}]", "policy={name: all-4}"
+    )
+    asked = []
+    for drone in (0, 1):
+        dog = Watchdog(PolicyOrders(scenario, drone), fallback=DETECTIONS, deadline_s=30.0)
+        try:
+            dog.wait_until_loaded()
+            dog.begin(Begin(0.0, 0.0), str, lambda _: None)
+            asked.append({d.representation for d in dog(fleet_of(3)._replace(ego=drone))})
+        finally:
+            dog.close()
+    assert asked == [{Representation.FEATURES}, {Representation.NONE}]
+
+
+@pytest.fixture(scope="module")
+def mixed() -> LiveResult:
+    """Two makes with two networks; drone 1 joins late, and is lost."""
+    return fly_live(example("fleet.drones=2", "duration_s=6", OTHER, MEMBERS), domain=DOMAIN, decide_within_s=1.0)
+
+
+def test_two_networks_fly_and_each_says_which(mixed: LiveResult) -> None:
+    """`worked` of drone 0 sends no maps to another network; `all-4` of drone 1 does not ask."""
+    of = {d: [o for o in mixed.orders if o.drone == d and o.representation != "none"] for d in (0, 1)}
+    assert {o.representation for o in of[0]} == {"detections"}
+    assert any("another network" in o.reason for o in of[0])
+    assert "features" in {o.representation for o in of[1]}
+
+
+# --- members -------------------------------------------------------------------------------------------
+
+
+def test_a_drone_joins_and_is_lost_as_the_scenario_says(mixed: LiveResult) -> None:
+    seen = [c for c in mixed.health if (c.drone, c.peer) == (0, 1) and c.health != LinkHealth.DEGRADED]
+    assert [c.health for c in seen] == [LinkHealth.FRESH, LinkHealth.DETACHED]
+    assert seen[0].t_s > 1.4
+    assert seen[1].t_s > 4.9
+    assert mixed.each[1].published <= 26  # from 1.5 s to 4 s
+    assert {n.text for n in mixed.notices if n.drone == 1} >= {"takes off", "fell silent"}
+    assert mixed.lost == []  # its process flew to the end
+
+
+@pytest.mark.parametrize(
+    "events",
+    [
+        MEMBERS,
+        "events=[{kind: drone_lost, at_s: 1, drone: 1}, {kind: drone_joins, at_s: 3.05, drone: 1}]",
+        "events=[{kind: drone_leaves, at_s: 1, drone: 1}]",
+        "events=[{kind: battery_fault, at_s: 2, drone: 1, lost_fraction: 1}]",
+    ],
+)
+def test_a_live_drone_is_in_the_fleet_when_the_simulated_one_is(events: str) -> None:
+    scenario = example("fleet.drones=2", "fleet.formation.altitude_m=10", "mission.descent_mps=5", events)
+    flown = run_sortie(scenario).tables["states"].to_pandas()
+    found = frames_in_the_fleet(traces(scenario)[1], scenario)
+    assert found == flown[flown["drone"] == 1]["airborne"].tolist()
+    assert 0 < sum(found) < len(found)
+
+
+def test_a_drone_that_goes_home_publishes_landing_and_descends() -> None:
+    scenario = example("fleet.drones=2", "events=[{kind: drone_leaves, at_s: 2, drone: 1}]")
+    flown = run_sortie(scenario).tables["states"].to_pandas()
+    height_m = flown[flown["drone"] == 1]["z_m"].to_numpy()
+    senses = ReplaySenses(scenario, 1, traces(scenario)[1], 0.0)
+    for frame in (0, 19, 21, 40, 59):
+        sensed = senses.sense(frame)
+        assert sensed.capture.drone == 1
+        assert sensed.capture.position_m[2] == pytest.approx(height_m[frame])
+        assert (senses.task().phase == TaskPhase.LANDING) == (frame > 19)
+    assert height_m[59] < height_m[0] - 9
+
+
+def test_a_drone_that_never_flies_has_senses() -> None:
+    scenario = example("fleet.drones=2", "events=[{kind: drone_joins, at_s: 5, drone: 1}]", "duration_s=6")
+    (_, trace) = traces(scenario.model_copy(update={"duration_s": 2.0}))
+    assert trace.aloft == ()
+    senses = ReplaySenses(scenario, 1, trace, 0.0)
+    assert senses.goodput_mbps() == (0.0,)
+    assert 0 <= senses.platform().soc <= 1
+
+
+class Fixed:
+    """A clock that stands."""
+
+    now = 1.0
+
+
+def test_a_drone_on_the_ground_hears_nothing() -> None:
+    bus, scenario = MemoryBus(), example("fleet.drones=2")
+    status = DroneStatus(airborne=False)
+    node = LiveNode(bus, Seals(None), 1, 2, seed=0)
+    memory = PeerMemory(1, rules_of(scenario, 0.0, 6.0), status)
+    node.fly(Fixed(), memory, rules_of(scenario, 0.0, 6.0), lambda: (1.0,))  # type: ignore[arg-type]
+    descriptor = fleet_of(2).descriptors[0]._replace(stamp_ns=1_000_000_000)
+    bus.writer(CONTEXT).write(encode_descriptor(descriptor))
+    node.take()
+    assert memory.peers == []
+    status.airborne = True
+    node.take()
+    assert memory.peers == []  # what it missed is gone
+    bus.writer(CONTEXT).write(encode_descriptor(descriptor))
+    node.take()
+    assert memory.peers == [0]
+
+
+# --- clocks, lies, people ------------------------------------------------------------------------------
+
+CLOCKS = (
+    "fleet.clock={offset_s: 0.2, drift_ppm: 30000, drift_growth_ppm_per_min: 50000}",
+    "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}, {kind: gnss_loss, at_s: 2, until_s: 4}, "
+    "{kind: clock_drift, at_s: 5, drone: 1, drift_ppm: 40000}, {kind: clock_skew, at_s: 1, drone: 0, skew_s: 3}]",
+)
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 3.0])
+def test_a_live_clock_is_off_as_the_simulated_one(begin_s: float) -> None:
+    scenario = example("fleet.drones=2", *CLOCKS)
+    parts = build(scenario, plan_for(scenario), scenario.seed)
+    parts.world.start(lambda _: None)
+    zero_s = 1000.0
+    env, status, told = simpy.Environment(begin_s), status_of(scenario, 1, zero_s), []
+    events = OwnEvents(scenario, 1, env, status, told.append)  # type: ignore[arg-type]
+    off_s = []
+    for frame in range(round(begin_s * 10), 60):
+        t_s = frame * scenario.frame_s + 0.001
+        parts.env.run(until=t_s)
+        env.run(until=t_s)
+        parts.world.read_clocks()
+        events.read()
+        simulated_s = parts.world.drones[1].clock_skew_s
+        assert status.clock_skew_s - zero_s == pytest.approx(simulated_s, abs=1e-9)
+        off_s.append(simulated_s)
+    assert len({round(v, 4) for v in off_s}) >= 20
+    assert [text.partition(" by")[0] for text in told] == [
+        "clock off", "no GNSS: the clock drifts", "the clock follows GNSS again", "clock drifts",
+    ]  # fmt: skip
+
+
+def test_a_live_drone_lies_itself_and_its_own_senses_are_true() -> None:
+    """The replayed charge was the lie, so that the drone's own policy believed it."""
+    lie = "events=[{kind: lie, at_s: 1, drone: 1, about: battery, claim: little, until_s: 3}]"
+    scenario = example("fleet.drones=2", lie)
+    senses = ReplaySenses(scenario, 1, traces(scenario)[1], 0.0)
+    env, status = simpy.Environment(), status_of(scenario, 1, 0.0)
+    OwnEvents(scenario, 1, env, status, str)  # type: ignore[arg-type]
+    lies = []
+    for frame in (5, 15, 35):
+        env.run(until=frame * 0.1)
+        senses.sense(frame)
+        assert senses.platform().soc > 0.9
+        claims = fleet_of(2).descriptors[1]
+        for each in status.lies.values():
+            claims = each(claims)
+        lies.append(claims.battery_soc < 0.1)
+    assert lies == [False, True, False]
+
+
+def test_a_person_that_the_simulated_drone_found_is_known_live() -> None:
+    scenario = load("person_crossing", [])
+    flown = run_sortie(scenario, replication=0).tables["descriptors"].to_pandas()
+    known = flown[flown["drone"] == 0]["novelty_flags"].to_numpy() & PERSON_FLAG > 0
+    senses = ReplaySenses(scenario, 0, traces(scenario)[0], 0.0)
+    assert rules_of(scenario, 0.0, 1.0).people
+    assert known.any()
+    for frame in (int(np.flatnonzero(known)[0]), int(np.flatnonzero(~known)[0])):
+        senses.sense(frame)
+        assert senses.task().person_in_region == known[frame]
+
+
+def test_what_is_replayed_is_of_the_same_frame() -> None:
+    """It was of the frame before."""
+    scenario = example("fleet.drones=2")
+    flown = run_sortie(scenario).tables["descriptors"].to_pandas()
+    soc = flown[flown["drone"] == 1]["soc"].to_list()
+    senses = ReplaySenses(scenario, 1, traces(scenario)[1], 1.0)
+    for frame in (0, 7, 30):
+        senses.sense(frame)
+        assert senses.platform().soc == soc[10 + frame]
+
+
+# --- what is left out ----------------------------------------------------------------------------------
+
+
+def test_what_a_flight_leaves_out_is_named_in_one_line() -> None:
+    assert left_out(example()) == ""
+    scenario = example(
+        "context.form=small", "perception.detector=surrogate", "record.views=true", "fleet.drones=3",
+        "fleet.makes=[{name: a, drones: [2], weights: x.safetensors}]",
+        "events=[{kind: spoof, at_s: 1, drone: 1}, {kind: link_drop, at_s: 1, drone: 1}, {kind: drone_lost, at_s: 2, drone: 0}]",
+    )  # fmt: skip
+    assert left_out(scenario) == (
+        "a live flight does not use context.form, perception.detector, record.views, fleet.makes.0.weights, "
+        "events.0 (spoof: no attacker joins the bus), "
+        "events.1 (link_drop: it changes the replayed goodput alone, the bus loses nothing)"
+    )
+    assert left_out(scenario, vehicles=[0]).endswith(", events.2 (drone_lost: drone 0 does as its vehicle does)")
+
+
+USED = {
+    "context": {"rate_hz", "degraded_after_periods", "detached_after_periods", "authentication", "publish_every", "trust"},
+    "perception": {"tracking_rate_hz", "compute_delay_s", "people", "thermal", "scene"},
+    "policy": {"name", "params", "dwell_s", "hysteresis", "changes", "commands", "invariants", "of_makes", "shield"},
+    "record": set(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("section", USED)
+def test_every_field_is_used_or_named(section: str) -> None:
+    """A new field of these sections has to be in one of the two."""
+    model: Any = Scenario.model_fields[section].annotation
+    assert issubclass(model, BaseModel)
+    unused = {path.partition(".")[2] for path in UNUSED if path.startswith(f"{section}.")}
+    assert unused | USED[section] == set(model.model_fields)
+    assert not unused & USED[section]
+
+
+CHANGED = {
+    "perception.fusion": "late",
+    "perception.precision": "bfloat16",
+    "perception.sample_rate_hz": "1",
+    "perception.fusion_delay_s": "0.01",
+    "perception.max_age_s": "0.2",
+    "perception.motion_compensation": "false",
+    "perception.join": "average",
+    "perception.score_threshold": "0.5",
+    "perception.cells_by": "norm",
+    "perception.unsent_cells": "zero",
+}
+
+
+@pytest.mark.parametrize("path", CHANGED)
+def test_a_field_that_is_left_out_changes_no_trace(path: str) -> None:
+    base, changed = (example("fleet.drones=2", "duration_s=3", *set_) for set_ in ((), (f"{path}={CHANGED[path]}",)))
+    assert base != changed
+    assert path in left_out(changed)
+    for one, other in zip(traces(base), traces(changed), strict=True):
+        assert (one.t_s, one.published, one.aloft, one.events) == (
+            other.t_s,
+            other.published,
+            other.aloft,
+            other.events,
+        )
+
+
+def test_the_command_prints_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "traces", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    done = CliRunner().invoke(app, ["live", "--set", "record.views=true"])
+    assert "a live flight does not use perception.detector, record.views" in done.stderr.replace("\n", " ")
