@@ -48,9 +48,9 @@ class Sighting(NamedTuple):
 
 def found_probability(distance_m: Floats | float, camera: Thermal) -> Floats:
     """The probability of finding an unhidden person at a distance from the camera, any shape."""
-    return np.asarray(
-        camera.near_probability / (1.0 + np.exp((np.asarray(distance_m) - camera.half_range_m) / camera.range_width_m))
-    )
+    with np.errstate(over="ignore"):  # far beyond the range of a sharp camera the probability is 0
+        beyond = np.exp((np.asarray(distance_m) - camera.half_range_m) / camera.range_width_m)
+    return np.asarray(camera.near_probability / (1.0 + beyond))
 
 
 def in_cone(xy_m: Floats, position_m: Sequence[float] | Floats, camera: Thermal) -> NDArray[np.bool_]:

@@ -10,12 +10,11 @@ from typing import Annotated, Any
 import typer
 
 import sortie
-from sortie.policies.contract import PolicyError
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import load_conditions
 from sortie.sim.cli.conditions import compare_conditions, refuse
 from sortie.sim.cli.console import bars, out
-from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded
+from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, split_policies
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 from sortie.sim.studies.compare import Flown, chosen_seeds
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
@@ -59,11 +58,11 @@ def compare(
         refuse(
             {"seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "readme": readme}
         )
-        named = list(POLICIES) if policies == "all" else _split_policies(policies)
+        named = list(POLICIES) if policies == "all" else split_policies(policies)
         return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
-    labels = _split_policies(policies)
+    labels = split_policies(policies)
     base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
     chosen = chosen_seeds(base, seed, seeds)
     ensure_files(out_file, recording)
@@ -96,20 +95,3 @@ def _plain(compared: sortie.Comparison) -> dict[str, Any]:
     ]
     gains = [{k: None if v != v else v for k, v in asdict(gain).items()} for gain in compared.gains]  # NaN: no interval
     return {"gains": gains, "sorties": sorties}
-
-
-def _split_policies(text: str) -> list[str]:
-    """Split at commas outside brackets."""
-    names, depth = [""], 0
-    for letter in text:
-        depth += (letter == "(") - (letter == ")")
-        if letter == "," and depth == 0:
-            names.append("")
-        else:
-            names[-1] += letter
-    cleaned = [n.strip() for n in names if n.strip()]
-    if not cleaned:
-        raise PolicyError("no policy named, as in --policies worked,all-4,silence")
-    if len(set(cleaned)) < len(cleaned):
-        raise PolicyError(f"a policy is named twice: {', '.join(cleaned)}")
-    return cleaned

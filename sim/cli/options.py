@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.console import err
@@ -36,3 +37,24 @@ def loaded(scenario: str, set_: list[str] | None, policy: str | None) -> Scenari
             f"{policy} flies to the end: the changes and commands of {own.name} are its own policy's", soft_wrap=True
         )
     return flown
+
+
+def split_policies(text: str) -> list[str]:
+    """Policies separated by commas; commas in brackets separate parameters.
+
+    Raises:
+        PolicyError: none is named, or one is named twice.
+    """
+    names, depth = [""], 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if letter == "," and depth == 0:
+            names.append("")
+        else:
+            names[-1] += letter
+    cleaned = [n.strip() for n in names if n.strip()]
+    if not cleaned:
+        raise PolicyError("no policy named, as in --policies worked,all-4,silence")
+    if len(set(cleaned)) < len(cleaned):
+        raise PolicyError(f"a policy is named twice: {', '.join(cleaned)}")
+    return cleaned

@@ -26,6 +26,7 @@ from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sortie.sim.cli.console import bars, err, out
+from sortie.sim.cli.options import split_policies
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
 from sortie.sim.studies.plane_cost import machine
@@ -67,7 +68,9 @@ def verify(
 
 
 def overhead(
-    policies: Annotated[str, typer.Option(help="Policies, separated by commas.")] = "worked",
+    policies: Annotated[
+        str, typer.Option(help="Policies, separated by commas: worked,best-2(received_budget=0.1).")
+    ] = "worked",
     drones: Annotated[str, typer.Option(help="Fleet sizes, separated by commas.")] = "5,25,100",
     seconds: Annotated[float, typer.Option(help="Length of each flight, s, without a detector.", min=1)] = SECONDS,
 ) -> None:
@@ -86,12 +89,12 @@ def overhead(
         "99th percentile",
     )
     table = Table(*columns, title=f"{SCENARIO}, {seconds:g} s")
-    for name in policies.split(","):
+    for name in split_policies(policies):
         for n in sizes:
             with bars() as bar:
-                row = measure(name.strip(), n, seconds, progress=bar(f"{name}, {n} drones", seconds))
+                row = measure(name, n, seconds, progress=bar(f"{name}, {n} drones", seconds))
             table.add_row(
-                row.policy, f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
+                escape(row.policy), f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
                 f"{row.context_share:.2%}", f"{row.p50_ms:.4f}", f"{row.p99_ms:.4f}",
             )  # fmt: skip
     out.print(table)

@@ -13,6 +13,7 @@ from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.outcome import outcome
 
 SCENARIO = "search_grid"
@@ -49,8 +50,8 @@ def measure(
     Raises:
         PolicyError: an unknown policy.
     """
-    sets = ["perception.detector=none", f"fleet.drones={drones}", f"duration_s={seconds}", f"policy.name={policy}"]
-    scenario = load(SCENARIO, [*sets, "policy.params={}"] if policy != "worked" else sets)
+    sets = ["perception.detector=none", f"fleet.drones={drones}", f"duration_s={seconds}"]
+    scenario = load(SCENARIO, [*sets, *policy_overrides(policy, load(SCENARIO).policy.name)])
     decide = resolve(scenario.policy.name, scenario.policy.params)
     took_ns: list[int] = []
 

@@ -130,7 +130,7 @@ def _parts(replayed: Replay) -> Iterable[Table | str]:
     from rich.table import Table
 
     differences = replayed.differences
-    total = Table(title=f"{replayed.policy} over the views of {replayed.flown}", show_header=False)
+    total = Table(title=escape(f"{replayed.policy} over the views of {replayed.flown}"), show_header=False)
     total.add_column(style="bold")
     total.add_column()
     total.add_row("decisions", f"{replayed.decisions}, for {replayed.directives} links in all")

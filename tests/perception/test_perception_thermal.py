@@ -64,3 +64,7 @@ def test_a_walker_waits_walks_and_stays() -> None:
     walkers = Walkers([Person(waypoints_m=((0.0, 0.0), (0.0, 14.0)), begin_s=5.0)])
     at = [tuple(walkers.at(t_s)[0]) for t_s in (0.0, 5.0, 10.0, 99.0)]
     assert at == [(0, 0), (0, 0), (0, pytest.approx(7.0)), (0, 14)]
+
+
+def test_far_beyond_a_sharp_range_nobody_is_found_and_nothing_overflows() -> None:
+    assert float(found_probability(1000.0, Thermal(range_width_m=0.1))) == 0.0

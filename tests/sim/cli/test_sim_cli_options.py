@@ -115,3 +115,14 @@ def test_a_study_replaces_no_file_that_it_did_not_write(tmp_path: Path, capsys: 
     said = capsys.readouterr().err
     assert said == f"error: {out}: holds notes.txt, which no report wrote; choose another folder or move it\n"
     assert (out / "notes.txt").read_text() == "notes.txt"
+
+
+def test_the_overhead_of_a_policy_with_parameters(capsys: pytest.CaptureFixture[str]) -> None:
+    """It was split at the comma within the brackets, and parameters were no part of a policy."""
+    assert (
+        command("overhead", "--policies", "best-2(received_budget=0.1, k=1),silence", "--drones", "2", "--seconds", "1")
+        == 0
+    )
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "best-2" in printed
+    assert "silence" in printed

@@ -99,7 +99,7 @@ def test_a_difference_says_where_in_what_and_why(run: sortie.Run) -> None:
             for d in worked(view, rho=0.25)
         ]
 
-    hasty.__qualname__ = "hasty"
+    hasty.__qualname__ = "hasty[old]"
     again = sortie.replay(run, hasty)
     assert not again.same
     assert {(d.drone, d.peer, d.fields, d.replayed_reason) for d in again.differences} == {
@@ -113,7 +113,7 @@ def test_a_difference_says_where_in_what_and_why(run: sortie.Run) -> None:
     assert [(s.begin, s.decisions) for s in again.spans] == [(first, 20)]
     assert again.table.num_rows == len(again.differences) == 20
     text = str(again.summary())
-    assert "hasty over the views of" in text
+    assert "hasty[old] over the views of" in text  # brackets are no markup
     assert "1→0" in text
     assert "The recorded world does not answer" in text
 
