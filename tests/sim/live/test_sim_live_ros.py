@@ -151,6 +151,29 @@ def test_a_node_with_wrong_parameters_says_so(nodes: ModuleType, tmp_path: Path)
         assert str(error.value) == text
 
 
+def test_the_benchmark_node_with_wrong_parameters_says_so(nodes: ModuleType) -> None:
+    """It ended in a traceback, and ROS was not shut down."""
+    ros.PARAMETERS.clear()
+    ros.PARAMETERS.update(scenario="none-such")
+    with pytest.raises(SystemExit) as stop:
+        nodes.benchmark()
+    assert stop.value.code == 1
+    assert not ros.ok()
+
+
+def test_a_publisher_logs_what_it_does_not_use(nodes: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nodes, "RoleNode", lambda *_: None)
+    changes = "context.authentication=false;record.views=true;perception.detector=none;expect=[];expect_decisions=[];events=[]"
+    logged = {}
+    for role in (Role.PUBLISHER, Role.GATE):
+        ros.PARAMETERS.clear()
+        ros.PARAMETERS.update(set=changes)
+        node = ros.Node("any")
+        nodes.make(role, node)
+        logged[role] = [line for line in node.logger.lines if "does not use" in line]
+    assert logged == {Role.PUBLISHER: ["a live flight does not use record.views"], Role.GATE: []}
+
+
 def test_each_drone_gets_its_own_secrets(nodes: ModuleType, tmp_path: Path) -> None:
     keys = importlib.import_module("sortie_ros.keys")
     (tmp_path / "master").write_text(MASTER.hex())

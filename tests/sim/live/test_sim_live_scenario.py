@@ -26,7 +26,7 @@ from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, run_sortie
 from sortie.sim.export.topics import CONTEXT
 from sortie.sim.live import session
-from sortie.sim.live.context import ReplaySenses, Trace, traces
+from sortie.sim.live.context import ReplaySenses, Trace, traces, unflown
 from sortie.sim.live.node import LiveNode
 from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.policy_process import Begin, PolicyOrders
@@ -161,6 +161,20 @@ def test_a_drone_on_the_ground_hears_nothing() -> None:
     bus.writer(CONTEXT).write(encode_descriptor(descriptor))
     node.take()
     assert memory.peers == [0]
+
+
+def test_a_drone_that_does_not_know_where_it_is_shakes_no_hands() -> None:
+    bus, scenario = MemoryBus(), example("fleet.drones=2")
+    node = LiveNode(bus, Seals(None), 1, 2, seed=0)
+    rules = rules_of(scenario, 0.0, 6.0)
+    node.fly(Fixed(), PeerMemory(1, rules, DroneStatus()), rules, lambda: (1.0,))  # type: ignore[arg-type]
+    capture = ReplaySenses(scenario, 1, unflown(scenario, 1), 0.0).sense(0).capture
+    sent = []
+    for muted in (True, False):
+        node.is_muted = lambda muted=muted: muted  # type: ignore[misc]
+        node.handshake(0, 10, capture, 0.1)
+        sent.append(sum(map(len, bus.written.values())))
+    assert sent == [0, 1]
 
 
 # --- clocks, lies, people ------------------------------------------------------------------------------
