@@ -177,7 +177,11 @@ def test_a_fleet_flies_with_a_vehicle_and_notices_that_it_falls_silent() -> None
 # --- signed telemetry ------------------------------------------------------------------------------------
 
 KEY = bytes(range(32))
-NOW_US = time.time_ns() // 1000
+
+
+def signed(key: bytes | None = KEY, ahead_us: int = 0) -> Transmitter:
+    """A vehicle that signs from now on."""
+    return Transmitter(0, key, time.time_ns() // 1000 + ahead_us)
 
 
 def frames(transmitter: Transmitter, t_s: float = 3.0) -> list[bytes]:
@@ -188,30 +192,30 @@ def frames(transmitter: Transmitter, t_s: float = 3.0) -> list[bytes]:
 @pytest.mark.parametrize("key", [None, bytes(32)], ids=["unsigned", "another key"])
 def test_telemetry_without_a_valid_signature_is_refused_and_counted(key: bytes | None) -> None:
     listener = Listener(KEY)
-    wrong = frames(Transmitter(0, key, NOW_US))
+    wrong = frames(signed(key))
     assert [m for frame in wrong for m in listener.heard(frame)] == []
     assert listener.refused == len(wrong)
-    good = frames(Transmitter(0, KEY, NOW_US))
+    good = frames(signed())
     assert len([m for frame in good for m in listener.heard(frame)]) == len(good)
     assert [m for frame in good for m in listener.heard(frame)] == []  # a repetition
     assert listener.refused == len(wrong) + len(good)
-    old = frames(Transmitter(0, KEY, NOW_US - 3_600_000_000))  # recorded an hour ago
+    old = frames(signed(ahead_us=-3_600_000_000))  # recorded an hour ago
     assert [m for frame in old for m in Listener(KEY).heard(frame)] == []
 
 
 def test_a_stranger_s_frame_from_the_future_locks_no_vehicle_out() -> None:
     """pymavlink keeps the time of a frame before it looks at its signature."""
-    listener, vehicle = Listener(KEY), Transmitter(0, KEY, NOW_US)
+    listener, vehicle = Listener(KEY), signed()
     listener.heard(frames(vehicle)[0])
-    (forged, *_) = frames(Transmitter(0, bytes(32), NOW_US + 10**12))
+    (forged, *_) = frames(signed(bytes(32), 10**12))
     assert listener.heard(forged) == []
     assert len(listener.heard(frames(vehicle)[0])) == 1
 
 
 def test_without_a_key_signatures_are_not_checked() -> None:
     listener = Listener()
-    signed = frames(Transmitter(0, KEY, NOW_US))
-    assert len([m for frame in signed for m in listener.heard(frame)]) == len(signed)
+    good = frames(signed())
+    assert len([m for frame in good for m in listener.heard(frame)]) == len(good)
     assert listener.refused == 0
 
 
