@@ -16,6 +16,7 @@ from sortie.fleet.messages.wire import decode_descriptor, decode_directive, enco
 from sortie.policies.contract import Representation
 from sortie.scenarios.schema import Scenario
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
+from sortie.sim.live import roles
 from sortie.sim.live.node import Role
 from sortie.sim.live.roles import RoleNode, RoleOrders
 from sortie.sim.live.seals import Seals
@@ -125,7 +126,7 @@ def test_a_publisher_with_a_vehicle_publishes_its_charge(
     bus: MemoryBus, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It failed at its first descriptor: nothing was replayed for its headrooms."""
-    monkeypatch.setattr("sortie.sim.live.roles.traces", lambda scenario: short_traces(scenario))
+    monkeypatch.setattr(roles, "traces", short_traces)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -146,7 +147,7 @@ def test_a_publisher_is_in_the_fleet_when_the_scenario_says(
     now_s = [1_700_000_000.0]
     for name in ("time", "monotonic"):
         monkeypatch.setattr(time, name, lambda: now_s[0])
-    monkeypatch.setattr("sortie.sim.live.roles.traces", lambda scenario: short_traces(scenario))
+    monkeypatch.setattr(roles, "traces", short_traces)
     spaces = "fleet.makes=[{name: a, drones: [0], feature_space: mine}]"
     events = "events=[{kind: drone_lost, at_s: 1.5, drone: 0}, {kind: drone_joins, at_s: 2.5, drone: 0}, {kind: clock_skew, at_s: 2.6, drone: 0, skew_s: 9}]"
     node = make(Role.PUBLISHER, flying(spaces=spaces, events=events))
