@@ -87,7 +87,9 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     """
     perception = scenario.perception.model_copy(update={"detector": "none"})
     honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
-    flown = scenario.model_copy(update={"perception": perception, "events": honest})
+    # a roster would shorten the goodputs to those of its members; the live drone makes its own
+    context = scenario.context.model_copy(update={"roster": False})
+    flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
     parts = build(flown, plan_for(flown), flown.seed)
     bounds = route_bounds(parts.world.motion)
     fly(parts, progress)

@@ -36,6 +36,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         roster=scenario.context.roster,
         makes=equipment_of(scenario),
         people=scenario.perception.thermal is not None,
+        classes=len(scenario.perception.classes) > 1,
     )
 
 

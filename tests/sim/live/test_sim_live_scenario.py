@@ -139,6 +139,12 @@ def test_a_drone_that_never_flies_has_senses() -> None:
     assert 0 <= senses.platform().soc <= 1
 
 
+def test_what_is_replayed_has_a_goodput_for_every_drone_whatever_rosters_say() -> None:
+    scenario = example("fleet.drones=3", "context.roster=true", "events=[{kind: drone_joins, at_s: 3, drone: 0}]")
+    trace = traces(scenario)[2]
+    assert {len(p.goodput_mbps) for p in trace.published} == {2}
+
+
 class Fixed:
     """A clock that stands."""
 
@@ -271,7 +277,7 @@ def test_what_a_flight_leaves_out_is_named_in_one_line() -> None:
 
 
 USED = {
-    "context": {"rate_hz", "degraded_after_periods", "detached_after_periods", "authentication", "publish_every", "trust"},
+    "context": {"rate_hz", "degraded_after_periods", "detached_after_periods", "authentication", "publish_every", "trust", "roster"},
     "perception": {"tracking_rate_hz", "compute_delay_s", "people", "thermal", "scene"},
     "policy": {"name", "params", "dwell_s", "hysteresis", "changes", "commands", "invariants", "of_makes", "shield"},
     "record": set(),
