@@ -213,4 +213,4 @@ def test_launch_files_start_the_nodes_of_the_package(nodes: ModuleType) -> None:
 def test_the_manifest_names_what_the_nodes_import() -> None:
     tree = ElementTree.parse(PACKAGE / "package.xml")  # noqa: S314 - a file of this repository
     assert {d.text for d in tree.iter("exec_depend")} == {"rclpy", "launch", "launch_ros", "sortie_msgs", "std_msgs"}
-    assert "ROS 2 was not at hand" in (PACKAGE / "README.md").read_text("utf-8")
+    assert "This package was written without ROS 2" in (PACKAGE / "README.md").read_text("utf-8")
