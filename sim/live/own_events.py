@@ -20,7 +20,8 @@ from sortie.sim.live.context import Trace
 
 def status_of(scenario: Scenario, drone: int, zero_s: float) -> DroneStatus:
     """A live drone's status; a perfect clock shows `zero_s` at the scenario's time 0."""
-    return DroneStatus(scenario.fleet.feature_spaces[drone], clock_skew_s=zero_s)
+    looks = not scenario.context_only[drone]
+    return DroneStatus(scenario.feature_spaces[drone], looks=looks, clock_skew_s=zero_s)
 
 
 class OwnEvents:
