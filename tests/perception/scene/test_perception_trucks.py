@@ -6,15 +6,16 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from perception_examples import EMPTY, capture
 
 from sortie.perception.classes import CAR, PERSON_SIZE_M, TRUCK_FROM_M
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.scene.behind_trucks import behind
-from sortie.perception.scene.height_field import CAR_TOP_M, HeightField
+from sortie.perception.scene.height_field import CAR_TOP_M, TRUCK_TOP_M, HeightField
 from sortie.perception.scene.render import CAMERAS, Renderer, Window
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.scene.town import Town
+from sortie.perception.scene.town import Floats, Town
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
@@ -96,10 +97,10 @@ def test_a_thermal_camera_does_not_see_a_person_behind_a_truck() -> None:
     assert look(*frame, truck()) == []
 
 
-def test_trucks_hide_cars_from_the_surrogate_and_are_seen_over_hedges() -> None:
-    """Of cars the share that is seen falls where trucks drive; of trucks it is not less than of cars in their place."""
+def test_trucks_hide_cars_from_the_surrogate() -> None:
+    """Of cars the share that is seen falls where trucks drive. A truck is not hidden by its own body."""
     captures = CaptureColumns.of([capture(10.0 * k, 5.0, t_s=1.0 + k, drone=k) for k in range(5)])
-    dense, bare = (dict(building_density=d, tree_density=d) for d in (0.6, 0.0))
+    bare = dict(building_density=0.0, tree_density=0.0)
 
     def seen(trucks: float, scene: dict[str, float]) -> tuple[float, float]:
         eyes = Eyes(model(trucks, **scene))
@@ -110,7 +111,25 @@ def test_trucks_hide_cars_from_the_surrogate_and_are_seen_over_hedges() -> None:
     assert seen(0.0, bare)[0] == 1.0
     assert 0.9 < seen(0.4, bare)[0] < 0.999
     assert seen(0.4, bare)[1] == 1.0
-    assert seen(1.0, dense)[1] > seen(0.0, dense)[0]
+
+
+def test_of_a_truck_a_higher_top_has_to_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three points of each truck are looked at. More is hidden of low points than of high ones."""
+    eyes, captures = Eyes(model(0.5)), CaptureColumns.of([capture(10.0, 5.0)])
+    judged: dict[float, int] = {}
+    seen = HeightField.seen
+
+    def counted(self: HeightField, x: Floats, y: Floats, eye: Floats, top_m: float = CAR_TOP_M) -> NDArray[np.bool_]:
+        judged[top_m] = judged.get(top_m, 0) + len(x)
+        return seen(self, x, y, eye, top_m)
+
+    monkeypatch.setattr(HeightField, "seen", counted)
+    looks = eyes.look(captures)
+    assert judged[TRUCK_TOP_M] == 3 * eyes.traffic.truck[looks.car].sum() > 0
+    field, at = HeightField(Town(Scene()), AREA), np.random.default_rng(0).uniform(-90, 90, (2, 4000))
+    eye = np.tile([0.0, 0.0, 60.0], (4000, 1))
+    low, high = (seen(field, *at, eye, top_m) for top_m in (CAR_TOP_M, TRUCK_TOP_M))
+    assert high.sum() > low.sum() + 20
 
 
 # --- how they look ---------------------------------------------------------------------------------
