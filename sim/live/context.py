@@ -151,8 +151,8 @@ class ReplaySenses:
     def __init__(self, scenario: Scenario, drone: int, trace: Trace, begin_s: float) -> None:
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, trace.bounds, mission.more_targets)
-        self._cameras = cameras_of(scenario.fleet)
-        self._flight = FlightSenses(trace.motion, scenario.frame_s, self._scene.height_field, self._cameras)
+        self._cameras = cameras_of(scenario.fleet)[drone]
+        self._flight = FlightSenses(trace.motion, scenario.frame_s, self._scene.height_field, [self._cameras])
         self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace
@@ -179,7 +179,7 @@ class ReplaySenses:
     @property
     def cameras(self) -> Cameras:
         """The drone's."""
-        return self._cameras[self._drone]
+        return self._cameras
 
     def platform(self) -> Platform:
         """Charge and headrooms."""
