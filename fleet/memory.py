@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 from typing import NamedTuple
 
 from sortie.fleet.clock import PeerClocks
@@ -136,7 +137,8 @@ class PeerMemory:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
-        return FleetView(self.drone, self._period_s, known, self.ages_s(now_s), self._rules.detached_after_periods)
+        frozen, ages_s = MappingProxyType(known), MappingProxyType(self.ages_s(now_s))
+        return FleetView(self.drone, self._period_s, frozen, ages_s, self._rules.detached_after_periods)
 
     def believed(self) -> list[Descriptor]:
         """The latest descriptors of the peers that it does not doubt."""

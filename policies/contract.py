@@ -18,6 +18,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from sortie.scenarios.disc import AGENT_IDS as AGENT_IDS  # policies import this and the next two from here
@@ -165,7 +166,8 @@ def goodput_in(known: tuple[float, ...], me: int, roster: Roster | None, peer: i
 class FleetView(NamedTuple):
     """A policy's input: the latest descriptor of every drone heard so far, of whatever age.
 
-    `descriptors` and `age_s` have the same keys. The ego is one of them.
+    `descriptors` and `age_s` have the same keys. The ego is one of them. In flight both can be read only: whatever a
+    policy did to them would reach the staleness rules and the record.
     """
 
     ego: int
@@ -174,6 +176,21 @@ class FleetView(NamedTuple):
     age_s: Mapping[int, float]
     detached_after_periods: float = DETACHED_AFTER_PERIODS
     """A peer whose descriptor is older than this is detached: nothing reaches it, and nothing comes from it."""
+
+    @property
+    def frozen(self) -> FleetView:
+        """The same view with mappings that can be read only.
+
+        Example:
+            >>> FleetView(0, 0.1, {}, {0: 0.0}).frozen.age_s[0] = 1.0
+            Traceback (most recent call last):
+            TypeError: 'mappingproxy' object does not support item assignment
+        """
+        return self._replace(descriptors=MappingProxyType(self.descriptors), age_s=MappingProxyType(self.age_s))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A view that can be read only is copied, and goes to another process, as one with plain mappings."""
+        return FleetView, (self.ego, self.period_s, dict(self.descriptors), dict(self.age_s), self[-1])
 
     @property
     def me(self) -> Descriptor | None:
@@ -418,6 +435,7 @@ def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
                 and duty_percent.__class__ is int
                 and 0 <= duty_percent <= _MAX_DUTY
                 and reason.__class__ is str
+                and (reason.isascii() or _reason_fault(reason) is None)
             ):
                 return False
             if roi is not sound_roi and roi is not None:
@@ -449,8 +467,8 @@ def check_reposition(request: object, view: FleetView) -> None:
     where, me = f"reposition of drone {view.ego}", view.me
     if me is None:
         raise PolicyError(f"{where}: the view has no descriptor of it, must be None")
-    if not isinstance(request.reason, str):
-        raise PolicyError(f"{where}: reason is {request.reason!r}, must be text")
+    if fault := _reason_fault(request.reason):
+        raise PolicyError(f"{where}: {fault}")
     away_m = []
     for name, value, here_m in (("x_m", request.x_m, me.position_m[0]), ("y_m", request.y_m, me.position_m[1])):
         try:
@@ -479,9 +497,8 @@ def find_wrong_type(d: object) -> str | None:
     for name, value in () if d.roi is None else d.roi._asdict().items():
         if not _compares(value, -_FAR_M, _FAR_M):
             return f"{where}: roi.{name} is {value!r}, must be a number"
-    if not isinstance(d.reason, str):
-        return f"{where}: reason is {d.reason!r}, must be text"
-    return None
+    fault = _reason_fault(d.reason)
+    return f"{where}: {fault}" if fault else None
 
 
 def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
@@ -514,6 +531,17 @@ def _compares(value: Any, low: float, high: float) -> bool:
     except Exception:  # whatever a foreign type raises
         return False
     return True
+
+
+def _reason_fault(reason: object) -> str | None:
+    """Why a reason cannot stand in the record; None if it can."""
+    if not isinstance(reason, str):
+        return f"reason is {reason!r}, must be text"
+    try:
+        reason.encode()
+    except UnicodeEncodeError:  # half of a surrogate pair
+        return f"reason is {reason!r}, must be text that UTF-8 can write"
+    return None
 
 
 def _is_whole(value: Any) -> bool:

@@ -18,6 +18,7 @@ from sortie.policies.catalogue.prior import METHODS, STAND_IN
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
+from sortie.policies.user_calls import LOAD_S, Guarded, guarded, watched
 from sortie.policies.user_code import imported_files, is_users, load
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
@@ -109,7 +110,8 @@ def describe_error(error: Exception) -> str:
     frames = traceback.walk_tb(error.__traceback__)
     lines = [(f.f_code.co_filename, n) for f, n in frames if is_users(f.f_globals.get("__name__"))]
     place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
-    return f"{type(error).__name__}: {error}{place}"
+    text = f"{type(error).__name__}: {error}{place}"
+    return text.encode(errors="backslashreplace").decode()  # a table and a terminal take no half of a surrogate pair
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
@@ -133,7 +135,10 @@ def own_fusion(name: str) -> str | None:
 def viewpoint_of(policy: Policy) -> Viewpoint | None:
     """The function by which a policy chooses where to look from, with its parameters bound; None if it has none."""
     bound = policy.keywords if isinstance(policy, functools.partial) else {}
-    found = getattr(policy.func if isinstance(policy, functools.partial) else policy, "viewpoint", None)
+    function = policy.func if isinstance(policy, functools.partial) else policy
+    found = getattr(function, "viewpoint", None)
+    if found is not None and isinstance(function, Guarded):
+        found = guarded(found)
     shared = {k: v for k, v in bound.items() if k in parameters(found)} if found is not None else {}
     return functools.partial(found, **shared) if found is not None and shared else found
 
@@ -171,7 +176,8 @@ def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
     path, attribute = _file_of(reference)
     file = str(path)
     try:
-        module = load(path)
+        with watched(LOAD_S):
+            module = Guarded(load)(path)
     except Exception as error:
         raise PolicyError(f"policy file {file!r} does not load: {describe_error(error)}") from error
     function = getattr(module, attribute, None)
@@ -183,4 +189,4 @@ def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
         raise PolicyError(
             f"policy file {file!r}: {attribute!r} names no parameters, must be a Python function"
         ) from error
-    return function  # type: ignore[no-any-return]
+    return guarded(function)

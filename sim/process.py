@@ -2,10 +2,16 @@
 
 import gc
 
+from sortie.policies.user_calls import end_when_stuck
+
 ALLOCATIONS = 200_000
 """Net allocations between two looks for reference cycles; Python's own 700 cost a flight of twenty drones a tenth."""
 
 
-def collect_rarely() -> None:
-    """Have the garbage collector run rarely. Libraries must not call this: it changes the whole process."""
+def own_process() -> None:
+    """Have the garbage collector run rarely, and let a policy that cannot be interrupted end the process.
+
+    Libraries must not call this: it changes the whole process.
+    """
     gc.set_threshold(ALLOCATIONS)
+    end_when_stuck()

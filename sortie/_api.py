@@ -331,7 +331,7 @@ def campaign(
     Args:
         campaign: a campaign file, or a library campaign's name.
         out: its folder; None takes `runs/campaign-NAME`.
-        workers: worker processes; 0 flies in this process, None takes one a core. A script that asks for workers keeps
+        workers: worker processes; 0 flies in this process, or in one other for policies in files of one's own. None takes one a core. A script that asks for workers keeps
             its calls under `if __name__ == "__main__":`, since each worker imports the script.
         scheduler: the address of a dask cluster that is running, `tcp://host:8786`.
         resume: only go on; an error if there is nothing to go on with.
@@ -363,7 +363,7 @@ def campaign(
     with user_errors():
         plan = make_plan(study)
         ensure_usable(folder, plan)
-        with open_engine(count, scheduler) as engine:
+        with open_engine(count, scheduler, plan.user_code) as engine:
             watch = (lambda p: None) if progress is None else progress
             done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch)
     return CampaignResult(folder, done.finished, done.failed, done.flown, done.seconds)

@@ -18,6 +18,7 @@ import types
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar, cast
 
+from sortie.policies.user_calls import Guarded, guarded
 from sortie.policies.user_code import is_users
 
 Decides = TypeVar("Decides", bound=Callable[..., Any])
@@ -115,6 +116,8 @@ class _Rebuilding:
 
     def function(self, found: Any) -> Callable[..., Any]:
         """A copy of a callable with confined globals."""
+        if isinstance(found, Guarded):
+            return guarded(self.function(found.__wrapped__))
         if hasattr(found, "cache_info"):  # the result of a cached function depends on its arguments alone
             found = found.__wrapped__
         if isinstance(found, functools.partial):
@@ -198,7 +201,9 @@ def uses_builtin(policy: Callable[..., Any], builtin: object) -> bool:
         if id(value) in met:
             continue
         met[id(value)] = value
-        if isinstance(value, functools.partial):
+        if isinstance(value, Guarded):
+            waiting.append(value.__wrapped__)
+        elif isinstance(value, functools.partial):
             waiting += [value.func, *value.args, *value.keywords.values()]
         elif isinstance(value, types.MethodType):
             waiting += [value.__func__, value.__self__]

@@ -36,6 +36,7 @@ from sortie.scenarios.schema.fleet import (
     Route,
     Viewpoints,
 )
+from sortie.scenarios.schema.limits import Limits
 from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
 from sortie.scenarios.schema.perception import Perception, Person, Scene, Thermal
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
@@ -70,6 +71,7 @@ __all__ = [
     "Jam",
     "json_schema",
     "Lie",
+    "Limits",
     "LinkDrop",
     "MIN_TILE_BYTES",
     "Mission",

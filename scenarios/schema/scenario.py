@@ -14,6 +14,7 @@ from sortie.scenarios.schema.context import Context
 from sortie.scenarios.schema.events import BaseEvent, Event, LinkDrop
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Camera, Fleet, Make, Network
+from sortie.scenarios.schema.limits import Limits
 from sortie.scenarios.schema.mission import Mission
 from sortie.scenarios.schema.perception import Perception
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
@@ -39,6 +40,7 @@ class Scenario(Section):
     perception: Perception = Perception()
     policy: PolicySection = PolicySection()
     record: RecordSection = RecordSection()
+    limits: Limits = Limits()
     events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
     expect: tuple[Expectation, ...] = Field(
         (), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`."

@@ -1,4 +1,4 @@
-"""Where runs are flown: in this process, on a local cluster, or on a cluster that is already running.
+"""Where runs are flown: in this process or one other, on a local cluster, or on a cluster that is already running.
 
 An engine takes tasks as it can use them and gives results as they come; it never holds more than what is in flight.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import json
 import logging
 import signal
 import threading
@@ -18,7 +17,8 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
-from sortie.sim.campaign.work import RunResult, Task, fly_batch, fly_in_worker, task_key
+from sortie.sim.campaign.one_process import OneProcess
+from sortie.sim.campaign.work import RunResult, Task, fly_batch, fly_in_worker, killed
 from sortie.sim.folders import RunError
 
 BATCH_S = 1.0
@@ -107,7 +107,7 @@ class Dask:
                     submit([task])
             else:
                 fill()
-                yield [_killer(batch[0], code)]
+                yield [killed(batch[0], code)]
 
     def _batch(self) -> int:
         if self._seconds_per_run is None:
@@ -119,22 +119,24 @@ class Dask:
         self._seconds_per_run = seconds if known is None else 0.8 * known + 0.2 * seconds
 
 
-def _killer(task: Task, code: str) -> RunResult:
-    """The row of a run that no worker survived."""
-    run, text = task
-    nothing = (None,) * len(json.loads(text)["metrics"])
-    return RunResult(run, task_key(text, code), "failed", "WorkerDied: on every attempt", "", nothing)
-
-
 @contextmanager
-def open_engine(workers: int = 0, scheduler: str | None = None) -> Iterator[Engine]:
+def open_engine(workers: int = 0, scheduler: str | None = None, user_code: bool = False) -> Iterator[Engine]:
     """An engine: `scheduler` joins a running cluster, `workers` > 0 starts a local one, 0 flies here.
+
+    With `user_code`, nothing flies here: 0 starts one process, without dask.
 
     Raises:
         RunError: dask.distributed is missing, or there is no scheduler at that address.
     """
     if scheduler is None and workers == 0:
-        yield InProcess()
+        if not user_code:
+            yield InProcess()
+            return
+        one = OneProcess(_undisturbed)
+        try:
+            yield one
+        finally:
+            one.close()
         return
     try:
         import dask

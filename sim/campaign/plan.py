@@ -140,6 +140,11 @@ class CampaignPlan:
     def _base(self) -> Any:
         return as_node(self.spec["base"])
 
+    @property
+    def user_code(self) -> bool:
+        """Whether policies of a user's own fly."""
+        return any(path.endswith(".py") for path in self.spec["files"])
+
     def task(self, run: int) -> str:
         """What the worker receives."""
         at = self.at(run)

@@ -23,7 +23,7 @@ from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version, file_digest
-from sortie.sim.process import collect_rarely
+from sortie.sim.process import own_process
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
@@ -74,7 +74,7 @@ def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]
 
 def fly_in_worker(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
     """`fly_batch`, in a process that is the campaign's alone."""
-    collect_rarely()
+    own_process()
     keep_freed()  # dask's nanny has its workers give back every 64 KiB, which costs a third of a run
     return fly_batch(code, tasks)
 
@@ -111,6 +111,24 @@ def _fly(run: int, task: str, code: str) -> RunResult:
     except Exception as error:  # whatever it is, the other runs go on
         return RunResult(run, key, "failed", _in_one_line(error), "", (None,) * len(fields["metrics"]))
     return RunResult(run, key, "done", "", record.fingerprint[:16], values)
+
+
+def killed(task: Task, code: str) -> RunResult:
+    """The row of a run that no worker survived."""
+    return _without_result(task, code, "WorkerDied: on every attempt")
+
+
+def stuck(task: Task, code: str) -> RunResult:
+    """The row of a run whose policy could not be interrupted."""
+    limit_s = json.loads(task[1])["scenario"]["limits"]["decision_s"]
+    what = f"no answer within {limit_s:g} s (limits.decision_s), and no interruption either"
+    return _without_result(task, code, f"TookTooLongError: {what}")
+
+
+def _without_result(task: Task, code: str, error: str) -> RunResult:
+    run, text = task
+    nothing = (None,) * len(json.loads(text)["metrics"])
+    return RunResult(run, task_key(text, code), "failed", error, "", nothing)
 
 
 def number(result: dict[str, Any], name: str) -> float | None:

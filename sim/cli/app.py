@@ -34,7 +34,7 @@ from sortie.sim.cli import (
 )
 from sortie.sim.cli.console import err, out
 from sortie.sim.identity import code_version
-from sortie.sim.process import collect_rarely
+from sortie.sim.process import own_process
 
 
 class _Commands(TyperGroup):
@@ -71,7 +71,7 @@ for name, command in COMMANDS.items():
 
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
-    collect_rarely()
+    own_process()
     try:
         app()
     except SortieError as error:

@@ -43,7 +43,10 @@ def run(
     campaign: Annotated[str, typer.Argument(help="A campaign file, or a library campaign's name.")],
     workers: Annotated[
         int | None,
-        typer.Option(help="Number of worker processes; 0 flies in this process; default: one per core.", min=0),
+        typer.Option(
+            help="Number of worker processes; 0 flies in this process, or in one other for your own policies; default: one per core.",
+            min=0,
+        ),
     ] = None,
     scheduler: Annotated[str | None, typer.Option(help="Use a running dask cluster: tcp://host:8786.")] = None,
     out_dir: Annotated[

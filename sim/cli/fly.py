@@ -79,22 +79,21 @@ def fly(
         own = _as_filed(_named(scenario), flown.policy.name)
     drawn, files = flown.seed if seed is None else seed, _own_files(flown)
     path = out_dir or run_folder.default_path(flown, drawn, number, own, files)
-    place = path.absolute()  # as it is now: a policy may change the working folder
     run_folder.ensure_writable(path)
     if not replace:
         run_folder.ensure_same(path, flown, drawn, number, files)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
-    other, note = run_folder.in_place_of(place, flight.fingerprint), ""
+    other, note = run_folder.in_place_of(path, flight.fingerprint), ""
     try:
-        flight.save(place, recording=recording, replace=replace)
+        flight.save(path, recording=recording, replace=replace)
         if other:
             note = f", in place of {other}"
     except run_folder.OtherRunError:  # it came meanwhile, or other code flew it: what was flown now is kept too
         note = f", as {path} holds {other or 'another run'}"
-        path, place = (run_folder.beside(p, flight.fingerprint) for p in (path, place))
-        flight.save(place, recording=recording)
+        path = run_folder.beside(path, flight.fingerprint)
+        flight.save(path, recording=recording)
     out.print(flight.summary())
     out.print(flight.decisions())
     report(flight.outcome)
@@ -104,7 +103,7 @@ def fly(
         same = "is" if flight.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")
     if view_:
-        view(place)
+        view(path)
 
 
 def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) -> Watchers:

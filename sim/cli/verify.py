@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from rich.table import Table
 
 from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
+from sortie.policies.user_calls import DECISION_S, watched
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
 from sortie.policies.verification.proof import PLANE, ProofVerdict, prove
@@ -57,11 +59,8 @@ def verify(
     decide = resolve(section.name, section.params)
     rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
-    try:
+    with watched(DECISION_S):
         broken = _try(policy, section, decide, rules, drones, views, out_dir)
-    except SystemExit as stop:  # or a policy that ends the program would pass
-        err.print(f"[red]{escape(policy)} ends the program (exit code {stop.code}), must return directives[/red]")
-        raise typer.Exit(1) from None
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
         raise typer.Exit(1)
@@ -143,7 +142,7 @@ def _section(policy: str) -> PolicySection:
 def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant, ...]:
     """From the file named, or the policy's own file, or what a registered policy promises."""
     inner: Any = decide.func if isinstance(decide, functools.partial) else decide
-    own = getattr(inner, "__globals__", {}).get(OWN_INVARIANTS) if ":" in name else PROMISES.get(name)
+    own = getattr(inspect.unwrap(inner), "__globals__", {}).get(OWN_INVARIANTS) if ":" in name else PROMISES.get(name)
     source = f"{name}: {OWN_INVARIANTS}" if file is None else str(file)
     try:
         text = (own or "") if file is None else file.read_text("utf-8")

@@ -29,6 +29,7 @@ from sortie.policies.contract import (
     check_reposition,
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
+from sortie.policies.user_calls import is_guarded
 from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.enforced import Cap, Steps, judge, put_right
 from sortie.policies.verification.invariants import (
@@ -76,6 +77,11 @@ class PolicyPlan(NamedTuple):
         }
 
     @property
+    def of_users(self) -> bool:
+        """Whether any of its policies is a user's own code."""
+        return any(is_guarded(policy.decide) for policy in self.policies.values())
+
+    @property
     def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
         return any(viewpoint_of(policy.decide) is not None for policy in self.policies.values())
@@ -95,7 +101,7 @@ def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyP
     commands = () if first is not None else tuple((c.at_s, c.command, c.drones) for c in section.commands)
     try:
         rules = parse(section.invariants)
-        replays = tuple((r.at_s, r.drone, from_json(r.view)) for r in section.replays)
+        replays = tuple((r.at_s, r.drone, from_json(r.view).frozen) for r in section.replays)
         if section.shield:
             check_shieldable(rules)
     except InvariantError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -25,9 +26,11 @@ from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, m
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
+from sortie.policies.user_calls import guarded, watched
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
@@ -62,6 +65,10 @@ class Observer(Protocol):
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
 
 
+class LimitError(SortieError):
+    """A flight that takes longer than it may."""
+
+
 DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
 """As `sortie.perception.detectors.Constructor`; None flies without."""
 
@@ -91,15 +98,30 @@ def run_sortie(
         The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
 
     Raises:
-        PolicyError: an unknown policy, or one that breaks its contract.
+        PolicyError: an unknown policy, or one that breaks its contract, fails, or takes longer than `limits.decision_s`.
+        LimitError: the flight takes longer than `limits.run_s`.
     """
     begin_s = time.perf_counter()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
+    limits, end_s = scenario.limits, begin_s + scenario.limits.run_s
+
+    def each_second(t_s: float) -> None:
+        if time.perf_counter() > end_s:
+            what = f"{scenario.name}, seed {seed}: the flight"
+            raise LimitError(f"{what} takes longer than {limits.run_s:g} s (limits.run_s), and is at {t_s:g} s")
+        if progress is not None:
+            progress(t_s)
+
     parts = build(scenario, policies, seed, replication, detector_of)
     files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited while the sortie flies
-    fly(parts, progress, observer)
-    record = _collect(parts, policies, name, seed, replication)
+    with (
+        watched(limits.decision_s, f"{limits.decision_s:g} s (limits.decision_s)")
+        if policies.of_users
+        else nullcontext()
+    ):
+        fly(parts, each_second, observer)
+        record = _collect(parts, policies, name, seed, replication)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, wall=wall)
 
@@ -329,5 +351,5 @@ def _policy(scenario: Scenario, policy: str | Policy | None) -> tuple[str, Polic
     section = scenario.policy
     if policy is None or policy == section.name:
         return section.name, plan_for(scenario)
-    first = named_policy(policy, {}) if isinstance(policy, str) else NamedPolicy(name_of(policy), policy)
+    first = named_policy(policy, {}) if isinstance(policy, str) else NamedPolicy(name_of(policy), guarded(policy))
     return first.name, plan_of(section, first)

@@ -101,7 +101,7 @@ def serve(orders: PolicyOrders, pipe: Connection) -> None:
 def _decide(pilot: Pilot, ask: Ask) -> Decision:
     begin_ns = time.thread_time_ns()
     try:
-        directives = pilot(ask.view)
+        directives = pilot(ask.view.frozen)
         elapsed_ns = time.thread_time_ns() - begin_ns
         check_directives(directives, ask.view)
         return Decision(ask.number, tuple([_plain(d) for d in directives]), elapsed_ns=elapsed_ns)

@@ -109,6 +109,6 @@ def decisions(tables: Mapping[str, pa.Table]) -> Iterator[Decision]:
     for d in from_table(_Row, tables[DECISIONS]):
         known = {descriptors[row].agent_id: descriptors[row] for row in d.descriptors}
         ages_s = dict(zip(known, d.ages_s, strict=True))
-        view = FleetView(d.drone, d.period_s, known, ages_s, d.detached_after_periods)
+        view = FleetView(d.drone, d.period_s, known, ages_s, d.detached_after_periods).frozen
         answers = tuple([directives[row] for row in d.directives])
         yield Decision(d.t_s, d.drone, d.policy, view, answers, d.viewpoint)

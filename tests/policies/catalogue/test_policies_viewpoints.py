@@ -42,6 +42,10 @@ def tracking(view: FleetView, region: Disc) -> FleetView:
         (Reposition("a", 0.0, "x"), "reposition of drone 0: x_m is 'a', must be a number"),  # type: ignore[arg-type]
         (Reposition(0.0, None), "reposition of drone 0: y_m is None, must be a number"),  # type: ignore[arg-type]
         (Reposition(0.0, 1j), "reposition of drone 0: y_m is 1j, must be a number"),  # type: ignore[arg-type]
+        (
+            Reposition(0.0, 0.0, "\udfff"),
+            r"reposition of drone 0: reason is '\\udfff', must be text that UTF-8 can write",
+        ),
         (Reposition(0.0, 0.0, 5), "reposition of drone 0: reason is 5, must be text"),  # type: ignore[arg-type]
     ],
 )

@@ -162,6 +162,10 @@ def rung(view):
 
 def leaves(view):
     raise SystemExit(0)
+
+def quits(view):
+    import os
+    os._exit(0)
 """
 
 
@@ -176,7 +180,8 @@ def leaves(view):
         ("texts", "rate_hz is '10', must be in [0, 30], a number"),
         ("texts_when_old", "rate_hz is '10', must be in [0, 30], a number"),
         ("rung", "representation is 'features', must be in [0, 4], a Representation"),
-        ("leaves", "ends the program (exit code 0), must return directives"),
+        ("leaves", "raises ProgramExitError: exit code 0, must return"),
+        ("quits", "raises ProgramExitError: exit code 0, must return"),
     ],
 )
 def test_a_policy_that_gives_no_directives_is_a_broken_one(

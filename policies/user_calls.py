@@ -1,0 +1,227 @@
+"""Calls of a user's own code: one that ends the program, or that takes too long, is an error of that call alone.
+
+`Guarded` is the user's function as everything else calls it. Within `watched`, each of its calls has a limit of
+wall-clock time. A thread counts the time, and interrupts a call that is late. Python code cannot be interrupted while it
+is inside compiled code. Where the process is Sortie's own (`end_when_stuck`), a call that cannot be interrupted ends the
+process: by this thread, or by a second process (`stuck.py`) where compiled code lets no thread run.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import mmap
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+DECISION_S = 10.0
+"""The longest time for a decision where no scenario says otherwise."""
+LOAD_S = 60.0
+"""The longest time for a user's file to load."""
+GRACE_S = 5.0
+"""A call that is interrupted must end within this time."""
+TICK_S = 0.1
+STUCK = 70
+"""Exit code of a process that was ended because a call could not be interrupted."""
+BEAT = "=Qd480s"
+"""What `stuck.py` reads: a counter of ticks, how long it may stand still (0: for ever), and the error to print."""
+
+
+class ProgramExitError(Exception):
+    """A user's code tried to end the program."""
+
+
+class TookTooLongError(Exception):
+    """A call of a user's code that did not return within its limit."""
+
+
+class _Interrupt(BaseException):
+    """Sent into a call that is late. An ordinary `except` in the user's code does not catch it."""
+
+
+class Guarded:
+    """A user's function. It raises ProgramExitError in place of SystemExit, and TookTooLongError where it is late."""
+
+    __wrapped__: Callable[..., Any]
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._late = ""  # what it exceeded: it is not called again
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The function's answer."""
+        if self._late:
+            raise TookTooLongError(self._late)
+        watch = _WATCHES.get(threading.get_ident())
+        try:
+            if watch is None or watch.calling:
+                return self.__wrapped__(*args, **kwargs)
+            try:
+                watch.begin()
+                return self.__wrapped__(*args, **kwargs)
+            finally:
+                watch.end()  # an interrupt that was sent arrives here at the latest
+        except SystemExit as stop:
+            raise ProgramExitError(f"exit code {stop.code}, must return").with_traceback(stop.__traceback__) from None
+        except _Interrupt as late:
+            self._late = "no answer" if watch is None else f"no answer within {watch.limit}"
+            raise TookTooLongError(self._late).with_traceback(late.__traceback__) from None
+
+
+def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A user's function, guarded; parameters that a `partial` binds stay where they are."""
+    if isinstance(function, functools.partial):
+        return functools.partial(guarded(function.func), *function.args, **function.keywords)
+    return function if isinstance(function, Guarded) else Guarded(function)
+
+
+def is_guarded(function: Callable[..., Any]) -> bool:
+    """Whether a function is a user's, with its parameters bound or not."""
+    return isinstance(function.func if isinstance(function, functools.partial) else function, Guarded)
+
+
+@contextmanager
+def watched(limit_s: float, limit: str = "") -> Iterator[None]:
+    """Limit every guarded call of this thread within the block; an outer block of the same thread gives way to it.
+
+    In the main thread, the working folder is the same afterwards, so that paths of the command still mean the same.
+
+    Args:
+        limit_s: wall-clock time for one call.
+        limit: the limit in words for errors, as "10 s (limits.decision_s)".
+    """
+    thread = threading.get_ident()
+    outer = _WATCHES.get(thread)
+    _WATCHES[thread] = watch = _Watch(thread, limit_s, limit or f"{limit_s:g} s")
+    here = Path.cwd() if threading.current_thread() is threading.main_thread() else None
+    watch.start()
+    try:
+        yield
+    finally:
+        watch.stop()
+        if here is not None:
+            os.chdir(here)
+        if outer is None:
+            del _WATCHES[thread]
+        else:
+            _WATCHES[thread] = outer
+
+
+def end_when_stuck() -> None:
+    """Let a call that cannot be interrupted end the process. Libraries must not call this."""
+    global _ends_process
+    _ends_process = True
+
+
+class _Watch:
+    """Counts the time of the present call of one thread.
+
+    It counts its own ticks, so that a process that was stopped for a while is not late.
+    """
+
+    def __init__(self, thread: int, limit_s: float, limit: str) -> None:
+        self.calling = False
+        self.limit = limit
+        self._limit_s, self._thread = limit_s, thread
+        self._longest_s = limit_s + GRACE_S
+        self._error = f"a call of the policy does not return within {limit}, and cannot be interrupted"
+        self._ticks = 0
+        self._lock, self._over = threading.Lock(), threading.Event()
+
+    def start(self) -> None:
+        self._beat = _beat_of_process() if _ends_process else None
+        if self._beat is not None:  # before the first call, in which no thread may run
+            self._beat.tick(self._longest_s, self._error)
+        self._counter = threading.Thread(target=self._count, name="limit of a call", daemon=True)
+        self._counter.start()
+        _refuse_exits()
+
+    def stop(self) -> None:
+        self._over.set()
+        self._counter.join()
+        if self._beat is not None:
+            self._beat.rest()
+
+    def begin(self) -> None:
+        with self._lock:
+            self.calling, self._ticks = True, 0
+
+    def end(self) -> None:
+        with self._lock:
+            self.calling = False
+
+    def _count(self) -> None:
+        while not self._over.wait(TICK_S):
+            if self._beat is not None:
+                self._beat.tick(self._longest_s, self._error)
+            with self._lock:
+                if not self.calling:
+                    continue
+                before_s, self._ticks = self._ticks * TICK_S, self._ticks + 1
+                now_s = self._ticks * TICK_S
+                if before_s <= self._limit_s < now_s:
+                    ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                        ctypes.c_ulong(self._thread), ctypes.py_object(_Interrupt)
+                    )
+            if now_s > self._longest_s and self._beat is not None:
+                os.write(2, f"error: {self._error}\n".encode())
+                _exit(STUCK)
+
+
+class _Beat:
+    """Memory shared with the process of `stuck.py`."""
+
+    def __init__(self) -> None:
+        with tempfile.TemporaryFile() as file:
+            file.truncate(struct.calcsize(BEAT))
+            self._memory = mmap.mmap(file.fileno(), struct.calcsize(BEAT))
+            script = Path(__file__).with_name("stuck.py")
+            command = [sys.executable, "-I", "-S", str(script), str(file.fileno()), BEAT, str(TICK_S), str(STUCK)]
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[file.fileno()])  # noqa: S603 - our own script
+        self._ticks = 0
+        atexit.register(self._close)
+
+    def tick(self, longest_s: float, error: str) -> None:
+        self._ticks += 1
+        struct.pack_into(BEAT, self._memory, 0, self._ticks, longest_s, error.encode()[:480])
+
+    def rest(self) -> None:
+        self.tick(0.0, "")
+
+    def _close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+@functools.cache
+def _beat_of_process() -> _Beat:
+    return _Beat()
+
+
+@functools.cache
+def _refuse_exits() -> None:
+    """`os._exit` within a guarded call raises SystemExit, in this process and not in those that it forks."""
+    process = os.getpid()
+
+    def leave(code: int) -> None:
+        watch = _WATCHES.get(threading.get_ident())
+        if watch is not None and watch.calling and os.getpid() == process:
+            raise SystemExit(code)
+        _exit(code)
+
+    os._exit = leave  # type: ignore[assignment]
+
+
+_exit = os._exit
+_ends_process = False
+_WATCHES: dict[int, _Watch] = {}
+"""By thread."""

@@ -1,0 +1,201 @@
+"""Calls of a user's code that end the program, never return, or change what they are given."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sortie.policies import user_calls
+from sortie.policies.contract import FleetView, PolicyError
+from sortie.policies.registry import parameters, resolve, viewpoint_of
+from sortie.policies.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, watched
+from sortie.policies.verification.conformance import conform, full_view
+
+POLICY = """
+import os, re, sys, time
+from os import _exit
+from sortie.policies.contract import Directive, looks_from
+
+def leaves(view):
+    sys.exit(0)
+
+def leaves_with_a_message(view):
+    raise SystemExit("bye")
+
+def quits(view):
+    os._exit(0)
+
+def quits_by_name(view):
+    _exit(0)
+
+def spins(view):
+    while True:
+        pass
+
+def spins_again(view):
+    while True:
+        try:
+            spins(view)
+        except Exception:
+            pass
+
+def sleeps(view):
+    time.sleep(1000)
+
+def compiled(view):
+    re.match("(a+)+$", "a" * 60 + "b")
+
+def place(view):
+    sys.exit(0)
+
+@looks_from(place)
+def looks(view, *, rho=0.5):
+    return []
+"""
+ENDS = """
+from sortie.policies import user_calls
+from sortie.policies.registry import resolve
+user_calls.GRACE_S = 0.3
+user_calls.end_when_stuck()
+policy = resolve("{path}:{name}")
+with user_calls.watched(0.2, "0.2 s (limits.decision_s)"):
+    policy(None)
+print("went on")
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.py"
+    path.write_text(POLICY)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "code"), [("leaves", "0"), ("leaves_with_a_message", "bye"), ("quits", "0"), ("quits_by_name", "0")]
+)
+def test_a_policy_cannot_end_the_program(file: Path, name: str, code: str) -> None:
+    with watched(60), pytest.raises(ProgramExitError, match=rf"^exit code {code}, must return$"):
+        resolve(f"{file}:{name}")(full_view(2))
+
+
+def test_a_viewpoint_cannot_either(file: Path) -> None:
+    viewpoint = viewpoint_of(resolve(f"{file}:looks", {"rho": 0.1}))
+    assert viewpoint is not None
+    with pytest.raises(ProgramExitError, match=r"^exit code 0, must return$"):
+        viewpoint(full_view(2))
+
+
+@pytest.mark.parametrize("line", ["sys.exit(0)", "os._exit(0)"])
+def test_a_file_cannot_as_it_loads(tmp_path: Path, line: str) -> None:
+    (tmp_path / "mine.py").write_text(f"import os, sys\n{line}\n")
+    told = r"mine\.py' does not load: ProgramExitError: exit code 0, must return \(mine\.py, line 2\)$"
+    with pytest.raises(PolicyError, match=told):
+        resolve(f"{tmp_path / 'mine.py'}:decide")
+
+
+def test_what_is_not_a_users_call_may_end(file: Path) -> None:
+    """In this process, and in one that a policy forks."""
+    with watched(60):
+        child = os.fork()
+        if child == 0:
+            os._exit(7)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        with pytest.raises(SystemExit):
+            sys.exit(0)
+
+
+def test_the_guard_leaves_a_policy_as_it_is(file: Path) -> None:
+    policy = resolve(f"{file}:looks", {"rho": 0.1})
+    assert isinstance(policy, functools.partial)
+    assert isinstance(policy.func, Guarded)
+    assert parameters(policy.func) == {"rho": 0.5}
+    assert guarded(policy.func) is policy.func
+    assert policy(full_view(2)) == []
+
+
+@pytest.mark.parametrize("name", ["spins", "spins_again"])
+def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name: str) -> None:
+    policy = resolve(f"{file}:{name}")
+    with watched(0.15, "0.15 s"):
+        for _ in range(2):
+            with pytest.raises(TookTooLongError, match=r"^no answer within 0\.15 s$"):
+                policy(full_view(2))
+    assert resolve("worked")(full_view(2)), "nothing arrives later"
+
+
+def test_each_call_has_the_whole_limit() -> None:
+    ticks = threading.Event()
+    short = guarded(lambda: ticks.wait(0.5))
+    with watched(2.0):
+        for _ in range(5):
+            assert short() is False
+
+
+def test_calls_of_other_threads_go_on() -> None:
+    done = []
+    other = threading.Thread(target=lambda: done.append(guarded(lambda: threading.Event().wait(0.6))()))
+
+    def spins() -> None:
+        while True:
+            pass
+
+    other.start()
+    with watched(0.15), pytest.raises(TookTooLongError):
+        guarded(spins)()
+    other.join()
+    assert done == [False]
+
+
+@pytest.mark.parametrize(("name", "ended"), [("sleeps", user_calls.STUCK), ("compiled", -signal.SIGXCPU)])
+def test_a_call_that_cannot_be_interrupted_ends_the_process(file: Path, name: str, ended: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS.format(path=file, name=name)], capture_output=True, text=True, check=False
+    )
+    told = "error: a call of the policy does not return within 0.2 s (limits.decision_s), and cannot be interrupted\n"
+    assert (done.returncode, done.stdout, done.stderr) == (ended, "", told)
+
+
+def test_the_kit_goes_on(file: Path) -> None:
+    with watched(0.15):
+        checks = {c.name: c for c in conform(resolve(f"{file}:spins"), count=5)}
+    assert not checks["returns directives"].holds
+    assert re.search(r"TookTooLongError: no answer within 0\.15 s", checks["returns directives"].what)
+
+
+def test_an_error_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("raise ValueError('\\ud800')\n")
+    with pytest.raises(PolicyError, match=r"does not load: ValueError: \\ud800 \(mine\.py, line 1\)$") as caught:
+        resolve(f"{tmp_path / 'mine.py'}:decide")
+    assert str(caught.value).encode()
+
+
+# --- the view ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, lambda view: pickle.loads(pickle.dumps(view))])  # noqa: S301
+def test_a_frozen_view_is_copied_as_a_plain_one(copied: Callable[[FleetView], FleetView]) -> None:
+    view = full_view(3).frozen
+    other = copied(view)
+    assert other == view == full_view(3)
+    assert isinstance(other.age_s, dict)
+
+
+def test_a_frozen_view_can_be_read_only() -> None:
+    view: Any = full_view(3).frozen
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        view.age_s[1] = 0.0
+    with pytest.raises(TypeError, match="doesn't support item deletion"):
+        del view.descriptors[1]
