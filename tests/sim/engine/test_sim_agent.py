@@ -18,8 +18,8 @@ def test_what_goes_to_four_peers_is_made_once(monkeypatch: pytest.MonkeyPatch) -
     made: list[Any] = []
     plain = sortie.fleet.agent.make_payload
 
-    def counted(*what: Any) -> Any:
-        made.append(plain(*what))
+    def counted(*what: Any, **more: Any) -> Any:
+        made.append(plain(*what, **more))
         return made[-1]
 
     monkeypatch.setattr(sortie.fleet.agent, "make_payload", counted)
