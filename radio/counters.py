@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+CAUSES = ("collision_context", "collision_data", "hidden", "weak_signal", "half_duplex")
+"""Why a drone did not hear a broadcast: it met another broadcast, or a unicast frame or its answer; a sender that could
+not hear the first spoilt it; signal, fade or burst; the drone was sending itself."""
 
 
 @dataclass(slots=True)
@@ -21,5 +25,7 @@ class Counters:
     """Broadcasts heard, counted per receiver."""
     missed: int = 0
     """Broadcasts that a living drone did not hear."""
+    lost_to: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
+    """The same by cause, `CAUSES`; their sum is `missed`."""
     collided: int = 0
     """Broadcasts lost to a collision with another."""

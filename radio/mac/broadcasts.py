@@ -100,6 +100,7 @@ class Broadcasts:
         if collided:
             counters.collided += 1
             counters.missed += living
+            counters.lost_to["collision_context"] += living
             frame.on_heard([])
             return
         index, times = self._channel.frame, 0
@@ -115,4 +116,5 @@ class Broadcasts:
         count = len(heard)
         counters.receptions += count
         counters.missed += living - count
+        counters.lost_to["weak_signal"] += living - count
         frame.on_heard(heard)

@@ -271,6 +271,7 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
         scorer.start()
     parts.env.run(until=parts.scenario.duration_s)
     world.drain()
+    world.write_receptions()
     parts.transport.finish()
     parts.audit.finish()
     energy_j = parts.batteries.energy_j
@@ -289,7 +290,7 @@ def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replica
         tables |= _decided(parts.journal, policies, parts.scenario)
     if parts.scenario.context.roster:
         tables[rosters.TABLE] = notes.rosters.table()
-    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters)}
+    counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters) if f.name != "lost_to"}
     return SortieRecord(
         scenario=parts.scenario,
         policy=policy,

@@ -30,6 +30,7 @@ from sortie.perception.tracking.wire import content
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
 from sortie.radio import Air
+from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
@@ -129,6 +130,7 @@ class World:
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
         self._busy_at_s = (0.0, 0.0)
+        self._receptions = (0,) * (1 + len(LOSS_CAUSES))  # heard and lost to each cause, up to the frame's begin
         self._frame = 0
         self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
         self._headrooms = [(1.0, 1.0)] * n
@@ -159,6 +161,7 @@ class World:
             yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
             self.drain()
             if frame:
+                self.write_receptions()
                 self._measure_headrooms()
             self._frame = frame
             self.read_clocks()
@@ -263,6 +266,14 @@ class World:
     def note(self, drone: int, kind: str, text: str) -> None:
         """Write an event down; drone −1 is the whole fleet."""
         self._recorder.rows["events"].append((self.env.now, drone, kind, text))
+
+    def write_receptions(self) -> None:
+        """Record what became of descriptors since the present frame's begin; called at its end."""
+        counters = self.air.counters
+        now = (counters.receptions, *counters.lost_to.values())
+        since = [after - before for before, after in zip(self._receptions, now, strict=True)]
+        self._recorder.rows["receptions"].append((self._frame * self._scenario.frame_s, *since))
+        self._receptions = now
 
     def _write_medium(self) -> None:
         """How busy the channel has been since the last row, and how many drones have a usable link."""

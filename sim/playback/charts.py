@@ -20,16 +20,19 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas, Floats, line
 from sortie.sim.results.outcome import transitions
+from sortie.sim.results.record import TABLES
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 from sortie.sim.results.sightings import Sighting
 
 AP_WINDOW_S = 5.0
-MARKED = ("ap", "battery", "goodput", "traffic", "age", "medium")
+MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
 """Plots in which phase changes and events are marked."""
 EVENT_LANE: c.Rgba = (150, 108, 20, 255)
 RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
 FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
+_INSTANT_S = 1e-6
+"""A frame begins a few digits beside its second."""
 
 
 def phase_lane(group: int) -> str:
@@ -47,6 +50,7 @@ class Charts:
         self._kinds: list[str] = []
         self._running: set[str] = set()
         self._ages: Floats = np.zeros((0, 2))
+        self._received: Floats = np.zeros((0, len(TABLES["receptions"])))
         self._window: deque[Sighting] = deque()
         self._carried: dict[tuple[int, int], str] = {}
         self._lanes: dict[int, str] = {}
@@ -68,6 +72,7 @@ class Charts:
         canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
         canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
         canvas.static("plots/age/p99_ms", line("descriptor age p99, ms", (190, 190, 200, 255)))
+        canvas.static("plots/lost/percent", line("descriptors lost, %", (230, 120, 120, 255)))
         canvas.static("plots/medium/busy_percent", line("channel busy, %", (240, 150, 80, 255)))
         for folder in MARKED:
             canvas.static(f"plots/{folder}/marks/event", _mark("event", c.WARNING, rr.components.MarkerShape.Up))
@@ -85,6 +90,7 @@ class Charts:
         self._goodput(new["descriptors"])
         self._traffic(seconds, new["transmissions"])
         self._plane(seconds, new["ages"], new["medium"])
+        self._losses(seconds, new["receptions"])
         self._accuracy(seconds, seen)
         self._phases(new["mission"])
         self._decisions(new["directives"])
@@ -160,6 +166,21 @@ class Charts:
             self._ages = self._ages[self._ages[:, 0] >= seconds[-1][1]]
         busy = 100.0 * medium["busy_fraction"].to_numpy()
         self._canvas.scalars("plots/medium/busy_percent", medium["t_s"].to_numpy(), busy)
+
+    def _losses(self, seconds: Sequence[tuple[float, float]], receptions: pa.Table) -> None:
+        """Share of descriptor receptions lost in each second with any."""
+        rows = np.column_stack([column.to_numpy().astype(float) for column in receptions.columns])
+        self._received = np.concatenate([self._received, rows])
+        points = []
+        for begin_s, end_s in seconds:
+            first, last = np.searchsorted(self._received[:, 0], (begin_s - _INSTANT_S, end_s - _INSTANT_S))
+            heard, *lost = self._received[first:last, 1:].sum(axis=0).tolist()
+            if heard + sum(lost) > 0:
+                points.append((end_s, 100.0 * sum(lost) / (heard + sum(lost))))
+        if points:
+            self._canvas.scalars("plots/lost/percent", *np.array(points).T)
+        if seconds:
+            self._received = self._received[self._received[:, 0] >= seconds[-1][1] - _INSTANT_S]
 
     def _accuracy(self, seconds: Sequence[tuple[float, float]], seen: Iterable[Sighting]) -> None:
         """AP@0.5 over the last seconds, all egos pooled."""

@@ -16,6 +16,7 @@ SHARED = (
     ("AP@0.5 in the mission disc, last 5 s", "ap/mission", (0.0, 1.0)),
     ("features delivered, Mb/s", "traffic/features_delivered", None),
     ("age of descriptors, 99th percentile, ms", "age/p99_ms", None),
+    ("descriptors lost, %", "lost/percent", None),
     ("channel busy, %", "medium/busy_percent", (0.0, 104.0)),
 )
 """Plots in which every policy has a line: name, entity below `plots`, range."""

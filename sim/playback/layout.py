@@ -63,6 +63,7 @@ def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
         plot("traffic, Mb/s: features green, boxes orange; too late white, lost red", "traffic", legend=False),
         rrb.Horizontal(
             plot("age of descriptors, 99th percentile, ms", "age", legend=False),
+            plot("descriptors lost, %", "lost", legend=False),
             plot("channel busy, %", "medium", (0.0, 104.0), legend=False),
         ),
     ]

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.sentences import losses_in_words
 
 FEW = 3
 GROUNDED = ("landed", "drone_lost")
@@ -26,6 +27,8 @@ def explain_metric(metric: str, record: SortieRecord, result: dict[str, Any]) ->
     if top in ("bytes", "context_share", "data_rate_mbps", "deadline_miss_rate", "payload_fates", "phases", "ap50",
                "medium_busy_fraction", "data_age_s"):  # fmt: skip
         facts.append(_payloads(result))
+    if top in ("context", "age_s"):
+        facts.append(f"descriptors lost: {losses_in_words(result['context']) or 'none'}")
     if top in ("age_s", "descriptor_drops"):
         facts.append(_descriptors(result))
     if top in ("energy_j", "battery", "drones"):

@@ -17,6 +17,7 @@ from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Matched, average_precision, judge
 from sortie.perception.types import Boxes
 from sortie.policies.verification.enforced import CAUSES
+from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.radio.transmission import Status
 from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
@@ -27,6 +28,8 @@ from sortie.sim.results.regions import Regions
 from sortie.sim.results.tracking_outcome import tracking_outcome
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
+_INSTANT_S = 1e-6
+"""A frame begins a few digits beside the time that a scenario names."""
 
 
 def outcome(record: SortieRecord) -> dict[str, Any]:
@@ -80,6 +83,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "handshakes_sent": _sum(sent.filter(pc.equal(sent["representation"], HANDSHAKE))["payload_bytes"]),
             **{f"data_{status}": count for status, count in by_status.items()},
         },
+        "context": _context(tables["receptions"], 0.0, scenario.duration_s),
         "context_share": _ratio(context_bytes, context_bytes + data_sent),
         "data_rate_mbps": data_sent * 8e-6 / scenario.duration_s,
         "deadline_miss_rate": _miss_rate(sent),
@@ -281,6 +285,18 @@ def _distrusted_by(trust: pa.Table) -> dict[str, int]:
     return {str(peer): sum(p == peer for p, _ in pairs) for peer in sorted({p for p, _ in pairs})}
 
 
+def _context(receptions: pa.Table, begin_s: float, end_s: float) -> dict[str, Any]:
+    """Shares of descriptor receptions that were lost, in frames that begin from `begin_s` to before `end_s`."""
+    t_s = receptions["t_s"].to_numpy() + _INSTANT_S
+    within = receptions.filter(pa.array((begin_s <= t_s) & (t_s < end_s)))
+    lost = {cause: _sum(within[cause]) for cause in LOSS_CAUSES}
+    every = _sum(within["heard"]) + sum(lost.values())
+    return {
+        "lost": _ratio(sum(lost.values()), every),
+        "lost_to": {cause: _ratio(count, every) for cause, count in lost.items()},
+    }
+
+
 def _miss_rate(sent: pa.Table) -> float | None:
     """Payloads that missed their deadline or were replaced before it, over those whose fate is known.
 
@@ -362,6 +378,7 @@ def _phase(record: SortieRecord, both: Both, begin_s: float, end_s: float, name:
         "begin_s": begin_s,
         "end_s": end_s,
         "ap50": _accuracy(both, begin_s, end_s),
+        "context": _context(record.tables["receptions"], begin_s, end_s),
         "data_rate_mbps": _sum(sent["payload_bytes"]) * 8e-6 / (end_s - begin_s),
         "feature_payload_bytes": _percentiles(pc.cast(features["payload_bytes"], pa.float64()))["p50"],
         "deadline_miss_rate": _miss_rate(sent),

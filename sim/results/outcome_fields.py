@@ -229,11 +229,32 @@ class Disagreement(TypedDict):
     ]
 
 
+class LostTo(TypedDict):
+    collision_context: Annotated[float | None, "It met another descriptor on the air.", SHARE]
+    collision_data: Annotated[float | None, "It met a payload's frame, or the answer to one.", SHARE]
+    hidden: Annotated[float | None, "A sender that could not hear the first one spoilt it at the receiver.", SHARE]
+    weak_signal: Annotated[
+        float | None, "Distance, shadowing, fading, a burst or an event made the link too bad.", SHARE
+    ]
+    half_duplex: Annotated[float | None, "The receiver was sending itself.", SHARE]
+
+
+class ContextOutcome(TypedDict):
+    lost: Annotated[
+        float | None,
+        "Share of descriptor receptions that were lost on the air, 0 … 1. Each descriptor counts once for each other drone "
+        "in the air.",
+        SHARE,
+    ]
+    lost_to: Annotated[LostTo, "The part of it that each cause has; together they are `lost`."]
+
+
 class PhaseOutcome(TypedDict):
     phase: Annotated[str, "The mission's phase."]
     begin_s: Annotated[float, "From when."]
     end_s: Annotated[float, "Until when, exclusive."]
     ap50: Annotated[Accuracy, "Accuracy within it."]
+    context: Annotated[ContextOutcome, "Losses of descriptors in the frames that begin within it."]
     data_rate_mbps: Annotated[float, "Payload bytes captured in it, as Mb/s."]
     feature_payload_bytes: Annotated[float | None, "Median size of a feature payload."]
     deadline_miss_rate: Annotated[float | None, "As for the whole sortie.", SHARE]
@@ -278,6 +299,7 @@ class Outcome(TypedDict):
     ]
     people: Annotated[PeopleOutcome, "People and thermal cameras; null without both, and where nobody was in a region."]
     bytes: Annotated[Bytes, "What was sent."]
+    context: Annotated[ContextOutcome, "What the context plane lost."]
     context_share: Annotated[float | None, "Context bytes over all bytes.", SHARE]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
     deadline_miss_rate: Annotated[

@@ -22,6 +22,7 @@ from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
+from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.identity import release_of
@@ -50,6 +51,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         goodput_mbps=pa.list_(F), phase=S, region_x_m=F, region_y_m=F, region_radius_m=F,
         novelty_flags=I, coverage_grid=pa.binary(),
     ),
+    "receptions": dict(t_s=F, heard=I, **dict.fromkeys(LOSS_CAUSES, I)),
     "drops": dict(t_s=F, receiver=I, reason=S),
     "directives": dict(
         t_s=F, drone=I, peer=I, representation=S, rho=F, roi_x_m=F, roi_y_m=F, roi_radius_m=F, rate_hz=F,
@@ -92,6 +94,10 @@ ABOUT = {
     "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`; "
     "`looks` counts the frames before this one in which perception ran.",
     "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, Mb/s; 0 is unknown, at most 2⁻¹⁰ is silent, at most 2⁻⁹ has no payload lately but descriptors arrive.",
+    "receptions": "What became of descriptors on the air in the frame that begins at `t_s`, counted for each drone in the "
+    "air that could receive one: heard, or lost to a cause. It met another descriptor (`collision_context`) or a payload's "
+    "frame or its answer (`collision_data`), a sender that could not hear the first spoilt it (`hidden`), the signal was too "
+    "weak (`weak_signal`), or the receiver was sending itself (`half_duplex`).",
     "drops": "A descriptor refused at a receiver, with the reason.",
     "directives": "A change of what a gate enforces, with the reason that decided it.",
     "interventions": "A directive that the shield replaced, or could not put right: `kind` is `policy` for each of the "

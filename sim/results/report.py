@@ -12,7 +12,7 @@ from sortie.sim.folders import write_text
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures
-from sortie.sim.results.sentences import decision_in_words, event_in_words
+from sortie.sim.results.sentences import decision_in_words, event_in_words, losses_in_words
 from sortie.sim.results.summary import PLURAL
 
 STYLE = """
@@ -121,6 +121,7 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Data delivered", size(data["data_delivered"]), f"of {size(data['data_sent'])} sent"),
         ("Deadlines missed", percent(result["deadline_miss_rate"]), f"channel busy {percent(result['medium_busy_fraction'])}"),
         ("Context plane", size(data["context_sent"]), f"{percent(result['context_share'])} of all bytes"),
+        ("Descriptors lost", percent(result["context"]["lost"]), losses_in_words(result["context"]) or "of receptions"),
         ("Energy", f"{result['energy_j']['total'] / 1e3:.1f} kJ", f"least charge left {percent(least)}"),
     ]  # fmt: skip
 
@@ -149,10 +150,11 @@ def _decisions(result: dict[str, Any]) -> str:
 
 def _numbers(result: dict[str, Any]) -> str:
     """Phases, then drones."""
-    head = "<tr><th>phase</th><th>AP full scene</th><th>AP mission</th><th>data</th><th>deadlines missed</th></tr>"
+    head = "<tr><th>phase</th><th>AP full scene</th><th>AP mission</th><th>data</th><th>deadlines missed</th><th>descriptors lost</th></tr>"
     phases = "".join(
         f"<tr><td>{escape(p['phase'])}, {p['begin_s']:g}–{p['end_s']:g} s</td><td>{number(p['ap50']['full_scene'])}</td>"
-        f"<td>{number(p['ap50']['mission'])}</td><td>{p['data_rate_mbps']:.1f} Mb/s</td><td>{percent(p['deadline_miss_rate'])}</td></tr>"
+        f"<td>{number(p['ap50']['mission'])}</td><td>{p['data_rate_mbps']:.1f} Mb/s</td><td>{percent(p['deadline_miss_rate'])}</td>"
+        f"<td>{percent(p['context']['lost'])}</td></tr>"
         for p in result["phases"]
     )
     drones = "".join(

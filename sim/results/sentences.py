@@ -4,12 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
+from sortie.scenarios.report_text import percent
+
 
 def decision_in_words(change: dict[str, Any]) -> str:
     """A transition as a sentence: `drone 2 → 0, 1: detections at 2 Hz, because goodput 3.1 < 5 Mb/s`."""
     peers = ", ".join(str(p) for p in change["peers"])
     reason = f", because {change['reason']}" if change["reason"] else ""
     return f"drone {change['drone']} → {peers}: {change['to']}{reason}"
+
+
+_LOST_TO = {
+    "collision_context": "collisions with descriptors",
+    "collision_data": "collisions with payloads",
+    "hidden": "hidden senders",
+    "weak_signal": "weak signals",
+    "half_duplex": "own transmissions",
+}
+
+
+def losses_in_words(context: dict[str, Any]) -> str:
+    """What descriptors were lost to, the largest part first: `2.1 % collisions with payloads, 0.3 % weak signals`."""
+    parts = sorted(((share, cause) for cause, share in context["lost_to"].items() if share), reverse=True)
+    return ", ".join(f"{percent(share)} {_LOST_TO[cause]}" for share, cause in parts)
 
 
 def event_in_words(row: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, size
+from sortie.sim.results.sentences import losses_in_words
 
 MAX_TRANSITIONS = 24
 PLURAL = {"car": "cars", "truck": "trucks", "person": "people"}
@@ -80,6 +81,10 @@ def outcome_table(result: dict[str, Any]) -> Table:
         "context plane",
         f"{size(data['context_sent'])} ({percent(result['context_share'])} of all bytes), "
         f"age {number(result['age_s']['p50'])} s median, {number(result['age_s']['p99'])} s p99",
+    )
+    losses = losses_in_words(result["context"])
+    table.add_row(
+        "descriptors lost", f"{percent(result['context']['lost'])} of receptions{f' ({losses})' if losses else ''}"
     )
     fates = ", ".join(
         f"{size(data[f'data_{s}'])} {s.replace('_', ' ')}" for s in ("delivered", "lost", "expired", "in_flight")

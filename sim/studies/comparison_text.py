@@ -131,6 +131,7 @@ def _side_by_side(flown: Flown) -> dict[str, list[str]]:
         "deadlines missed": mean("deadline_miss_rate", text=percent),
         "medium busy": mean("medium_busy_fraction", text=percent),
         "context sent": mean("bytes", "context_sent", text=size),
+        "descriptors lost": mean("context", "lost", text=percent),
         "data age, median": mean("data_age_s", "p50", text=lambda v: number(v, ".2f", "s")),
         "energy": mean("energy_j", "total", text=_kilojoules),
         "  radio": mean("energy_j", "radio", text=_kilojoules),

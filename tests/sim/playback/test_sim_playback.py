@@ -166,7 +166,7 @@ def test_there_is_one_recording_with_its_layout(saved: Path) -> None:
         return sorted(v for b in batches if name in b.schema.names for (v,) in b[name].to_pylist())
 
     assert column("ViewBlueprint:class_identifier") == [
-        "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 6,
+        "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 7,
     ]  # fmt: skip
     assert column("TimePanelBlueprint:timeline") == ["sim_time"]
 
@@ -179,7 +179,7 @@ def test_every_entity_that_the_layout_shows_is_there(rows: Rows, record: SortieR
     expected |= {f"/lanes/drone_{i}" for i in range(n)}
     expected |= {
         "/about", "/lanes/events", "/lanes/phase", "/log/decisions", "/log/events", "/plots/age/p99_ms", "/plots/ap/full_scene",
-        "/plots/ap/mission", "/plots/medium/busy_percent", "/plots/traffic/features_delivered", "/world/cars/moving",
+        "/plots/ap/mission", "/plots/lost/percent", "/plots/medium/busy_percent", "/plots/traffic/features_delivered", "/world/cars/moving",
         "/world/cars/parked", "/world/fleet", "/world/links", "/world/mission", "/world/mission/disc", "/world/target",
         "/world/broken", "/world/town/buildings", "/world/town/ground", "/world/town/trees",
     }  # fmt: skip
@@ -382,7 +382,7 @@ def test_a_hatch_covers_exactly_the_cells_of_the_region() -> None:
 
 
 def test_events_and_phase_changes_are_marked_on_the_plots(rows: Rows) -> None:
-    for plot in ("ap", "battery", "goodput", "traffic", "age", "medium"):
+    for plot in ("ap", "battery", "goodput", "traffic", "age", "lost", "medium"):
         assert series(rows, f"/plots/{plot}/marks/event") == [(4.0, 0.0), (6.0, 0.0)]
         assert series(rows, f"/plots/{plot}/marks/phase") == [(3.0, 0.0)]
     assert [(t_s, v) for t_s, _, v in rows["/lanes/events"]["StateChange:state"]] == [
@@ -456,6 +456,16 @@ def test_the_age_of_descriptors_is_that_of_each_second(rows: Rows, record: Sorti
     for second in (4.0, 5.0):
         ages = [a["age_s"] for a in record.tables["ages"].to_pylist() if second <= a["t_s"] < second + 1.0]
         assert drawn[second + 1.0] == pytest.approx(1e3 * np.percentile(ages, 99))
+
+
+def test_the_share_of_lost_descriptors_is_that_of_each_second(rows: Rows, record: SortieRecord) -> None:
+    drawn = dict(series(rows, "/plots/lost/percent"))
+    assert sorted(drawn) == [float(second) for second in range(1, round(record.scenario.duration_s) + 1)]
+    for second, percent in drawn.items():
+        within = [r for r in record.tables["receptions"].to_pylist() if second - 1.05 <= r["t_s"] < second - 0.05]
+        every = sum(sum(r.values()) - r["t_s"] for r in within)
+        assert percent == pytest.approx(100.0 * (1.0 - sum(r["heard"] for r in within) / every))
+    assert max(drawn.values()) > 5.0
 
 
 def test_moving_cars_are_the_scene_s(rows: Rows, record: SortieRecord) -> None:

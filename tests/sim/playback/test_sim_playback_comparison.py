@@ -63,9 +63,9 @@ def test_the_layout_has_a_scene_each_and_plots_with_a_line_each(
         return [v for b in batches if name in b.schema.names for row in b[name].to_pylist() for v in row or ()]
 
     kinds = sorted(all_of("ViewBlueprint:class_identifier"))
-    assert kinds == ["3D", "3D", "StateTimeline", "StateTimeline", "TextLog", "TextLog", *["TimeSeries"] * 3]
+    assert kinds == ["3D", "3D", "StateTimeline", "StateTimeline", "TextLog", "TextLog", *["TimeSeries"] * 4]
     shown = all_of("ViewContents:query")
-    for entity in ("features_delivered", "p99_ms", "busy_percent"):
+    for entity in ("features_delivered", "p99_ms", "lost/percent", "busy_percent"):
         assert [q.split("/")[1] for q in shown if q.rstrip().endswith(entity)] == [
             "worked",
             "all-4_received_budget_0_1",
