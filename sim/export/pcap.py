@@ -147,9 +147,7 @@ def _payload_packets(record: SortieRecord, begin_ns: int) -> Iterator[Packet]:
             k = place % row["fragments"]
             t_s = row["t_start_s"] + (place + 1) / sent * (end_s - row["t_start_s"])
             part = min(each, size - k * each)
-            if k == 0 or tiled:
-                numbers[drone, kind] += 1
-            number = numbers[drone, kind]
+            number = numbers[drone, kind] + (k if tiled else 0) + 1
             head = _header(drone, begin_ns + round(t_s * 1e9), peer)
             if row["fragments"] == 1 or tiled:
                 head += _data(kind, number, part)
@@ -157,6 +155,7 @@ def _payload_packets(record: SortieRecord, begin_ns: int) -> Iterator[Packet]:
                 head += _data_frag(kind, number, k, part, each, size)
             ends = (address(drone), DATA_PORT), (address(peer), DATA_PORT)
             yield Packet(t_s, kind, *ends, len(head) + part, head + bytes(min(part, KEPT_BYTES)))
+        numbers[drone, kind] += row["fragments"] if tiled else 1
 
 
 def _fragments_sent(row: Mapping[str, Any], each: int, tiled: bool) -> int:

@@ -30,7 +30,7 @@ SETTINGS = {
     "plain": (),
     "tiles": ("radio.framing=tiles",),
     "small": ("context.form=small", "context.authentication=false"),
-    "bad": ("radio.tx_power_dbm=-8", "radio.path_loss_exponent=3", "policy={name: boxes, dwell_s: 0.3}"),
+    "bad": ("radio.tx_power_dbm=6", "radio.path_loss_exponent=3", "policy={name: boxes, dwell_s: 0.3}"),
     "crowded": ("fleet.drones=9", "policy.params={rho: 1.0}", "radio.bandwidth_mhz=20"),
 }
 
