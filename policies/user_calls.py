@@ -172,7 +172,7 @@ class _Watch:
                     ctypes.pythonapi.PyThreadState_SetAsyncExc(
                         ctypes.c_ulong(self._thread), ctypes.py_object(_Interrupt)
                     )
-            if now_s > self._longest_s and self._beat is not None:
+            if now_s > self._longest_s and _ends_process:
                 os.write(2, f"error: {self._error}\n".encode())
                 _exit(STUCK)
 
@@ -203,8 +203,12 @@ class _Beat:
 
 
 @functools.cache
-def _beat_of_process() -> _Beat:
-    return _Beat()
+def _beat_of_process() -> _Beat | None:
+    """None where no process can be started: calls that compiled code holds then have no limit."""
+    try:
+        return _Beat()
+    except OSError:
+        return None
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -101,7 +102,7 @@ def test_a_comparison_in_a_readme_says_how_it_was_made(scenario: Path, tmp_path:
         "fleet.drones=2",
     )
     assert command("compare", scenario, *made, "--readme", readme, "--recording", tmp_path / "new" / "c.rrd") == 0
-    said = f"sortie compare {scenario} --policies 'silence,all-4(received_budget=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
+    said = f"sortie compare {shlex.quote(str(scenario))} --policies 'silence,all-4(received_budget=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
     assert f"`{said}`: 1 s, 2 drones, seed 3, in this town, this flight." in readme.read_text()
     assert (tmp_path / "new" / "c.rrd").is_file()
 
