@@ -3,6 +3,9 @@
 A pickle is a program: it may name any function and call it. Here a name is looked up in a short table of stand-ins,
 never imported, and the stand-ins build arrays of numbers and text only, with sizes that their bytes confirm. It is
 the one file of the project that imports `pickle` (a test holds it to that).
+
+A few bytes can still ask for gigabytes, or for nesting that no stack holds. So a file is first read in a process of its
+own, with limits of memory, time and depth. It is read here only if that went well.
 """
 
 from __future__ import annotations
@@ -10,6 +13,10 @@ from __future__ import annotations
 import io
 import pickle
 import re
+import resource
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +30,14 @@ _NOW = {
     "numpy._core.numeric": "numpy.core.numeric",
     "__builtin__": "builtins",  # protocols 0 to 2 name Python 2's
 }
-_KINDS = re.compile(r"b1|[iu][1248]|f[248]|[US]\d{1,6}")
+_KINDS = re.compile(r"b1|[iu][1248]|f[248]|[US][1-9]\d{0,5}")
+MAX_DEPTH = 100
+"""The deepest nesting of containers."""
+MEMORY_BYTES, MEMORY_A_BYTE = 512 * 2**20, 40
+"""Memory for a file's objects: a part of its own, and a share of the file's size."""
+TIME_S, TIME_A_MEGABYTE_S = 30, 1
+"""Processor time for a file, in the same way."""
+_BEGIN = "from sortie.perception.recordings.unpickle import try_out; try_out()"
 
 
 class UnpickleError(SortieError):
@@ -34,10 +48,13 @@ def load_data(path: Path | str) -> Any:
     """The object in a pickle file, of any protocol, written under numpy 1 or 2.
 
     Raises:
-        UnpickleError: a name beyond the table, a dtype that is not numbers or text, or a broken file.
+        UnpickleError: a name beyond the table, a dtype that is not numbers or text, a broken file, or one that takes too
+            much memory or time.
     """
     try:
-        return loads_data(Path(path).read_bytes())
+        data = Path(path).read_bytes()
+        _ensure_within_limits(data)
+        return loads_data(data)
     except (UnpickleError, OSError) as error:
         reason = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         raise UnpickleError(f"{path}: {reason}") from None
@@ -51,6 +68,79 @@ def loads_data(data: bytes) -> Any:
         raise
     except Exception as error:  # a broken pickle can raise nearly anything
         raise UnpickleError(f"cannot be unpickled, {type(error).__name__}: {error}") from None
+
+
+def try_out() -> None:
+    """In a process of its own: read the pickle on the standard input within limits, and write what is wrong with it."""
+    data = sys.stdin.buffer.read()
+    seconds = _seconds_for(data)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    most = now + _memory_for(data)
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    try:
+        fault = _nesting_fault(loads_data(data))
+    except UnpickleError as error:
+        fault = _too_big(data) if isinstance(error.__context__, MemoryError) else str(error)
+    sys.stdout.write(fault.encode(errors="backslashreplace").decode())
+
+
+def _ensure_within_limits(data: bytes) -> None:
+    """Refuse a pickle that takes too much memory, time or depth, before it is read in this process."""
+    done = subprocess.run([sys.executable, "-P", "-c", _BEGIN], input=data, capture_output=True, check=False)  # noqa: S603 - our own code
+    if done.returncode == -signal.SIGXCPU:
+        raise UnpickleError(f"takes more than {_seconds_for(data)} s to read, is damaged or no recording")
+    if done.returncode < 0:  # a stack that is too small, or memory
+        raise UnpickleError(f"ends the process that reads it ({signal.Signals(-done.returncode).name}), is damaged")
+    if done.returncode:
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise UnpickleError(_too_big(data) if "MemoryError" in last else f"cannot be read: {last}")
+    if done.stdout:
+        raise UnpickleError(done.stdout.decode())
+
+
+def _too_big(data: bytes) -> str:
+    return f"takes more than {_memory_for(data) // 2**20} MB of memory, is damaged or no recording"
+
+
+def _memory_for(data: bytes) -> int:
+    return MEMORY_BYTES + MEMORY_A_BYTE * len(data)
+
+
+def _seconds_for(data: bytes) -> int:
+    return TIME_S + TIME_A_MEGABYTE_S * len(data) // 10**6
+
+
+def _nesting_fault(data: Any) -> str:
+    """What is wrong with the nesting of containers; empty where nothing is."""
+    depths: dict[int, int] = {}  # by object, 0 while its items are looked at
+    waiting = [data]
+    while waiting:
+        one = waiting[-1]
+        if depths.get(id(one), 0):
+            waiting.pop()
+            continue
+        items = [item for item in _items(one) if isinstance(item, (dict, list, tuple, set, frozenset))]
+        deeper = [item for item in items if id(item) not in depths]
+        if deeper and id(one) not in depths:
+            depths[id(one)] = 0
+            waiting += deeper
+            continue
+        waiting.pop()
+        inside = [depths.get(id(item), 0) for item in items]
+        if 0 in inside:
+            return "holds a container that holds itself, must be data"
+        depths[id(one)] = 1 + max(inside, default=0)
+        if depths[id(one)] > MAX_DEPTH:
+            return f"is nested more than {MAX_DEPTH} deep, must be data"
+    return ""
+
+
+def _items(one: Any) -> list[Any]:
+    if isinstance(one, dict):
+        return [*one.keys(), *one.values()]
+    return list(one) if isinstance(one, (list, tuple, set, frozenset)) else []
 
 
 class _Data(pickle.Unpickler):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import collections
+import functools
 import os
 import pickle
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sortie.perception.recordings import unpickle
 from sortie.perception.recordings.unpickle import UnpickleError, load_data, loads_data
 
 DATA = {
@@ -146,6 +149,52 @@ def test_the_message_names_the_file(tmp_path: Path) -> None:
     path.write_bytes(pickle.dumps(Call(os.system, "true")))
     with pytest.raises(UnpickleError, match=r"x\.pkl: global posix\.system is refused, must be data: numbers, text"):
         load_data(path)
+
+
+def nested(depth: int, begin: bytes = b"", end: bytes = b".") -> bytes:
+    """A tuple in a tuple in a tuple ..., as a pickle."""
+    return b"\x80\x04" + begin + b")" + b"\x85" * depth + end
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (nested(200_000), "is nested more than 100 deep, must be data"),
+        (nested(200_000, b"}", b"Ns."), "ends the process that reads it (SIGSEGV), is damaged"),  # a key is hashed
+        (b"\x80\x04Nr\xff\xff\xff\x3f.", "takes more than 512 MB of memory, is damaged or no recording"),  # a memo
+        (b"\x80\x05\x96" + (6 << 30).to_bytes(8, "little") + b".", "takes more than 512 MB of memory"),
+        (b"\x80\x04]\x94h\x00a.", "holds a container that holds itself, must be data"),
+        (
+            b"\x80\x02cnumpy.core.numeric\n_frombuffer\n(C\x00cnumpy\ndtype\n(X\x02\x00\x00\x00U0K\x00K\x01tR"
+            b"J\xff\xff\xff\x7f\x85X\x01\x00\x00\x00CtR.",
+            "dtype 'U0' is refused, must be numbers or text",
+        ),
+    ],
+    ids=["deep", "deep key", "memo", "bytearray", "cycle", "no item size"],
+)
+def test_what_a_few_bytes_ask_for_is_limited(data: bytes, message: str, tmp_path: Path) -> None:
+    """200 kB of nested tuples ended the process, and 13 bytes took 6 GB."""
+    path = tmp_path / "x.pkl"
+    path.write_bytes(data)
+    with pytest.raises(UnpickleError, match="^" + re.escape(f"{path}: {message}")):
+        load_data(path)
+
+
+def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, slow = tmp_path / "x.pkl", "while True: pass"
+    path.write_bytes(pickle.dumps(1))
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 2))\n"
+    monkeypatch.setattr(unpickle, "_BEGIN", limit + slow)
+    with pytest.raises(UnpickleError, match=r"x\.pkl: takes more than 30 s to read, is damaged or no recording$"):
+        load_data(path)
+
+
+def test_data_within_the_limits_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.pkl"
+    shared = (1, 2)
+    data = {"shared": [shared] * 1000, "deep": functools.reduce(lambda inner, _: [inner], range(90), 0)}
+    path.write_bytes(pickle.dumps(data))
+    assert load_data(path) == data
 
 
 @settings(max_examples=300, deadline=None)
