@@ -187,7 +187,8 @@ def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) ->
         fly_batch(p.code, [(0, p.task(0))])
 
 
-def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     policy = tmp_path / "faulty.py"
     policy.write_text(FAULTY.format(what="raise RuntimeError('planted\\nin two lines')"))
     p, folder = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide")), tmp_path / "a"

@@ -462,7 +462,9 @@ def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: P
 
 def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
     missing = tmp_path / "none.safetensors"
-    done = sortie("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")
+    done = sortie(
+        "fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1", cwd=tmp_path
+    )
     assert done.returncode == 2
     assert done.stderr.strip() == f"error: {missing}: no such weights file; `sortie train` makes one"
 
@@ -478,7 +480,7 @@ def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_the_surrogate_cannot_do_is_one_line(field: str, value: str, told: str) -> None:
+def test_what_the_surrogate_cannot_do_is_one_line(field: str, value: str, told: str, tmp_path: Path) -> None:
     asked = ("--set", "perception.detector=surrogate", "--set", f"perception.{field}={value}", "--set", "duration_s=1")
-    done = sortie("fly", "track_target", *asked)
+    done = sortie("fly", "track_target", *asked, cwd=tmp_path)
     assert (done.returncode, done.stderr.strip()) == (2, f"error: {told}")
