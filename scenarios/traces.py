@@ -50,17 +50,20 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
         raise TraceError(f"{path}: no such trace")
     try:
         table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
+        names = table.column_names
+    except UnicodeDecodeError as error:
+        raise TraceError(f"{path}: names of columns are in another encoding, must be UTF-8") from error
     except (pa.ArrowException, OSError) as error:
         raise TraceError(f"{path}: is not a {path.suffix or 'Parquet'} table: {str(error).splitlines()[0]}") from error
     required = tuple(required)
     for name in required:
-        if name not in table.column_names:
+        if name not in names:
             raise TraceError(f"{path}: no column {name}, a trace needs {', '.join(required)}")
     if not 0 < table.num_rows <= MAX_ROWS:
         raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
     columns = {}
     for name, (low, high) in bounds.items():
-        if name not in table.column_names:
+        if name not in names:
             continue
         try:
             values = table[name].cast(pa.float64()).to_numpy()

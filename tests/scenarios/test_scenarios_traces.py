@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +16,14 @@ from sortie.scenarios.traces import TraceError, located, read_columns
 def rows(name: str) -> list[dict[str, str]]:
     with (ct.PAPER_120S / name).open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_a_trace_in_another_encoding_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_bytes("t_s,höhe_m\n0,1\n".encode("latin-1"))
+    what = f"{path}: names of columns are in another encoding, must be UTF-8"
+    with pytest.raises(TraceError, match=f"^{re.escape(what)}$"):
+        read_columns(path, {"t_s": (0.0, 1.0)})
 
 
 @pytest.mark.parametrize("name", ct.FILES)

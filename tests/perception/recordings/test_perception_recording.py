@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from recording_examples import score_map, small
 
+from sortie.perception.benchmark.manifest import BenchmarkError, read_arrays
 from sortie.perception.recordings.exchange import moved
 from sortie.perception.recordings.recording import RecordingError, cells_of, open_recording
 from sortie.perception.recordings.writing import write_recording
@@ -221,3 +223,28 @@ def test_moved_is_its_own_inverse_and_cells_follow_the_grid() -> None:
 
     row, column, inside = cells_of(np.array([(-102.4, 102.3, 4, 2, 0, 1), (102.4, 0, 4, 2, 0, 1)]), FULL)
     assert (row[0], column[0], inside.tolist()) == (0, 63, [True, False])
+
+
+@pytest.mark.parametrize("damage", ["stream", "encrypted", "method"])
+def test_a_damaged_archive_is_one_line(damage: str, tmp_path: Path) -> None:
+    """A deflate stream that is no longer one, and flags in the directory that other archives have."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, t_s=np.arange(1000.0))
+    raw = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        begin = archive.infolist()[0].header_offset
+    for signature, at in ((b"PK\x03\x04", begin), (b"PK\x01\x02", raw.rindex(b"PK\x01\x02"))):
+        flags, method = (6, 8) if signature == b"PK\x03\x04" else (8, 10)
+        assert raw[at : at + 4] == signature
+        if damage == "encrypted":
+            raw[at + flags] |= 1
+        if damage == "method":
+            raw[at + method] = 99
+    if damage == "stream":
+        name, extra = (int.from_bytes(raw[begin + k : begin + k + 2], "little") for k in (26, 28))
+        data = begin + 30 + name + extra
+        raw[data : data + 40] = b"\xff" * 40
+    path.write_bytes(raw)
+    for read, error in ((open_recording, RecordingError), (read_arrays, BenchmarkError)):
+        with pytest.raises(error, match=rf"^{re.escape(str(path))}: cannot be read[^\n]*$"):
+            read(path)  # type: ignore[operator]
