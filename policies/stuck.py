@@ -24,8 +24,8 @@ def main() -> None:
         if longest_s and still_s > longest_s and os.getppid() == parent:
             os.write(2, b"error: " + error.rstrip(b"\0") + b"\n")
             os.kill(parent, signal.SIGXCPU)  # by which it is known
-            select.select([0], [], [], 1.0)
-            os.kill(parent, signal.SIGKILL)
+            if not select.select([0], [], [], 1.0)[0]:
+                os.kill(parent, signal.SIGKILL)
             return
 
 

@@ -17,8 +17,8 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol
 
-from sortie.sim.campaign.one_process import OneProcess
-from sortie.sim.campaign.work import RunResult, Task, fly_batch, fly_in_worker, killed
+from sortie.sim.campaign.one_process import OneProcess, fly_apart
+from sortie.sim.campaign.work import RunResult, Task, fly_batch, killed
 from sortie.sim.folders import RunError
 
 BATCH_S = 1.0
@@ -71,7 +71,7 @@ class Dask:
 
         def submit(batch: list[Task]) -> None:
             name = f"sortie-{batch[0][0]}-{uuid.uuid4().hex[:12]}"
-            future = self._client.submit(fly_in_worker, code, batch, key=name, pure=False)
+            future = self._client.submit(fly_apart, code, batch, key=name, pure=False)
             flying[future] = batch
             done.add(future)
 

@@ -1,7 +1,7 @@
-"""An engine of one worker process without dask: where a campaign with policies of a user's own flies with `--workers 0`.
+"""Runs with policies of a user's own fly in a process beside the driver's, or beside the worker's on a cluster.
 
-The driver runs no user code. What ends the process, or cannot be interrupted, is one failed run, and the next one flies in
-a new process.
+What ends the process, or cannot be interrupted, is one failed run, and the next one flies in a new process. `OneProcess` is
+also an engine: the one that flies such a campaign with `--workers 0`, without dask.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from multiprocessing.connection import Connection
 
 from sortie.policies.user_calls import STUCK
-from sortie.sim.campaign.work import RunResult, Task, fly_in_worker, killed, stuck
+from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
 
 ATTEMPTS = 4
 """As often as dask's scheduler tries a run whose worker dies: a process may be killed for no fault of the run."""
@@ -33,7 +33,7 @@ class OneProcess:
 
     workers = 1
 
-    def __init__(self, undisturbed: Callable[[], AbstractContextManager[None]]) -> None:
+    def __init__(self, undisturbed: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
         """Args: `undisturbed` keeps Ctrl-C from a process that is started within it."""
         self._undisturbed = undisturbed
         self._process: subprocess.Popen[bytes] | None = None
@@ -42,7 +42,7 @@ class OneProcess:
     def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         """As `Engine`."""
         for task in tasks:
-            yield [self._fly(code, task)]
+            yield [self.fly(code, task)]
 
     def close(self) -> None:
         """End the process."""
@@ -52,7 +52,8 @@ class OneProcess:
             self._pipe.close()
         self._process = None
 
-    def _fly(self, code: str, task: Task) -> RunResult:
+    def fly(self, code: str, task: Task) -> RunResult:
+        """One run's row. Raises what the worker raises: RunError for other code or files."""
         for _ in range(ATTEMPTS):
             answer = self._answer(code, task)
             if isinstance(answer, Exception):
@@ -86,6 +87,19 @@ class OneProcess:
             )
         theirs.close()
         self._pipe = ours
+
+
+def fly_apart(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
+    """`fly_in_worker` for a worker of a cluster: runs with a user's code fly in a process beside it."""
+    if not any(flies_user_code(task) for task in tasks):
+        return fly_in_worker(code, tasks)
+    begin_s = time.perf_counter()
+    if not hasattr(_OF_THREAD, "one"):
+        _OF_THREAD.one = OneProcess()
+    return [_OF_THREAD.one.fly(code, task) for task in tasks], time.perf_counter() - begin_s
+
+
+_OF_THREAD = threading.local()
 
 
 def serve(file: int) -> None:

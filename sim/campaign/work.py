@@ -113,6 +113,11 @@ def _fly(run: int, task: str, code: str) -> RunResult:
     return RunResult(run, key, "done", "", record.fingerprint[:16], values)
 
 
+def flies_user_code(task: Task) -> bool:
+    """Whether a task's policy is in a file of a user's own."""
+    return any(path.endswith(".py") for path in json.loads(task[1])["files"])
+
+
 def killed(task: Task, code: str) -> RunResult:
     """The row of a run that no worker survived."""
     return _without_result(task, code, "WorkerDied: on every attempt")

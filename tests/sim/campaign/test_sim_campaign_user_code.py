@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import BASE, CAMPAIGN, write
+from campaign_examples import BASE, CAMPAIGN, CLUSTER, table_bytes, write
 
 import sortie
 
@@ -57,6 +57,21 @@ def test_what_a_policy_does_is_one_failed_run(
         assert error in row["error"]
         assert row["seed"] is not None
     assert sortie.campaign(campaign, out=tmp_path / "a", workers=0).flown == 0, "a resume does not stop there again"
+
+
+@CLUSTER
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(POLICY.format(what="re.match('(a+)+$', 'a' * 60 + 'b')"))
+    text = CAMPAIGN.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']").replace(
+        "{count: 6}", "{count: 2}"
+    )
+    campaign = write(tmp_path, text, BASE + "limits: {decision_s: 0.2}\n")
+    done = [sortie.campaign(campaign, out=tmp_path / f"{workers}", workers=workers) for workers in (0, 1)]
+    assert done[0].failed == done[1].failed > 0
+    assert table_bytes(tmp_path / "0") == table_bytes(tmp_path / "1")
 
 
 def test_the_driver_runs_no_decision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
