@@ -1,25 +1,16 @@
-"""Loops compiled to machine code by numba: rounded as written, no fast-math, without Python's global lock."""
+"""Compiled loops of this room: `compiled` (`sortie.scenarios.compiled`), and a fused multiply-add."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from numba import njit, types
+from numba import types
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
+from sortie.scenarios.compiled import compiled
 
-def compiled(loop: Callable[..., Any]) -> Any:
-    """The loop, compiled at its first call and kept for later processes where a folder for that can be written.
-
-    It may use constants of its own file alone: kept code does not see that another file has changed. A division by zero
-    gives an infinity, as in numpy.
-    """
-    try:
-        return njit(nogil=True, error_model="numpy", cache=True)(loop)
-    except RuntimeError:  # neither beside the source nor in the user's cache folder
-        return njit(nogil=True, error_model="numpy")(loop)
+__all__ = ["compiled", "fma"]
 
 
 def _fma(_: Any, a: Any, b: Any, c: Any) -> tuple[Signature, Any]:

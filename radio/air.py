@@ -21,25 +21,28 @@ import numpy as np
 import simpy
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.channel.snr import Channel, FloatArray, Jammer, SampleDraws
+from sortie.radio.channel.earshot import LinkList
+from sortie.radio.channel.snr import SQUARE, Channel, FloatArray, Jammer
 from sortie.radio.channel.traces import read_links
 from sortie.radio.counters import Counters
 from sortie.radio.goodput import Goodput
-from sortie.radio.mac.airtime import repair_wire_bytes, sample_wire
+from sortie.radio.mac.airtime import fragments, repair_wire_bytes
 from sortie.radio.mac.broadcasts import Broadcast, Broadcasts, OnHeard
 from sortie.radio.mac.jobs import End
 from sortie.radio.mac.medium import Medium
 from sortie.radio.overrides import Overrides
 from sortie.radio.relay import Routes
-from sortie.radio.sample import IntArray, Sample, Service
+from sortie.radio.sample import Sample, Service, Use
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
-from sortie.scenarios.streams import stream
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
-_SERVED, _DEADLINE_QUEUED = End.SERVED, End.DEADLINE_QUEUED
+_DEADLINE_QUEUED, _DEADLINE_IN_SERVICE = End.DEADLINE_QUEUED, End.DEADLINE_IN_SERVICE
+_UNREACHABLE = End.UNREACHABLE
 _DELIVERED, _LOST, _EXPIRED = Status.DELIVERED, Status.LOST, Status.EXPIRED
+HEARD_DB = 40.0
+"""SNR with which a link that is traced by its loss or goodput is heard, and its answers."""
 _WINDOW_S = 1e-3
 """A goodput measurement that is still going on counts once it is this old."""
 
@@ -100,19 +103,30 @@ class Air:
             trace = None if settings.trace is None else read_links(settings.trace, n_drones)
             self._overrides = Overrides(settings, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
         self._broadcasts = Broadcasts(
-            settings, self.channel, self.counters, self._gone, self._overrides,
-            seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread,
+            settings.group_rate_mbps, n_drones, self.counters, self._gone,
+            seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread, as_lists=n_drones <= SQUARE,
         )  # fmt: skip
-        self.medium = Medium[Sample, Broadcast](env, n_drones, self._begin, self._end, self._broadcasts.end)
-        self._service = Service(settings, seed, replication)
-        self._draws = SampleDraws(seed, replication)
+        self.medium = Medium[Sample, Broadcast](
+            env,
+            settings,
+            n_drones,
+            seed,
+            replication,
+            self.channel.noise_dbm,
+            self._begin,
+            self._end,
+            self._broadcasts.end,
+        )
+        self._links: LinkList | None = None
+        self._link_lists: tuple[NDArray[np.int64], NDArray[np.int64]]
+        self._service = Service(settings, self.channel.noise_dbm)
+        self._uses: dict[tuple[int, int], tuple[int, Use]] = {}  # of each link with unicast traffic, and its frame
         self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, made at first use
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
         self._in_flight: dict[int, Sample] = {}
         self._latest: dict[tuple[int, int, int, str], Sample] = {}
         self._routes = Routes(settings.relay_max_hops) if settings.relay_max_hops > 1 else None
-        self._seed = (seed, replication)
         self._numbers = 0
 
     # --- once a frame ----------------------------------------------------------------------------
@@ -125,7 +139,57 @@ class Air:
             self._overrides.advance(extra_loss_db, self.channel.noise_rise_db(jammers) if jammers else None)
         if self._routes is not None:
             self._routes.renew(self.link_mbps())
-        self.medium.retune()
+        for sender in range(self._n):
+            self._drained(sender)  # what has arrived so far went over the links as they were
+        self._retune()
+        self._set_links()
+
+    def _set_links(self) -> None:
+        """Tell the medium how strong everybody is at everybody else."""
+        links, given = self.channel.links, self._overrides
+        if links is not self._links:
+            self._links = links
+            begin = np.asarray(links.begin, np.int64)
+            receiver = links.receiver if links.is_square else links.receiver[links.by_sender]
+            self._link_lists = begin, np.ascontiguousarray(receiver, np.int64)
+        sender, receiver = links.sender, links.receiver
+        snr_db, extra = self.channel.now.snr_db, None
+        if given is not None:
+            square_db, traced, loss = given.snr_db(self.channel.snr_db), given.traced, given.group_loss()
+            answers = traced.T & ~traced  # the way back of a traced link carries answers, and descriptors by its SNR
+            loss[answers & (square_db < self._service.least_snr_db)] = 1.0
+            snr_db = np.where(traced | answers, HEARD_DB, square_db)[sender, receiver]
+            extra = loss[sender, receiver]
+        if not links.is_square:
+            snr_db = snr_db[links.by_sender]
+            extra = None if extra is None else extra[links.by_sender]
+        gain = np.nan_to_num(10.0 ** (np.asarray(snr_db, float) / 10.0))
+        self.medium.set_links(*self._link_lists, gain, is_square=links.is_square, frame=self.channel.frame, extra=extra)
+
+    def _retune(self) -> None:
+        """The links, or who is there, have changed: find out anew how those with traffic are used."""
+        self._uses = {}
+        for sender in range(self._n):
+            for k, s in enumerate(self.medium.queued(sender)):
+                use = self._use(s.sender, s.receiver)
+                if k == 0:
+                    self._service.begin(s, use, self._env.now, fresh=False)
+
+    def _use(self, sender: int, receiver: int) -> Use:
+        """How a link is used in this frame."""
+        found = self._uses.get((sender, receiver))
+        if found is not None:
+            return found[1]
+        now, medium = self._env.now, self.medium
+        flow = medium.flow(sender, receiver)
+        minstrel = self._service.minstrel
+        if minstrel is not None:
+            minstrel.sent(sender, receiver, now, medium.learned(flow).tolist())
+        given = None if self._overrides is None else self._overrides.link(sender, receiver)
+        use = self._service.use(sender, receiver, now, *self._snr_of(sender, receiver), receiver in self._gone, given)
+        medium.tune(flow, use.link)
+        self._uses[sender, receiver] = flow, use
+        return use
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way (see `Channel.reroute`)."""
@@ -175,8 +239,7 @@ class Air:
         """
         if sender in self._gone:
             return
-        frame = self._broadcasts.frame(sender, payload_bytes, on_heard)
-        self.medium.announce(frame, frame.residual, self._broadcasts.phase_s[sender])
+        self.medium.announce(self._broadcasts.frame(sender, payload_bytes, on_heard), self._broadcasts.phase_s[sender])
 
     # --- data ------------------------------------------------------------------------------------
 
@@ -226,9 +289,8 @@ class Air:
         hop = receiver if self._routes is None else self._routes.next_hop(sender, receiver, self._routes.max_hops)
         s = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            *sample_wire(payload_bytes, piece_bytes or self._settings.fragment_bytes, piece_bytes is not None),
-            self._draws.next(sender, hop), self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
-            self._order,
+            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes),
+            self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
         )  # fmt: skip
         s.receiver = hop
         self._in_flight[number] = s
@@ -242,6 +304,9 @@ class Air:
 
     def _queue(self, s: Sample) -> None:
         """Hand a sample to its sender's queue; there the newest of its kind stands for an older one."""
+        self._use(s.sender, s.receiver)
+        s.flow = self._uses[s.sender, s.receiver][0]
+        self._service.prepare(s)
         key = (s.sender, s.origin, s.target, s.kind)
         old = self._latest.get(key)
         self._latest[key] = s
@@ -249,6 +314,7 @@ class Air:
             self.medium.submit(s)
         elif old.live:
             served = self.medium.in_service(s.sender) is old
+            self._book(old)
             self.medium.replace(old, s)
             self._measure(old, served, self._env.now)
             self._close(old, _EXPIRED, "replaced")
@@ -268,15 +334,20 @@ class Air:
         for s in [s for s in self._in_flight.values() if s.sender == drone]:
             if s.number in self._in_flight:  # no earlier one's callback has settled it
                 if s.live:
-                    self._book(s)  # what it had put on the air; the medium's accounts are of now
                     self.medium.withdraw(s)
                 self._close(s, _LOST, "sender_gone")
-        self.medium.retune()
+        self._others_changed()
 
     def wake(self, drone: int) -> None:
         """A silenced drone is back: it sends and hears again."""
         self._gone.discard(drone)
-        self.medium.retune()
+        self._others_changed()
+
+    def _others_changed(self) -> None:
+        if self.channel.frame >= 0:
+            self.medium.sync()
+            self._retune()
+            self.medium.replan()
 
     def _refuse(self, event: simpy.Event) -> None:
         s = cast(Sample, event.value)
@@ -284,11 +355,8 @@ class Air:
             self._close(s, _LOST, "sender_gone")
 
     def _begin(self, s: Sample, now_s: float) -> None:
-        """A sample comes to the head of its queue, or its link has changed while it is there."""
-        self._book(s)
-        i, j = s.sender, s.receiver
-        given = None if self._overrides is None else self._overrides.link(i, j)
-        self._service.begin(s, now_s, *self._snr_of(i, j), j in self._gone, given)
+        """A sample comes to the head of its queue."""
+        self._service.begin(s, self._use(s.sender, s.receiver), now_s, fresh=True)
 
     def _snr_of(self, sender: int, receiver: int) -> tuple[float, float]:
         """Mean SNR of a link as its sender knows it, from the frame before, and as it is."""
@@ -303,18 +371,18 @@ class Air:
     def _end(self, s: Sample, how: End, now_s: float) -> None:
         """The medium is through with a sample's pass, or its deadline has passed."""
         self._measure(s, how is not _DEADLINE_QUEUED, now_s)
-        if how is not _SERVED:
+        if how is _DEADLINE_QUEUED or how is _DEADLINE_IN_SERVICE:
             queued = how is _DEADLINE_QUEUED and s.repairs == 0
             if queued and s.hops == 1:  # it may have come to the head at this very instant
                 s.t_first_s = nan
             self._close(s, _EXPIRED, "deadline_queued" if queued else "deadline_in_service")
             return
-        if s.unreachable:
-            self._close(s, _LOST, s.unreachable)
+        if how is _UNREACHABLE:
+            self._close(s, _LOST, s.unreachable or "no_link")
             return
         if s.reliable:
             s.wire_bytes += repair_wire_bytes(s.left)
-        lost = s.lose()
+        lost = s.end_pass()
         if lost and s.reliable:
             s.left = lost
             wait_s = self._settings.heartbeat_s + self._settings.nack_delay_s
@@ -327,19 +395,13 @@ class Air:
         else:
             self._close(s, _LOST, "fragment_lost")
 
-    def _order(self, s: Sample, count: int) -> IntArray:
-        """A random order of so many pieces, from the draw of the sample's present pass."""
-        entity = (s.sender, s.receiver, int(s.round_draw() * 2.0**53))
-        return stream(*self._seed, entity, "lost pieces").permutation(count)
-
     def _forward(self, s: Sample, now_s: float) -> None:
         """A relay has it: on to the next hop, as the links are now."""
         assert self._routes is not None  # noqa: S101 (nothing else sends it to another than its target)
         self._forget(s)
         here = s.receiver
         hop = self._routes.next_hop(here, s.target, self._routes.max_hops - s.hops)
-        s.forward(here, hop, now_s, self._draws.next(here, hop), self._drained(here))
-        s.pass_bytes = self._service.wire_bytes(s)
+        s.forward(here, hop, now_s, self._drained(here))
         self._queue(s)
 
     def _forget(self, s: Sample) -> None:
@@ -355,19 +417,16 @@ class Air:
             self._close(s, _EXPIRED, "deadline_in_service")
             return
         s.repairs += 1
-        s.passes += 1
-        s.restart()
-        s.pass_bytes = self._service.wire_bytes(s)
-        s.live = True
+        self._use(s.sender, s.receiver)
+        self._service.prepare(s)
         self.medium.submit(s)
 
     def _close(self, s: Sample, status: Status, reason: str) -> None:
         del self._in_flight[s.number]
         self._forget(s)
-        if s.pieces is not None and s.remaining < 1.0:  # cut short: its first pieces are there
-            self._book(s)
-            s.lose()
-        row = s.row(status, reason, self._env.now)
+        if s.pieces is not None and s.arrived_frames:  # cut short: its first pieces are there
+            s.end_pass()
+        row = s.row_of(status, reason, self._env.now)
         c = self.counters
         c.data_wire_bytes += row.wire_bytes
         c.data_delivered_bytes += row.arrived_bytes
@@ -416,15 +475,17 @@ class Air:
 
     def _book(self, s: Sample) -> None:
         """Count what was acknowledged since the last time."""
-        if s.remaining < s.mark_left:
-            self._service.learn(s, self._env.now)
-            self._drained_bits[s.sender] += s.book()
+        done = s.arrived_frames - s.mark_frames
+        if done > 0:
+            s.mark_frames = s.arrived_frames
+            bits = done * self._service.bits_of_a_frame(s)
+            s.mark_bits += bits
+            self._drained_bits[s.sender] += bits
 
     def _drained(self, sender: int) -> float:
         """What the sender has got through so far, bits as goodput counts them."""
         head = self.medium.in_service(sender)
         if head is not None:
-            self.medium.sync()
             self._book(head)
         return self._drained_bits[sender]
 
@@ -433,8 +494,11 @@ class Air:
         if served:
             self._book(s)
             window = now_s - s.mark_s
-            if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.t_start_s):
-                self._goodput.measured(s.sender, s.receiver, s.mark_bits / window * 1e-6, now_s)
+            if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.begun_s):
+                mbps = min(
+                    s.mark_bits / window * 1e-6, s.full_mbps
+                )  # a lone frame is acknowledged later than it arrives
+                self._goodput.measured(s.sender, s.receiver, mbps, now_s)
         else:
             waited = now_s - s.t_queued_s
             if s.repairs == 0 and waited >= _WINDOW_S:
@@ -445,13 +509,12 @@ class Air:
 
     @property
     def airtime_s(self) -> list[float]:
-        """Seconds each drone has transmitted so far: data with retries and collisions, and context frames."""
-        self.medium.sync()
+        """Seconds each drone has transmitted so far: data with retries and collisions, answers, and context frames."""
         return self.medium.transmit_s
 
     @property
     def utilisation(self) -> float:
-        """Fraction of the time so far in which the channel was claimed."""
+        """Fraction of the time so far in which something was on the air."""
         return self.medium.utilisation
 
     @property
@@ -462,6 +525,6 @@ class Air:
     def finish(self) -> list[Transmission]:
         """What is still in flight at the end, by number; call it once, when the clock has stopped."""
         self.medium.sync()
-        for s in self._in_flight.values():
-            self._book(s)
-        return [s.row(Status.IN_FLIGHT, "", nan) for _, s in sorted(self._in_flight.items())]
+        for sender in range(self._n):
+            self._drained(sender)
+        return [s.row_of(Status.IN_FLIGHT, "", nan) for _, s in sorted(self._in_flight.items())]

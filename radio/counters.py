@@ -28,4 +28,4 @@ class Counters:
     lost_to: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
     """The same by cause, `CAUSES`; their sum is `missed`."""
     collided: int = 0
-    """Broadcasts lost to a collision with another."""
+    """Broadcasts that a collision kept from at least one living drone."""

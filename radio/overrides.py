@@ -1,26 +1,22 @@
 """What stands in place of the link models, or on top of them: link traces and bursts of loss.
 
 Frames of a traced link go by the trace, those of any other by the models and, where the scenario has them, bursts.
-What happens to a unicast frame's tries is worked out where its sample is served (`sortie.radio.sample`); whom a group frame
-reaches is settled here, by a uniform number for each link and frame.
+The medium draws what each frame on the air loses to them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import isnan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.radio.channel.bursts import PairNumbers, PairStates
+from sortie.radio.channel.bursts import PairStates
 from sortie.radio.channel.traces import Given, LinkTrace
-from sortie.radio.rates import mean_group_per, snr_index
 from sortie.radio.settings import AirSettings
 
 FloatArray = NDArray[np.float64]
-_GOLDEN = 0.6180339887498949
 
 
 class LinkNow(NamedTuple):
@@ -53,16 +49,10 @@ class Overrides:
         self._states = None
         if bursts.good_to_bad > 0.0 or bursts.loss_good > 0.0:
             self._states = PairStates(bursts, n, seed, replication, frame_s)
-        self._numbers = PairNumbers(seed, replication, n, "override loss", ordered=True)
         self._frame = -1
         nothing = np.full((n, n), np.nan)
         self._given = Given(nothing, nothing, nothing)
         self._burst_loss: FloatArray = np.zeros((n, n))
-        self._draws: FloatArray = np.zeros((n, n))
-        # group frames go out in the primary 20 MHz with the whole power, so over less noise
-        self._group_gain_db = 10.0 * float(np.log10(settings.bandwidth_mhz / 20.0))
-        self._group_rate_mbps = settings.group_rate_mbps
-        self._k_db = settings.rician_k_db
         self._snr_rows: list[list[float]] | None = None
         self._known_rows: list[list[float]] | None = None
 
@@ -79,7 +69,6 @@ class Overrides:
             noise_rise_db: [N], how far jammers lift each receiver's noise; None is not at all.
         """
         self._frame += 1
-        self._draws = self._numbers.row()
         if self._states is not None:
             self._burst_loss = self._states.advance()
         if self._trace is not None:
@@ -128,26 +117,6 @@ class Overrides:
         loss, mbps = float(self._given.loss[sender, receiver]), float(self._given.goodput_mbps[sender, receiver])
         return LinkNow(float(self._burst_loss[sender, receiver]), loss, mbps)
 
-    def heard(self, sender: int, heard: Sequence[int], mpdu_bytes: int, times: int) -> list[int]:
-        """Whom a group frame reaches, ascending.
-
-        Args:
-            heard: whom it reaches by the models, ascending.
-            times: how many group frames the sender has sent in this frame before.
-        """
-        draws = (self._draws[sender] + times * _GOLDEN) % 1.0
-        on_top = self._burst_loss[sender]
-        if self._trace is None:
-            return [i for i in heard if draws[i] >= on_top[i]]
-        loss, snr_db = self._given.loss[sender], self._given.snr_db[sender]
-        traced = ~(np.isnan(loss) & np.isnan(snr_db))
-        reached = [i for i in heard if not traced[i] and draws[i] >= on_top[i]]
-        for i in np.flatnonzero(traced).tolist():
-            missed = float(loss[i])
-            if isnan(missed):
-                per = mean_group_per(self._group_rate_mbps, self._k_db, mpdu_bytes)  # kept: frames come in few lengths
-                missed = per[snr_index(float(snr_db[i]) + self._group_gain_db)]
-                missed = 1.0 - (1.0 - missed) * (1.0 - float(on_top[i]))
-            if i != sender and draws[i] >= missed:
-                reached.append(i)
-        return sorted(reached)
+    def group_loss(self) -> FloatArray:
+        """[N, N]: probability that a group frame is lost besides what its SNR loses, or in place of it where traced."""
+        return np.where(np.isnan(self._given.loss), self._burst_loss, self._given.loss)

@@ -11,11 +11,17 @@ from sortie.radio.rates import STANDARDS, StandardName
 AntennaName = Literal["isotropic", "dipole"]
 PathLossName = Literal["log_distance", "free_space", "two_ray"]
 RateControlName = Literal["ideal", "minstrel"]
+FadingName = Literal["exchange", "frame"]
+AccessName = Literal["voice", "video", "best_effort", "background"]
 _CHOICES = {
     "standard": tuple(STANDARDS),
     "antenna": get_args(AntennaName),
     "path_loss": get_args(PathLossName),
     "rate_control": get_args(RateControlName),
+    "fading": get_args(FadingName),
+    "context_class": get_args(AccessName),
+    "payload_class": get_args(AccessName),
+    "block_ack_window": (64, 256),
 }
 
 
@@ -32,6 +38,28 @@ class BurstSettings:
     """Probability that a good pair loses a frame at a try, in addition to the losses that follow from the SNR."""
     loss_bad: float = 1.0
     """The same for a bad pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccessSettings:
+    """How one class of traffic gets at the medium (EDCA)."""
+
+    aifsn: int
+    """Slots of idle medium, after a SIFS, before the backoff counts down."""
+    cw_min: int
+    """Largest backoff at a first try, in slots; one less than a power of two."""
+    cw_max: int
+    """Largest backoff after failures."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdcaSettings:
+    """The four classes of 802.11, highest priority first; defaults are the standard's."""
+
+    voice: AccessSettings = AccessSettings(2, 3, 7)
+    video: AccessSettings = AccessSettings(2, 7, 15)
+    best_effort: AccessSettings = AccessSettings(3, 15, 1023)
+    background: AccessSettings = AccessSettings(7, 15, 1023)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +97,23 @@ class AirSettings:
     shadowing_distance_m: float | None = None
     """Correlation distance of shadowing; None: every pair has its own shadowing, correlated in time only."""
     rician_k_db: float = 12.0
+    fading: FadingName = "exchange"
+    """A link's fade is drawn anew for each transmission (`exchange`), or once a frame (`frame`)."""
+    preamble_detection_dbm: float = -82.0
+    """Weakest frame that is received, and that holds others back (carrier sense)."""
     group_rate_mbps: float = 6.0
     """Basic rate of group-addressed frames."""
     rate_control: RateControlName = "ideal"
     """`ideal` picks the rate by the SNR of the frame before, `minstrel` by statistics of acknowledged frames."""
+    context_class: AccessName = "voice"
+    """EDCA class of group-addressed frames."""
+    payload_class: AccessName = "best_effort"
+    """EDCA class of unicast frames."""
+    edca: EdcaSettings = EdcaSettings()
+    rts: bool = False
+    """Whether a request and a clearance to send (RTS/CTS) precede each A-MPDU."""
+    block_ack_window: int = 64
+    """Frames that may wait for their block acknowledgement: 64 or 256."""
     retry_limit: int = 7
     """MAC retries of a unicast frame."""
     max_ampdu_frames: int = 64
@@ -108,10 +149,12 @@ class AirSettings:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> AirSettings:
-        """Settings from a mapping, such as a scenario's `radio` section; `bursts` is a mapping too.
+        """Settings from a mapping, such as a scenario's `radio` section; `bursts` and `edca` are mappings too.
 
         Raises:
             TypeError: an unknown name.
             ValueError: see the class.
         """
-        return cls(**{**values, "bursts": BurstSettings(**values.get("bursts", {}))})
+        edca = {name: AccessSettings(**each) for name, each in values.get("edca", {}).items()}
+        parts = {"bursts": BurstSettings(**values.get("bursts", {})), "edca": EdcaSettings(**edca)}
+        return cls(**{**values, **parts})

@@ -3,118 +3,96 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
-from math import inf
 
-from sortie.radio.channel.snr import Channel
-from sortie.radio.counters import Counters
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.radio.counters import CAUSES, Counters
 from sortie.radio.mac.airtime import frame_bytes, group_frame_s
 from sortie.radio.mac.jobs import GroupFrame
-from sortie.radio.mac.medium import CW_CONTEXT
-from sortie.radio.overrides import Overrides
-from sortie.radio.settings import AirSettings
 from sortie.scenarios.streams import stream
 
 MAX_GROUP_PAYLOAD_BYTES = 2200
 """A group-addressed sample is one 802.11 frame."""
 
 _GROUP_OVERHEAD_BYTES = frame_bytes(0, unicast=False)
+_HEARD = len(CAUSES) + 1
+"""As `sortie.radio.mac.edca` numbers fates: 1 and on are the causes, then that it was heard."""
+_COLLISIONS = 3
 
 OnHeard = Callable[[Sequence[int]], None]
 
 
 class Broadcast(GroupFrame):
-    """A context frame with its length and who wants to know."""
+    """A context frame and who wants to know."""
 
-    __slots__ = ("mpdu_bytes", "on_heard", "residual")
+    __slots__ = ("on_heard",)
 
-    def __init__(
-        self, sender: int, airtime_s: float, slots: int, residual: float, mpdu_bytes: int, on_heard: OnHeard
-    ) -> None:
-        self.sender, self.airtime_s, self.slots = sender, airtime_s, slots  # as GroupFrame, in one go
-        self.fire_s = inf
-        self.residual = residual
-        self.mpdu_bytes = mpdu_bytes
+    def __init__(self, sender: int, airtime_s: float, wire_bytes: int, on_heard: OnHeard) -> None:
+        super().__init__(sender, airtime_s, wire_bytes)
         self.on_heard = on_heard
 
 
 class Broadcasts:
     """The group-addressed half of the air; `Air` documents the arguments.
 
-    `gone` is the air's own set of silenced drones;
-    `overrides` None is none. `phase_s` is how long after the call each drone's frames reach
+    `gone` is the air's own set of silenced drones; `phase_s` is how long after the call each drone's frames reach
     its radio.
     """
 
     def __init__(
-        self,
-        settings: AirSettings,
-        channel: Channel,
-        counters: Counters,
-        gone: Set[int],
-        overrides: Overrides | None,
-        *,
-        seed: int,
-        replication: int,
-        frame_s: float,
-        publish_spread: float,
-    ) -> None:
-        self._rate_mbps = settings.group_rate_mbps
-        self._channel = channel
-        self._counters = counters
-        self._gone = gone
-        self._overrides = overrides
-        self._n = n = channel.n
-        self._access_streams = [stream(seed, replication, i, "access") for i in range(n)]
-        self._access: list[list[tuple[int, float]]] = [[] for _ in range(n)]  # backoff slots and residual
+        self, rate_mbps: float, n: int, counters: Counters, gone: Set[int],
+        *, seed: int, replication: int, frame_s: float, publish_spread: float, as_lists: bool,
+    ) -> None:  # fmt: skip
+        self._rate_mbps, self._n, self._counters, self._gone, self._as_lists = rate_mbps, n, counters, gone, as_lists
         self._airtime_s: dict[int, float] = {}  # by payload, bytes
         self.phase_s = [
             float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
         ]
-        self._heard_in = [-1] * n  # the last frame in which each drone was on the air
-        self._heard_times = [0] * n  # how often in that frame before
 
     def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
-        """One more frame of a drone, with its own random draws; arguments and errors as for `Air.broadcast`."""
+        """One more frame of a drone; arguments and errors as for `Air.broadcast`."""
         if not 0 <= sender < self._n:
             raise ValueError(f"sender is {sender}, must be in [0, {self._n - 1}]")
         if not 1 <= payload_bytes <= MAX_GROUP_PAYLOAD_BYTES:
             raise ValueError(f"payload_bytes is {payload_bytes}, must be in [1, {MAX_GROUP_PAYLOAD_BYTES}]")
-        ready = self._access[sender]
-        if not ready:
-            drawn = self._access_streams[sender].random((256, 2)).tolist()[::-1]
-            ready.extend([(int(slot_u * (CW_CONTEXT + 1)), residual) for slot_u, residual in drawn])
-        slots, residual = ready.pop()
         airtime_s = self._airtime_s.get(payload_bytes)
         if airtime_s is None:
             airtime_s = self._airtime_s[payload_bytes] = group_frame_s(payload_bytes, self._rate_mbps)
         counters = self._counters
         counters.broadcasts += 1
         counters.context_sent_bytes += payload_bytes
-        return Broadcast(sender, airtime_s, slots, residual, payload_bytes + _GROUP_OVERHEAD_BYTES, on_heard)
+        return Broadcast(sender, airtime_s, payload_bytes + _GROUP_OVERHEAD_BYTES, on_heard)
 
-    def end(self, frame: Broadcast, collided: bool) -> None:
-        """The medium is through with a frame."""
+    def end(self, frame: Broadcast, receivers: NDArray[np.int64], fates: NDArray[np.uint8]) -> None:
+        """The medium is through with a frame; receivers that it does not name are out of its reach."""
         counters, sender, gone = self._counters, frame.sender, self._gone
-        counters.context_wire_bytes += frame.mpdu_bytes
+        counters.context_wire_bytes += frame.wire_bytes
         living = self._n - 1 - (len(gone - {sender}) if gone else 0)
-        if collided:
-            counters.collided += 1
-            counters.missed += living
-            counters.lost_to["collision_context"] += living
-            frame.on_heard([])
-            return
-        index, times = self._channel.frame, 0
-        if self._heard_in[sender] == index:
-            times = self._heard_times[sender] = self._heard_times[sender] + 1
+        if self._as_lists and not gone:
+            fate_list, receiver_list = fates.tolist(), receivers.tolist()
+            heard: Sequence[int] = [
+                j for j, fate in zip(receiver_list, fate_list, strict=True) if fate == _HEARD and j != sender
+            ]
+            if len(heard) < living:
+                self._miss(np.delete(fates, sender) if len(fates) == self._n else fates, living - len(heard))
         else:
-            self._heard_in[sender], self._heard_times[sender] = index, 0
-        heard = self._channel.heard(sender, frame.mpdu_bytes, times)
-        if self._overrides is not None:
-            heard = self._overrides.heard(sender, heard, frame.mpdu_bytes, times)
-        if gone:
-            heard = [i for i in heard if i not in gone]
-        count = len(heard)
-        counters.receptions += count
-        counters.missed += living - count
-        counters.lost_to["weak_signal"] += living - count
+            counted = receivers != sender
+            if gone:
+                counted &= ~np.isin(receivers, list(gone))
+            alive, fates = receivers[counted], fates[counted]
+            found = alive[fates == _HEARD]
+            if len(found) < living:
+                self._miss(fates, living - len(found))
+            heard = found.tolist() if self._as_lists else found
+        counters.receptions += len(heard)
         frame.on_heard(heard)
+
+    def _miss(self, fates: NDArray[np.uint8], missed: int) -> None:
+        counters = self._counters
+        counters.missed += missed
+        by_cause = np.bincount(fates, minlength=_HEARD + 1)[1:_HEARD].tolist()
+        for name, count in zip(CAUSES, by_cause, strict=True):
+            counters.lost_to[name] += count
+        counters.lost_to["weak_signal"] += missed - sum(by_cause)
+        counters.collided += any(by_cause[:_COLLISIONS])

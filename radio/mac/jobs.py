@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import inf, nan
+from math import nan
 
-from sortie.radio.mac.airtime import Exchanges
-from sortie.radio.mac.contention import DIFS_S, contention
-
-_IDLE_ALONE_S = contention(1).idle_s
+import numpy as np
 
 
 class End(Enum):
     """How a job left the medium."""
 
-    SERVED = "served"
+    ARRIVED = "arrived"
+    """All of it is at the receiver."""
+    OVER = "over"
+    """Every fragment has arrived or has used up its tries."""
+    UNREACHABLE = "unreachable"
+    """Nobody answered its first frame."""
     DEADLINE_QUEUED = "deadline_queued"
     DEADLINE_IN_SERVICE = "deadline_in_service"
 
@@ -22,53 +24,38 @@ class End(Enum):
 class AirJob:
     """One sample's claim on the air; subclassed by what knows the sample.
 
-    `remaining` runs from 1 to 0 while it is served. `granted_s` is the channel time that it was given
-    (shares of contention included), `alone_s` the channel time that it needs alone, `need_s` beside the senders
-    that are backlogged now.
+    `row` is its place in the medium's tables while it is there, else −1; `frames`, `full_bytes` and `last_bytes` are the
+    number of its frames (MPDUs) and the length of each and of the last; `t_start_s` is when it came to the head of its
+    sender's queue.
     """
 
     __slots__ = (
-        "alone_s",
-        "clean_s",
-        "collided_s",
-        "count",
-        "deadline_s",
-        "granted_s",
-        "live",
-        "need_s",
-        "number",
-        "ppdu_s",
-        "remaining",
-        "sender",
-        "t_start_s",
-    )
+        "arrived_frames", "deadline_s", "dropped", "flow", "frames", "full_bytes", "granted_s", "here", "keeps_frames",
+        "last_bytes", "live", "number", "pass_granted_s", "row", "sender", "sent_frames", "t_start_s",
+    )  # fmt: skip
 
     def __init__(self, number: int, sender: int, deadline_s: float) -> None:
         self.number = number
         self.sender = sender
         self.deadline_s = deadline_s
-        self.remaining = 1.0
-        self.granted_s = 0.0
-        self.t_start_s = nan
         self.live = True
-        self.count = self.ppdu_s = self.clean_s = self.collided_s = self.alone_s = self.need_s = 0.0
-
-    def demand(self, exchanges: Exchanges, tries: float = 1.0) -> None:
-        """Set the load that the whole job puts on the medium, each frame sent `tries` times; `remaining` stays."""
-        self.count = count = exchanges.count * tries
-        self.ppdu_s = ppdu_s = exchanges.ppdu_s * tries
-        self.clean_s = clean_s = exchanges.clean_s * tries
-        self.collided_s = ppdu_s + count * DIFS_S
-        self.alone_s = clean_s + count * _IDLE_ALONE_S
+        self.row = self.flow = -1
+        self.frames = self.full_bytes = self.last_bytes = 0
+        self.arrived_frames = self.sent_frames = 0  # of this pass, as the medium told last
+        self.dropped: list[int] = []  # frames of this pass that used up their tries, by index
+        self.keeps_frames = False  # whether `here` is kept: which frames of this pass are at the receiver
+        self.here = np.arange(0)
+        self.granted_s = self.pass_granted_s = 0.0
+        self.t_start_s = nan
 
 
 class GroupFrame:
     """One group-addressed frame; subclassed by what knows its content."""
 
-    __slots__ = ("airtime_s", "fire_s", "sender", "slots")
+    __slots__ = ("airtime_s", "row", "sender", "wire_bytes")
 
-    def __init__(self, sender: int, airtime_s: float, slots: int) -> None:
+    def __init__(self, sender: int, airtime_s: float, wire_bytes: int) -> None:
         self.sender = sender
         self.airtime_s = airtime_s
-        self.slots = slots
-        self.fire_s = inf
+        self.wire_bytes = wire_bytes
+        self.row = -1

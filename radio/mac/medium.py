@@ -1,104 +1,271 @@
-"""The shared medium on the SimPy clock: who may use the air, and when a sample is through.
+"""The shared medium on the SimPy clock: exchange by exchange as 802.11's EDCA, without an event for each exchange.
 
-Two classes of traffic.
-
-**Data** is a fluid. Each sender has a first-in-first-out queue; while n senders are backlogged each is given
-1/n of the channel's time, and of that its own exchanges, its idle slots and its part of the collisions are
-paid (Bianchi's model for n). So a sample with exchanges X needs n · X.channel_s(n) seconds while n stays.
-
-**Context** (group-addressed frames) goes first. A frame that finds data on the air waits for the rest of that
-exchange (uniform), then all waiting context frames count down backoff slots; the lowest counter sends, equal
-ones collide, the others freeze. Data stand still from the countdown to the end of the last waiting frame.
-
-Events: one timer for the data (next completion or deadline, never per fragment) and one for the frame on the
-air. A timer that turns out to be early because others joined is set anew; it never polls.
+`sortie.radio.mac.edca` simulates the stations. This file brings it onto the clock. It keeps two copies of the stations'
+state. The *settled* one is at the last moment at which something came from outside: a job, a withdrawal, a change of the
+links. From it the *planned* one is run ahead to the next moment at which somebody outside must hear something: a sample
+is through or given up, a group frame is over, a deadline passes. One timer is set there, and when it fires the plan
+becomes the settled state. If something comes from outside earlier, the plan is thrown away. The random numbers are
+counted by station, so what is run again draws the same, and the result does not depend on how often that happens.
 """
 
 from __future__ import annotations
 
-from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable
 from heapq import heappop, heappush
-from math import inf, nextafter
-from typing import Generic, TypeVar
+from math import inf, nan
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
 import simpy
+from numpy.typing import NDArray
 
-from sortie.radio.mac.contention import SIFS_S, SLOT_S, contention
+from sortie.radio.channel.draws import fade_table_db
+from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
-
-AIFS_CONTEXT_S = SIFS_S + 2 * SLOT_S
-CW_CONTEXT = 15
-_EPS_S = 1e-10
-_SERVED = End.SERVED  # members of an enumeration are slow to look up
+from sortie.radio.rates import CURVES, LEGACY_CURVES, STANDARDS, group_curve
+from sortie.radio.settings import AirSettings, EdcaSettings
+from sortie.scenarios.streams import stream
 
 J = TypeVar("J", bound=AirJob)
 F = TypeVar("F", bound=GroupFrame)
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+PREAMBLE_SINR_DB = 4.0
+"""Below this ratio of signal to interference and noise, a preamble is not detected."""
+_NS = 1e-9
+_AHEAD_NS = 100_000_000
+"""A plan goes no further than this; frames of the flight change the links as often."""
+_MODULE: list[Any] = []
+
+
+def _edca() -> Any:
+    """The compiled stations, imported at their first use: numba takes half a second."""
+    if not _MODULE:
+        from sortie.radio.mac import edca
+
+        _MODULE.append(edca)
+    return _MODULE[0]
+
+
+class Link(NamedTuple):
+    """How a sender uses a link to one receiver at present."""
+
+    mcs: int
+    dead: bool = False
+    """Whether nobody is there to answer."""
+    rate_mbps: float = 0.0
+    """In place of the MCS's, with `frames` in an A-MPDU; 0 is the MCS's own."""
+    frames: int = 0
+    loss: float = nan
+    """Probability that a try is lost, in place of the packet error rate."""
+    burst_loss: float = 0.0
+    """Probability that a try is lost besides the packet error rate."""
+
+
+class _State:
+    """Everything about the stations that a run changes, in arrays; `now_ns` is how far they have been run."""
+
+    __slots__ = ("arrays", "jobs", "now_ns")
+
+    def __init__(self, arrays: tuple[NDArray[Any], ...], jobs: int, now_ns: int) -> None:
+        self.arrays, self.jobs, self.now_ns = arrays, jobs, now_ns
+
+    def clone(self) -> _State:
+        return _State(tuple(a.copy() for a in self.arrays), self.jobs, self.now_ns)
+
+
+_S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LI, _LS, _DROPS = range(13)
+_JOBS, _FLOWS, _MOST_DROPS = 64, 32, 8192
 
 
 class Medium(Generic[J, F]):
-    """One channel that everybody hears.
+    """The air between stations that hear one another as far as the links allow.
 
     Args:
         env: the clock.
-        n_drones: senders are 0 … n_drones − 1.
-        on_begin: called with a job and the time when it comes to the head of its queue, and again by `retune` while
-            it is there; must call `job.demand`.
-        on_end: called with a job, how it ended and the time, once it is through or its deadline has passed, after
-            the medium has moved on.
-        on_group_end: called at a context frame's end with the frame and whether it collided.
+        settings: see `sortie.radio.settings.AirSettings`.
+        n_drones: stations are 0 … n_drones − 1.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
+        noise_dbm: of the whole channel.
+        on_begin: called with a job and the time when it comes to the head of its sender's queue.
+        on_end: called with a job, how it ended and the time, after the medium has moved on.
+        on_group_end: called at a group frame's end with the frame, the ids of those within its reach and what became of
+            it at each (`edca.HEARD` or a cause).
+
+    `set_links` must be called before the first job.
     """
 
     def __init__(
         self,
         env: simpy.Environment,
+        settings: AirSettings,
         n_drones: int,
+        seed: int,
+        replication: int,
+        noise_dbm: float,
         on_begin: Callable[[J, float], None],
         on_end: Callable[[J, End, float], None],
-        on_group_end: Callable[[F, bool], None],
+        on_group_end: Callable[[F, IntArray, NDArray[np.uint8]], None],
     ) -> None:
         self._env = env
         self._on_begin, self._on_end, self._on_group_end = on_begin, on_end, on_group_end
-        self._queues: list[deque[J]] = [deque() for _ in range(n_drones)]
-        self._heads: dict[int, J] = {}
-        self._deadlines: list[tuple[float, int, int, J]] = []
+        self._n = n = n_drones
+        self._queues: list[deque[J]] = [deque() for _ in range(n)]
+        self._deadlines: list[tuple[int, int, int, J]] = []
         self._pushes = 0
-        table = [contention(max(1, k)) for k in range(n_drones + 1)]
-        self._idle_s = [c.idle_s for c in table]
-        self._collisions = [c.collisions for c in table]
-        self._sends = [c.sends_per_success for c in table]
-        self._last_s = env.now
+        self._e = e = _edca()
         self._begin_s = env.now
-        self._due_s = inf
         self._timer: simpy.Event | None = None
-        self._waiting: list[F] = []
-        self._context_from_s = inf
-        self._context_until_s = -inf
-        self._context_fire_s = inf
-        self._context_target_s = inf  # when the frame that is to win ends, as the clock will say it
-        self._context_due_s = inf
-        self._context_timer: simpy.Event | None = None
-        self._coming: list[tuple[float, int, float, F, float]] = []  # the next to contend comes last
-        self.transmit_s = [0.0] * n_drones
-        """Seconds each drone has transmitted: data with retries and collisions, and context frames."""
-        self.data_busy_s = 0.0
-        self.context_busy_s = 0.0
+        self._told: list[tuple[int, int, J | F | None]] = []
+        self._is_telling = False
+        self._free = list(range(_JOBS))[::-1]
+        self._finished: list[int] = []
+        self._at_row: dict[int, J | F] = {}
+        self._flows: dict[tuple[int, int], int] = {}
+        self._is_square = True
+        self._settings = settings
+        s, order = _tables(e, settings, n, noise_dbm)
+        self._ints, self._floats, self._rates, self._limits = s
+        self._group_access, self._payload_access = order
+        keys = [stream(seed, replication, i, "channel access").bit_generator.random_raw() for i in range(n)]
+        self._keys = np.array(keys, np.uint64)
+        self._fade = (10.0 ** (np.asarray(fade_table_db(settings.rician_k_db), float) / 10.0)).astype(np.float32)
+        curves = [*CURVES, group_curve(settings.group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
+        self._curves = np.array(curves)
+        self._window = window = int(self._ints[e.C_BLOCK])
+        stations = np.zeros((n, e.STATION_COLUMNS), np.int64)
+        for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT, e.NEXT_AT):
+            stations[:, column] = e.FAR
+        for column in (e.LOCK, e.CANDIDATE, e.HEAD, e.HEAD_LOW, e.TAIL, e.TAIL_LOW, e.COMING, e.TX_JOB):
+            stations[:, column] = -1
+        idle_ns = self._ns(env.now) - 10**9
+        stations[:, e.IDLE_AT] = stations[:, e.CANDIDATE_AT] = stations[:, e.TX_BEGIN] = idle_ns
+        for a in range(2):
+            stations[:, e.BEGIN + a] = idle_ns + e.SIFS + self._ints[e.C_AIFSN + a] * e.SLOT
+            stations[:, e.WINDOW + a] = self._ints[e.C_WINDOW + a]
+        mcs = len(self._rates)
+        self._settled = _State(
+            (
+                stations, np.zeros(n), np.zeros(n * n), np.zeros(n * n, np.uint8), np.zeros(5, np.int64),
+                np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
+                np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
+                np.zeros((_FLOWS, e.FLOW_COLUMNS), np.int64), np.zeros((_FLOWS, mcs, 2), np.int64),
+                np.zeros((_MOST_DROPS, 2), np.int64),
+            ),
+            _JOBS, self._ns(env.now) - 1,
+        )  # fmt: skip
+        self._settled.arrays[_G][e.G_SINCE] = self._ns(env.now)
+        self._planned = self._settled.clone()
+        self._flow_floats = np.zeros((_FLOWS, 3))
+        self._orders = np.zeros((_FLOWS, mcs), np.int64)
+        self._out = np.zeros((2 * n + 8, 2), np.int64)
+        self._touch = np.zeros(2 * n + 2, np.int64)
+        self._begin: IntArray = np.zeros(n + 1, np.int64)
+        self._receiver: IntArray = np.zeros(0, np.int64)
+        self._gain: FloatArray = np.zeros(0)
+        self._extra = np.zeros(1)
+        self._shared: tuple[Any, ...] = ()
 
-    # --- data ------------------------------------------------------------------------------------
+    @staticmethod
+    def _ns(t_s: float) -> int:
+        return round(t_s * 1e9)
+
+    # --- the links -------------------------------------------------------------------------------
+
+    def set_links(
+        self,
+        begin: IntArray,
+        receiver: IntArray,
+        gain: FloatArray,
+        *,
+        is_square: bool,
+        frame: int,
+        extra: FloatArray | None = None,
+    ) -> None:
+        """A new frame's links: how strong each station is at each other.
+
+        Args:
+            begin: [N + 1]: the links of station i are begin[i] … begin[i + 1] − 1.
+            receiver: [L], rising within a station's links.
+            gain: [L]: mean received power over the noise of the whole channel, linear.
+            is_square: whether every station has a link to every one, itself included.
+            frame: its number.
+            extra: [L]: probability that a group frame is lost besides; None is none.
+        """
+        e, ints = self._e, self._ints
+        self.sync()
+        settled = self._settled
+        is_same = receiver is self._receiver
+        old = self._begin, self._receiver, settled.arrays[_WHY]
+        self._begin, self._receiver, self._gain = begin, receiver, gain
+        ints[e.C_SQUARE], ints[e.C_FRAME], ints[e.C_EXTRA] = is_square, frame, extra is not None
+        if extra is not None:
+            self._extra = extra
+        self._share()
+        if not is_same:
+            if len(settled.arrays[_W]) != len(receiver):
+                sized = {_W: len(receiver), _WHY: len(receiver)}
+                self._settled, self._planned = (_sized(x, sized) for x in (settled, self._planned))
+                settled = self._settled
+            a = settled.arrays
+            if len(old[1]):
+                e.relink(a[_S], a[_P], a[_W], a[_WHY], old[0], old[1], old[2].copy(), begin, receiver, gain,
+                         self._fade, self._keys, ints)  # fmt: skip
+        self._plan()
+
+    def _share(self) -> None:
+        self._shared = (
+            self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
+            self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
+        )  # fmt: skip
+
+    def flow(self, sender: int, receiver: int) -> int:
+        """The number of an ordered link that carries unicast frames."""
+        found = self._flows.get((sender, receiver))
+        if found is None:
+            found = self._flows[sender, receiver] = len(self._flows)
+            if found == len(self._flow_floats):
+                more = 2 * found
+                self._settled, self._planned = (
+                    _sized(x, {_LI: more, _LS: more}) for x in (self._settled, self._planned)
+                )
+                self._flow_floats = _longer(self._flow_floats, more)
+                self._orders = _longer(self._orders, more)
+                self._share()
+            e = self._e
+            self._settled.arrays[_LI][found, [e.FLOW_FROM, e.FLOW_TO]] = sender, receiver
+            self._orders[found] = np.roll(np.arange(len(self._rates)), 5 * sender + receiver)
+        return found
+
+    def tune(self, flow: int, link: Link) -> None:
+        """From now on a sender uses a link like this."""
+        e = self._e
+        row = self._settled.arrays[_LI][flow]
+        row[e.FLOW_MCS], row[e.FLOW_FRAMES], row[e.FLOW_DEAD] = max(0, link.mcs), link.frames, link.dead
+        loss = -1.0 if link.loss != link.loss else link.loss
+        self._flow_floats[flow] = link.rate_mbps * 1e-3, loss, link.burst_loss
+
+    def learned(self, flow: int) -> IntArray:
+        """[MCS, 2]: frames of a link that were sent and that were acknowledged since the last call."""
+        found: IntArray = self._settled.arrays[_LS][flow].copy()
+        self._settled.arrays[_LS][flow] = 0
+        return found
+
+    # --- jobs ------------------------------------------------------------------------------------
 
     def submit(self, job: J) -> None:
-        """Queue a job behind its sender's others."""
+        """Queue a job behind its sender's others; its `flow`, `frames`, `full_bytes` and `last_bytes` are set."""
+        self.sync()
+        entry = self._enter(job)  # may make room in the tables
+        a = self._settled.arrays
+        self._e.submit(*entry, a[_S], a[_J])
         queue = self._queues[job.sender]
         queue.append(job)
-        self._expect(job)
         if len(queue) == 1:
-            now = self.sync()
-            self._serve(job, now)
-            self._arm(now)
-        elif job.deadline_s < self._due_s:
-            now = self._env.now
-            self._set_timer(max(job.deadline_s, now), now)
+            self._on_begin(job, self._env.now)
+        self._plan()
 
     def replace(self, old: J, new: J) -> None:
         """Drop `old` (queued or in service) for `new`.
@@ -106,320 +273,288 @@ class Medium(Generic[J, F]):
         A queued job's place is kept. One in service is cut short and the new one goes to the tail, so that
         the sender's other samples are not starved by a link that is slower than its samples come.
         """
-        if self._heads.get(old.sender) is old:
-            self.withdraw(old)
-            self.submit(new)
-            return
-        old.live = False
+        self.sync()
         queue = self._queues[old.sender]
-        queue[queue.index(old)] = new
-        self._expect(new)
-        if new.deadline_s < self._due_s:
-            now = self._env.now
-            self._set_timer(max(new.deadline_s, now), now)
+        if queue[0] is not old:
+            self._read(old)
+            entry = self._enter(new)
+            a = self._settled.arrays
+            if self._e.substitute(old.row, *entry, a[_S], a[_J]):
+                queue[queue.index(old)] = new
+                self._leave(old)
+                self._plan()
+                return
+            self._free.append(new.row)
+            del self._at_row[new.row]
+        self.withdraw(old)
+        self.submit(new)
+
+    def _enter(self, job: J) -> tuple[int, ...]:
+        """Open a row for a job; returns it as the stations want it."""
+        job.live = True
+        job.arrived_frames = job.sent_frames = 0
+        job.dropped = []
+        job.pass_granted_s = 0.0
+        job.t_start_s = nan
+        self._pushes += 1
+        if job.deadline_s < inf:
+            heappush(self._deadlines, (self._ns(job.deadline_s), job.number, self._pushes, job))
+        row = self._open(job)
+        return (
+            row, self._e.DATA, job.sender, job.flow, self._payload_access, job.frames, job.full_bytes, job.last_bytes, 0,
+            self._ns(self._env.now),
+        )  # fmt: skip
+
+    def _open(self, job: J | F) -> int:
+        if not self._free:
+            self._make_room()
+        job.row = row = self._free.pop()
+        self._at_row[row] = job
+        return row
+
+    def _make_room(self) -> None:
+        live = self._settled.arrays[_J][:, self._e.IS_LIVE]
+        self._free = [row for row in self._finished if not live[row]]
+        self._finished = [row for row in self._finished if live[row]]
+        if not self._free:
+            n = self._settled.jobs
+            self._settled, self._planned = (_sized(state, {_J: 2 * n}) for state in (self._settled, self._planned))
+            self._free = list(range(n, 2 * n))[::-1]
 
     def withdraw(self, job: J) -> None:
         """Take a job out without a word; the next in its queue begins."""
-        now = self.sync()
-        self._remove(job, now)
-        self._arm(now)
+        self.sync()
+        self._take(job)
+        self._plan()
 
-    def retune(self) -> None:
-        """Let every job in service set its demand anew (the links have changed)."""
-        if self._heads:
-            now = self.sync()
-            for job in self._heads.values():
-                self._on_begin(job, now)
-            self._arm(now)
+    def _take(self, job: J) -> None:
+        self._read(job)
+        a = self._settled.arrays
+        self._e.cancel(job.row, self._ns(self._env.now), a[_S], a[_J])
+        self._leave(job)
+
+    def _leave(self, job: J) -> None:
+        """A job is no longer the sender's concern here; the stations may still owe it an answer."""
+        job.live = False
+        self._finished.append(job.row)
+        del self._at_row[job.row]
+        job.row = -1
+        queue = self._queues[job.sender]
+        if job not in queue:
+            return
+        if queue[0] is job:
+            queue.popleft()
+            if queue:
+                self._on_begin(queue[0], self._env.now)
+        else:
+            queue.remove(job)
+
+    def _read(self, job: J) -> None:
+        """Bring a job's figures up to the settled state."""
+        self._drain()
+        e, row = self._e, self._settled.arrays[_J][job.row].tolist()
+        job.arrived_frames, job.sent_frames = row[e.ARRIVED], row[e.HIGH]
+        granted_s = row[e.AIR_NS] * _NS
+        job.granted_s += granted_s - job.pass_granted_s
+        job.pass_granted_s = granted_s
+        job.t_start_s = row[e.HEAD_AT] * _NS if row[e.HEAD_AT] >= 0 else nan
+        if job.keeps_frames:
+            waiting = np.arange(row[e.LOW], row[e.HIGH])
+            here = waiting[(self._settled.arrays[_M][job.sender, waiting % self._window] & 64) > 0]
+            job.here = np.concatenate([np.setdiff1d(np.arange(row[e.LOW]), job.dropped), here])
+
+    def _drain(self) -> None:
+        drops = self._settled.arrays[_DROPS]
+        for row, index in drops[1 : drops[0, 0] + 1].tolist():
+            job = self._at_row.get(row)
+            if job is not None:
+                job.dropped.append(index)  # type: ignore[union-attr]
+        drops[0, 0] = 0
 
     def in_service(self, sender: int) -> J | None:
-        """The job at the head of a sender's queue."""
-        return self._heads.get(sender)
+        """The job at the head of a sender's queue, its figures brought up to now."""
+        queue = self._queues[sender]
+        if not queue:
+            return None
+        self.sync()
+        self._read(queue[0])
+        return queue[0]
 
     def queued(self, sender: int) -> Iterable[J]:
         """A sender's jobs, the one in service first."""
         return self._queues[sender]
 
-    def _expect(self, job: J) -> None:
-        """Remember a job's deadline; of equal ones the older job's comes first."""
-        self._pushes += 1
-        heappush(self._deadlines, (job.deadline_s, job.number, self._pushes, job))
+    def heads(self) -> list[J]:
+        """The job at the head of every queue."""
+        return [queue[0] for queue in self._queues if queue]
 
-    def _serve(self, job: J, now_s: float) -> None:
-        self._heads[job.sender] = job
-        job.t_start_s = now_s
-        self._on_begin(job, now_s)
+    # --- group frames ----------------------------------------------------------------------------
 
-    def _remove(self, job: J, now_s: float) -> None:
-        job.live = False
-        queue = self._queues[job.sender]
-        if queue[0] is job:
-            queue.popleft()
-            if queue:
-                self._serve(queue[0], now_s)
-            else:
-                del self._heads[job.sender]
-        else:
-            queue.remove(job)
+    def announce(self, frame: F, in_s: float = 0.0) -> None:
+        """A group frame comes to its station's queue, `in_s` from now."""
+        self.sync()
+        row, at_ns = self._open(frame), self._ns(self._env.now + in_s)
+        a = self._settled.arrays
+        self._e.submit(
+            row, self._e.GROUP, frame.sender, 0, self._group_access, 1, frame.wire_bytes, frame.wire_bytes,
+            round(frame.airtime_s * 1e9), at_ns, a[_S], a[_J],
+        )  # fmt: skip
+        self._plan()
 
-    def sync(self) -> float:
-        """Bring every account up to now, and return it; frames whose time has come contend."""
-        now: float = self._env.now
-        coming = self._coming
-        if coming and -coming[-1][0] <= now:
-            self._admit(now)
-        if now > self._last_s:
-            self._account(now)
-        return now
+    def drop_context(self, sender: int) -> None:
+        """Forget a drone's group frames, waiting or to come; one that is on the air ends."""
+        self.sync()
+        a, e = self._settled.arrays, self._e
+        for row, frame in list(self._at_row.items()):
+            if isinstance(frame, GroupFrame) and frame.sender == sender and a[_S][sender, e.TX_JOB] != row:
+                e.cancel(row, self._ns(self._env.now), a[_S], a[_J])
+                self._finished.append(row)
+                del self._at_row[row]
+        self._plan()
 
-    def _admit(self, now: float) -> None:
-        """Let the frames contend whose time has come."""
-        coming = self._coming
-        while coming and -coming[-1][0] <= now:
-            minus_at_s, _, _, frame, residual = coming.pop()
-            self._join(frame, residual, -minus_at_s)
+    def replan(self) -> None:
+        """How links are used has changed."""
+        self._plan()
 
-    def _account(self, now: float) -> None:
-        dt = now - self._last_s
-        if dt <= 0.0:
+    # --- the clock -------------------------------------------------------------------------------
+
+    def sync(self) -> None:
+        """Bring the settled state up to now; what happens at this very instant is still to come."""
+        until = self._ns(self._env.now) - 1
+        if self._settled.now_ns < until:
+            self._e.run(until, *self._settled.arrays, *self._shared)
+            self._settled.now_ns = until
+
+    def _plan(self) -> None:
+        """Run a copy ahead to whatever must be told next, and set the timer there."""
+        if self._is_telling:
             return
-        heads = self._heads
-        if not heads and not self._waiting:
-            self._last_s = now
+        e, settled, planned = self._e, self._settled, self._planned
+        self._timer = None
+        self._told = []
+        if not self._at_row:
             return
-        if self._waiting:
-            blocked = min(now, self._context_until_s) - max(self._last_s, self._context_from_s)
-            if blocked > 0.0:
-                self.context_busy_s += blocked
-                dt -= blocked
-        self._last_s = now
-        n = len(heads)
-        if n == 0 or dt <= 0.0:
-            return
-        self.data_busy_s += dt
-        share, sends, transmit_s = dt / n, self._sends[n], self.transmit_s
-        for sender, job in heads.items():
-            left, need = job.remaining, job.need_s
-            done = share / need if need * left > share else left
-            job.remaining = left - done
-            job.granted_s += share
-            transmit_s[sender] += done * job.ppdu_s * sends
-
-    def _arm(self, now: float) -> None:
-        """Who is served has changed, or at what cost: set the timer to the earliest thing that can happen."""
-        deadlines, heads = self._deadlines, self._heads
+        deadlines = self._deadlines
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
-        due = inf
-        n = len(heads)
-        if n:
-            idle, collisions = self._idle_s[n], self._collisions[n]
-            soonest = inf
-            for job in heads.values():
-                job.need_s = need = job.clean_s + job.count * idle + collisions * job.collided_s
-                left = job.remaining * need
-                if left < soonest:
-                    soonest = left
-            soonest *= n
-            if now + soonest > self._context_from_s:
-                soonest += self._context_until_s - max(now, self._context_from_s)
-            due = now + soonest
-        if deadlines and deadlines[0][0] < due:
-            due = max(deadlines[0][0], now)
-        if due < self._due_s:
-            self._set_timer(due, now)
-
-    def _set_timer(self, due_s: float, now_s: float) -> None:
-        self._due_s = due_s
-        self._timer = timer = self._env.timeout(max(0.0, due_s - now_s))
+        until = settled.now_ns + _AHEAD_NS
+        if deadlines:
+            until = min(until, max(deadlines[0][0], settled.now_ns))
+        e.copy(*settled.arrays, *planned.arrays, self._begin)
+        planned.now_ns, told = e.run(until, *planned.arrays, *self._shared)
+        if told:
+            self._told = [(kind, row, self._at_row.get(row)) for kind, row in self._out[:told].tolist()]
+        now = self._env.now
+        self._timer = timer = self._env.timeout(max(0.0, planned.now_ns * _NS - now))
         timer.callbacks.append(self._on_timer)
 
     def _on_timer(self, event: simpy.Event) -> None:
         if event is not self._timer:
-            return  # an earlier time was set meanwhile
-        self._due_s = inf
-        now = self.sync()
-        heads, deadlines = self._heads, self._deadlines
-        n = len(heads)
-        through = [job for job in heads.values() if n * job.remaining * job.need_s <= _EPS_S]
-        if len(through) > 1:
-            through.sort(key=_number)
-        ended = [(job, _SERVED) for job in through]
-        for job in through:
-            job.remaining = 0.0
-            self._remove(job, now)
-        while deadlines and (not deadlines[0][3].live or deadlines[0][0] <= now + _EPS_S):
+            return  # something came earlier
+        self._settled, self._planned = self._planned, self._settled
+        now, settled, e = self._env.now, self._settled, self._e
+        self._is_telling = True
+        for kind, row, job in self._told:
+            if job is None or job.row != row:
+                continue
+            if kind == e.T_GROUP:
+                self._end_group(job, row)  # type: ignore[arg-type]
+                continue
+            self._read(job)  # type: ignore[arg-type]
+            self._leave(job)  # type: ignore[arg-type]
+            self._on_end(job, _ENDS[kind], now)  # type: ignore[arg-type]
+        deadlines = self._deadlines
+        while deadlines and (not deadlines[0][3].live or deadlines[0][0] <= settled.now_ns):
             job = heappop(deadlines)[3]
             if job.live:
-                served = heads.get(job.sender) is job and job.t_start_s < now
-                self._remove(job, now)
-                ended.append((job, End.DEADLINE_IN_SERVICE if served else End.DEADLINE_QUEUED))
-        self._arm(now)
-        for job, how in ended:
-            self._on_end(job, how, now)
+                is_head = self._queues[job.sender][0] is job
+                self._take(job)
+                is_served = is_head and job.t_start_s < now - _NS
+                self._on_end(job, End.DEADLINE_IN_SERVICE if is_served else End.DEADLINE_QUEUED, now)
+        self._is_telling = False
+        self._plan()
 
-    # --- context ---------------------------------------------------------------------------------
-
-    def announce(self, frame: F, residual: float, in_s: float = 0.0) -> None:
-        """Contend for the air with a context frame.
-
-        Args:
-            frame: its `slots` drawn, 0 … CW_CONTEXT.
-            residual: uniform in [0, 1): how much of a running data exchange is still to come.
-            in_s: how long from now, ≥ 0. No event of its own marks the begin: it is looked back at from the next one,
-                which is at the latest the end that the frame would have if nothing held it up.
-        """
-        if in_s <= 0.0:
-            now = self.sync()
-            self._join(frame, residual, now)
-            self._aim(now)
-            return
-        now = self._env.now
-        at_s = now + in_s
-        until = at_s + AIFS_CONTEXT_S + frame.slots * SLOT_S + frame.airtime_s
-        end_s = at_s + (until - at_s)
-        self._pushes += 1
-        insort(self._coming, (-at_s, -self._pushes, end_s, frame, residual))
-        if end_s < self._context_due_s:
-            self._aim(now)
-
-    def _join(self, frame: F, residual: float, now: float) -> None:
-        """A frame begins to contend."""
-        waiting = self._waiting
-        if waiting:
-            self._account(now)
-        elif self._heads:
-            self._account(now)
-            self._context_from_s = now + residual * self._mean_exchange_s()
-        else:  # nothing else goes on: it is its own plan
-            self._last_s = self._context_from_s = now
-            waiting.append(frame)
-            self._context_fire_s = frame.fire_s = fire = now + AIFS_CONTEXT_S + frame.slots * SLOT_S
-            self._context_until_s = until = fire + frame.airtime_s
-            self._context_target_s = now + (until - now)
-            return
-        waiting.append(frame)
-        if now >= self._context_fire_s:
-            return  # heard the frame that is on the air; counts down after it
-        frame.fire_s = max(now, self._context_from_s) + AIFS_CONTEXT_S + frame.slots * SLOT_S
-        self._plan_context(now)
-
-    def drop_context(self, sender: int) -> None:
-        """Forget a drone's context frames, waiting or to come; one that is on the air ends."""
-        now = self.sync()
-        self._coming = [entry for entry in self._coming if entry[3].sender != sender]
-        kept = [
-            f
-            for f in self._waiting
-            if f.sender != sender or (self._context_fire_s <= now and f.fire_s <= self._context_fire_s + SLOT_S / 2)
-        ]
-        if len(kept) == len(self._waiting):
-            return
-        self._waiting = kept
-        if now < self._context_fire_s:
-            self._plan_context(now)
-            self._aim(now)
-            self._arm(now)
-
-    def _mean_exchange_s(self) -> float:
-        if not self._heads:
-            return 0.0
-        jobs = [j for j in self._heads.values() if j.count > 0.0]
-        return sum(j.ppdu_s / j.count for j in jobs) / len(jobs) if jobs else 0.0
-
-    def _plan_context(self, now: float) -> None:
-        """Who of the waiting frames is to win, and when its turn is over."""
-        waiting = self._waiting
-        if not waiting:
-            self._context_from_s, self._context_until_s = inf, -inf
-            self._context_fire_s = self._context_target_s = inf
-            return
-        if len(waiting) == 1:
-            fire, longest_s = waiting[0].fire_s, waiting[0].airtime_s
-        else:
-            fire = min([f.fire_s for f in waiting])
-            longest_s = max([f.airtime_s for f in waiting if f.fire_s <= fire + SLOT_S / 2])
-        until = fire + longest_s
-        self._context_fire_s = fire
-        if until != self._context_until_s:
-            self._context_until_s = until
-            self._context_target_s = now + max(0.0, until - now)
-
-    def _aim(self, now: float) -> None:
-        """Set the timer to the earliest end of a context frame."""
-        due = self._context_target_s
-        for minus_at_s, _, end_s, _, _ in reversed(self._coming):
-            if -minus_at_s >= due:
-                break
-            if end_s < due:
-                due = end_s
-        if due == self._context_due_s or due == inf:
-            return
-        delay = due - now
-        if now + delay != due:  # so that the clock says it to the last digit
-            near = (nextafter(delay, inf), nextafter(delay, -inf))
-            delay = next((d for d in near if now + d == due), delay)
-        self._context_due_s = due
-        self._context_timer = timer = simpy.Timeout(self._env, max(0.0, delay))
-        timer.callbacks.append(self._on_context_timer)
-
-    def _on_context_timer(self, event: simpy.Event) -> None:
-        if event is not self._context_timer:
-            return
-        self._context_due_s = inf
-        now: float = self._env.now
-        coming = self._coming
-        if coming and -coming[-1][0] <= now:
-            minus_at_s, _, end_s, frame, _ = coming[-1]
-            if end_s <= now and not (self._waiting or self._heads) and (len(coming) == 1 or -coming[-2][0] > now):
-                coming.pop()
-                self._end_alone(frame, -minus_at_s, now)
-                return
-            self._admit(now)
-        if now < self._context_target_s:  # something holds it up
-            self._aim(now)
-            return
-        self._account(now)
-        fire, sent = self._context_fire_s, self._waiting
-        if len(sent) == 1:
-            self._waiting = []
-            self._context_from_s, self._context_until_s = inf, -inf
-            self._context_fire_s = self._context_target_s = inf
-            self._aim(now)
-            (frame,) = sent
-            self.transmit_s[frame.sender] += frame.airtime_s
-            self._on_group_end(frame, False)
-            return
-        self._waiting = [f for f in sent if f.fire_s > fire + SLOT_S / 2]
-        sent = [f for f in sent if f.fire_s <= fire + SLOT_S / 2]
-        for f in self._waiting:
-            if f.fire_s < inf:  # it had counted down to the moment the winner sent, if its AIFS was over by then
-                f.slots = min(f.slots, max(1, round((f.fire_s - fire) / SLOT_S)))
-            f.fire_s = now + AIFS_CONTEXT_S + f.slots * SLOT_S
-            self._context_from_s = now
-        self._plan_context(now)
-        self._aim(now)
-        for f in sent:
-            self.transmit_s[f.sender] += f.airtime_s
-            self._on_group_end(f, len(sent) > 1)
-
-    def _end_alone(self, frame: F, at_s: float, now: float) -> None:
-        """A frame had the channel to itself since it began to contend: `_join`, `_account` and the rest in one go."""
-        until = at_s + AIFS_CONTEXT_S + frame.slots * SLOT_S + frame.airtime_s
-        self.context_busy_s += min(now, until) - at_s
-        self._last_s = now
-        self._aim(now)
-        self.transmit_s[frame.sender] += frame.airtime_s
-        self._on_group_end(frame, False)
+    def _end_group(self, frame: F, row: int) -> None:
+        links = slice(self._begin[frame.sender], self._begin[frame.sender + 1])
+        receivers, fates = self._receiver[links], self._settled.arrays[_WHY][links]
+        self._finished.append(row)
+        del self._at_row[row]
+        frame.row = -1
+        self._on_group_end(frame, receivers, fates)
 
     # --- accounts --------------------------------------------------------------------------------
 
     @property
+    def transmit_s(self) -> list[float]:
+        """Seconds that each station has transmitted: data, retries, answers and group frames; a frame counts at its begin."""
+        self.sync()
+        sent: list[float] = (self._settled.arrays[_S][:, self._e.TRANSMITTED_NS] * _NS).tolist()
+        return sent
+
+    @property
+    def data_busy_s(self) -> float:
+        """Seconds in which unicast frames or their answers were on the air somewhere."""
+        return self._busy_s()[1]
+
+    @property
+    def context_busy_s(self) -> float:
+        """Seconds in which group frames alone were on the air."""
+        return self._busy_s()[0]
+
+    def _busy_s(self) -> tuple[float, float]:
+        e, g = self._e, self._settled.arrays[_G].copy()
+        self.sync()
+        e.account(max(self._ns(self._env.now), int(g[e.G_SINCE])), g)
+        return float(g[e.G_GROUP_NS]) * _NS, float(g[e.G_OTHER_NS]) * _NS
+
+    @property
     def utilisation(self) -> float:
-        """Fraction of the time so far in which the channel was claimed, contention included."""
-        elapsed = self.sync() - self._begin_s
-        return (self.data_busy_s + self.context_busy_s) / elapsed if elapsed > 0 else 0.0
+        """Fraction of the time so far in which something was on the air."""
+        elapsed = self._env.now - self._begin_s
+        return min(1.0, sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
 
 
-def _number(job: AirJob) -> int:
-    return job.number
+_ENDS = {1: End.ARRIVED, 2: End.OVER, 3: End.UNREACHABLE}
+
+
+def _tables(
+    e: Any, settings: AirSettings, n: int, noise_dbm: float
+) -> tuple[tuple[IntArray, FloatArray, FloatArray, IntArray], tuple[int, int]]:
+    """The settings as the stations read them, and the place of group frames and of unicast frames among the classes."""
+    standard = STANDARDS[settings.standard]
+    rates = standard.rates_mbps[settings.bandwidth_mhz]
+    window = max(settings.block_ack_window, settings.max_ampdu_frames)
+    full = frame_bytes(settings.fragment_bytes, fragmented=True)
+    limits = [ampdu_frames(full, rate, settings.max_ampdu_frames, standard) for rate in rates]
+    names = list(EdcaSettings.__dataclass_fields__)
+    used = sorted({names.index(settings.context_class), names.index(settings.payload_class)})
+    classes = [getattr(settings.edca, names[i]) for i in used]
+    first, second = classes[0], classes[-1]
+    ints = np.zeros(17, np.int64)
+    values = {
+        e.C_STATIONS: n, e.C_AIFSN: first.aifsn, e.C_AIFSN_LOW: second.aifsn, e.C_WINDOW: first.cw_min,
+        e.C_WINDOW_LOW: second.cw_min, e.C_LARGEST: first.cw_max, e.C_LARGEST_LOW: second.cw_max,
+        e.C_RETRIES: settings.retry_limit, e.C_BLOCK: window, e.C_RTS: settings.rts,
+        e.C_BY_FRAME: settings.fading == "frame", e.C_PREAMBLE_NS: round(standard.preamble_s * 1e9),
+        e.C_SYMBOL_NS: round(standard.symbol_s * 1e9), e.C_LEARNS: settings.rate_control == "minstrel",
+    }  # fmt: skip
+    for column, value in values.items():
+        ints[column] = value
+    legacy_noise = 20.0 / settings.bandwidth_mhz
+    over_noise = 10.0 ** ((settings.preamble_detection_dbm - noise_dbm) / 10.0)
+    floats = np.array([over_noise, 10.0 ** (PREAMBLE_SINR_DB / 10.0), legacy_noise])
+    tables = ints, floats, np.array(rates) * 1e-3, np.array(limits, np.int64)
+    return tables, (used.index(names.index(settings.context_class)), used.index(names.index(settings.payload_class)))
+
+
+def _longer(values: NDArray[Any], length: int) -> NDArray[Any]:
+    more = np.zeros((length, *values.shape[1:]), values.dtype)
+    kept = min(length, len(values))
+    more[:kept] = values[:kept]
+    return more
+
+
+def _sized(state: _State, lengths: dict[int, int]) -> _State:
+    """A state with some arrays longer or shorter."""
+    arrays = [_longer(a, lengths[k]) if k in lengths else a for k, a in enumerate(state.arrays)]
+    return _State(tuple(arrays), lengths.get(_J, state.jobs), state.now_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -24,6 +24,54 @@ class Bursts(Section):
         0.0, ge=0, le=1, description="Probability that a good pair loses a frame at a try, besides what SNR loses."
     )
     loss_bad: float = Field(1.0, ge=0, le=1, description="The same of a bad pair.")
+
+
+AccessName = Literal["voice", "video", "best_effort", "background"]
+
+
+def _aifsn(slots: int) -> Any:
+    return Field(slots, ge=1, le=15, description="Slots of idle medium, after a SIFS, before the backoff counts down.")
+
+
+def _window(slots: int, when: str) -> Any:
+    return Field(slots, ge=0, le=32767, description=f"Largest backoff {when}, in slots.")
+
+
+class Access(Section):
+    """How a class of traffic gets at the medium."""
+
+    aifsn: int = _aifsn(3)
+    cw_min: int = _window(15, "at a first try")
+    cw_max: int = _window(1023, "after failures")
+
+    @model_validator(mode="after")
+    def _grows(self) -> Access:
+        if self.cw_max < self.cw_min:
+            raise inconsistent(("cw_max",), f"{self.cw_max}", f"at least cw_min = {self.cw_min}")
+        return self
+
+
+class Voice(Access):
+    aifsn: int = _aifsn(2)
+    cw_min: int = _window(3, "at a first try")
+    cw_max: int = _window(7, "after failures")
+
+
+class Video(Access):
+    aifsn: int = _aifsn(2)
+    cw_min: int = _window(7, "at a first try")
+    cw_max: int = _window(15, "after failures")
+
+
+class Background(Access):
+    aifsn: int = _aifsn(7)
+
+
+class Edca(Section):
+    voice: Voice = Voice()
+    video: Video = Video()
+    best_effort: Access = Access()
+    background: Background = Background()
 
 
 class Radio(Section):
@@ -55,11 +103,29 @@ class Radio(Section):
         description="Correlation distance of shadowing, for both ends of a link; left out, every pair has its own, in time alone.",
     )
     rician_k_db: float = Field(12.0, ge=-10, le=40, description="Rician factor of small-scale fading.")
+    fading: Literal["exchange", "frame"] = Field(
+        "exchange", description="A link's fade is drawn anew for each transmission, or once a frame."
+    )
+    preamble_detection_dbm: float = Field(
+        -82.0,
+        ge=-120,
+        le=-30,
+        description="Weakest frame that is received, and that holds others back (carrier sense).",
+    )
     group_rate_mbps: float = Field(6.0, ge=1, le=54, description="Basic rate of group-addressed frames (descriptors).")
     rate_control: Literal["ideal", "minstrel"] = Field(
         "ideal", description="Who picks the MCS: the SNR of the frame before, or statistics of what got through."
     )
-    retry_limit: int = Field(7, ge=0, le=32, description="MAC retries of a unicast frame.")
+    context_class: AccessName = Field("voice", description="EDCA class of group-addressed frames (descriptors).")
+    payload_class: AccessName = Field("best_effort", description="EDCA class of unicast frames.")
+    edca: Edca = Edca()
+    rts: bool = Field(False, description="Whether RTS and CTS precede each A-MPDU.")
+    block_ack_window: Literal[64, 256] = Field(
+        64, description="Frames that may wait for their block acknowledgement; at least max_ampdu_frames."
+    )
+    retry_limit: int = Field(
+        7, ge=0, le=32, description="MAC retries of a unicast frame whose block ack says that it is missing."
+    )
     max_ampdu_frames: int = Field(64, ge=1, le=256, description="Frames aggregated into one A-MPDU.")
     fragment_bytes: int = Field(1344, ge=64, le=65000, description="DDS fragment payload.")
     framing: Literal["sample", "tiles"] = Field(

@@ -95,7 +95,7 @@ def test_a_good_direct_link_is_not_left() -> None:
 
 
 def test_far_ends_of_a_row_are_reached_over_its_middle() -> None:
-    config = AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=7.0)
+    config = AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=7.0, preamble_detection_dbm=-101.0)
     came = {}
     for hops in (1, 2):
         flight = Hover(replace(config, relay_max_hops=hops), LINE_M)
@@ -156,7 +156,7 @@ def test_no_row_of_a_flight_over_relays_has_airtime_and_was_never_served() -> No
     flight = Hover(AirSettings(relay_max_hops=4, tx_power_dbm=10.0), line_m)
     flight.fly(5.0, lambda frame: [flight.send(i, j, 60_000) for i in range(5) for j in range(5) if i != j])
     rows = flight.rows + flight.air.finish()
-    assert sum(r.hops > 1 and r.reason == "deadline_queued" for r in rows) > 50
+    assert sum(r.hops > 1 and r.reason == "deadline_queued" for r in rows) > 30
     assert [r for r in rows if np.isnan(r.t_start_s) and r.airtime_s > 0.0] == []
 
 

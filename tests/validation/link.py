@@ -18,8 +18,10 @@ from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, two_ray_loss_db
 from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.channel.snr import Channel, earshot_m
-from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, Exchanges, frames_exchanges, legacy_ppdu_s
-from sortie.radio.mac.contention import DIFS_S, SIFS_S, SLOT_S, contention, saturation_mbps
+from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frames_exchanges, legacy_ppdu_s
+from sortie.radio.mac.contention import DIFS_S, SIFS_S, contention, saturation_mbps
+from sortie.radio.mac.jobs import AirJob, GroupFrame
+from sortie.radio.mac.medium import Link, Medium
 from sortie.radio.mac.rate_control import INTERVAL_S, Minstrel
 from sortie.radio.rates import STANDARDS, per, rate_table
 from sortie.radio.sample import Service
@@ -221,15 +223,30 @@ def contended(periods: int) -> Rows:
 
 
 def unequal() -> Rows:
-    """Two senders, one eight times as slow: shares of delivered bits in the fluid and in CSMA/CA."""
+    """Two senders, one eight times as slow: shares of delivered bits in the medium and in CSMA/CA."""
     slow, fast = csma.Turn(4e-3, BLOCK_ACK_S, 16, 12e3), csma.Turn(0.5e-3, BLOCK_ACK_S, 16, 12e3)
     ran = csma.run([slow, fast], 20_000, np.random.default_rng(3))
-    around_s = SIFS_S + BLOCK_ACK_S + DIFS_S + SLOT_S
-    need_s = [Exchanges(1.0, t.ppdu_s, t.ppdu_s + around_s).channel_s(contention(2)) for t in (slow, fast)]
     return [
         {"model": "CSMA/CA", "fast over slow, bits": round(float(ran.delivered_bits[1] / ran.delivered_bits[0]), 2)},
-        {"model": "fluid (equal time)", "fast over slow, bits": round(need_s[0] / need_s[1], 2)},
+        {"model": "the medium", "fast over slow, bits": round(_in_the_medium((4e-3, 0.5e-3)), 2)},
     ]
+
+
+def _in_the_medium(ppdus_s: tuple[float, float], seconds: float = 60.0) -> float:
+    """Frames of the second of two saturated senders over the first's, with 16 frames in A-MPDUs of these lengths."""
+    env = simpy.Environment()
+    medium = Medium[AirJob, GroupFrame](
+        env, AirSettings(rician_k_db=40.0), 2, 1, 0, -88.0, lambda *_: None, lambda *_: None, lambda *_: None
+    )
+    medium.set_links(np.array([0, 2, 4]), np.array([0, 1, 0, 1]), np.full(4, 1e4), is_square=True, frame=0)
+    for sender, ppdu_s in enumerate(ppdus_s):
+        job = AirJob(sender, sender, float("inf"))
+        job.flow, job.frames, job.full_bytes, job.last_bytes = medium.flow(sender, 1 - sender), 10**7, 1494, 1494
+        medium.tune(job.flow, Link(7, rate_mbps=16 * 1500 * 8e-6 / (ppdu_s - 44e-6), frames=16))
+        medium.submit(job)
+    env.run(until=seconds)
+    done = [job.arrived_frames for i in range(2) if (job := medium.in_service(i)) is not None]
+    return done[1] / done[0]
 
 
 # --- rate control and goodput ------------------------------------------------------------------------
@@ -251,12 +268,18 @@ def rate_control(seconds: float) -> Rows:
         ("shadowing, 20 ± 3.5 dB", 20 + drift),
         ("12 dB down and up every 5 s", step),
     ):
-        control, share, late = Minstrel(rates_mbps, 1, 0), [], []
+        control, share, late, turn = Minstrel(rates_mbps), [], [], 0
         known = snr[0]
         for k, now_db in enumerate(snr):
             pers = [row[table.index(now_db)] for row in table.all_per]
             mcs = control.mcs(0, 1, k * INTERVAL_S)
-            control.sent(0, 1, k * INTERVAL_S, mcs, 122, pers)
+            sent = [0] * len(pers)
+            sent[mcs] = 110
+            for _ in range(12):  # the others by turns
+                sent[turn % len(sent)] += 1
+                turn += 1
+            counts = [(n, n - int(rng.binomial(n, min(1.0, per)))) for n, per in zip(sent, pers, strict=True)]
+            control.sent(0, 1, k * INTERVAL_S, counts)
             best = max(r * (1 - p) for r, p in zip(rates_mbps, pers, strict=True))
             share.append(rates_mbps[mcs] * (1 - pers[mcs]) / best)
             at = table.mcs[table.index(known)]

@@ -118,7 +118,9 @@ def test_a_traced_loss_replaces_fading_and_bursts(tmp_path: Path) -> None:
 
 
 def test_descriptors_on_a_traced_snr_fade_as_the_models_do(tmp_path: Path) -> None:
-    config = AirSettings(tx_power_dbm=-15.0, noise_figure_db=12.0, shadowing_sigma_db=0.0)
+    config = AirSettings(
+        tx_power_dbm=-10.5, noise_figure_db=12.0, shadowing_sigma_db=0.0, preamble_detection_dbm=-120.0
+    )
     model = Hover(config)
     model.fly(300.0, lambda frame: model.publish(0))
     snr_db = float(model.air.snr_db[0, 1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import simpy
@@ -20,13 +22,24 @@ def _pers(snr_db: float) -> list[float]:
     return [row[TABLE.index(snr_db)] for row in TABLE.all_per]
 
 
-def _fly(snr_db: np.ndarray, frames: float, seed: int = 1) -> np.ndarray:
+def _counts(
+    mcs: int, frames: int, turn: int, per_by_mcs: Sequence[float], rng: np.random.Generator
+) -> list[tuple[int, int]]:
+    """Nine tenths at one MCS, the rest at the others by turns; how many were sent and acknowledged at each."""
+    sent, probes = [0] * len(per_by_mcs), frames / 10
+    sent[mcs] = round(frames - probes)
+    for k in range(int(turn * probes), int((turn + 1) * probes)):
+        sent[5 * k % len(sent)] += 1
+    return [(n, n - int(rng.binomial(n, per))) for n, per in zip(sent, per_by_mcs, strict=True)]
+
+
+def _fly(snr_db: np.ndarray, frames: int, seed: int = 1) -> np.ndarray:
     """The MCS in use in each interval of a link whose mean SNR is given for each."""
-    control, used = Minstrel(RATES, seed, 0), []
+    control, used, rng = Minstrel(RATES), [], np.random.default_rng(seed)
     for k, snr in enumerate(snr_db):
         now = k * INTERVAL_S
         used.append(control.mcs(0, 1, now))
-        control.sent(0, 1, now, used[-1], frames, _pers(snr))
+        control.sent(0, 1, now, _counts(used[-1], frames, k, _pers(snr), rng))
     return np.array(used)
 
 
@@ -59,7 +72,7 @@ def test_it_lags_in_a_channel_that_moves() -> None:
     snr = np.concatenate([np.full(100, 30.0), np.full(100, 18.0), np.full(100, 30.0)])
     ideal = np.array([max(r * (1 - p) for r, p in zip(RATES, _pers(s), strict=True)) for s in snr])
     share = _goodput(_fly(snr, 122), snr) / ideal
-    assert share[80:100].mean() > 0.95
+    assert share[80:100].mean() > 0.93  # the ideal rate or the one below
     assert share[100] < 0.2  # the drop takes it by surprise
     assert share[100:105].mean() < 0.6
     assert share[180:200].mean() > 0.9
@@ -68,32 +81,26 @@ def test_it_lags_in_a_channel_that_moves() -> None:
 
 
 def test_a_rate_that_fails_fades_by_its_weight() -> None:
-    control = Minstrel((10.0, 100.0), 1, 0)
+    control = Minstrel((10.0, 100.0))
     for k in range(40):
         control.mcs(0, 1, k * INTERVAL_S)
-        control.sent(0, 1, k * INTERVAL_S, 1, 1000, (0.0, 0.0))
+        control.sent(0, 1, k * INTERVAL_S, ((100, 100), (900, 900)))
     windows = 0
     while control.mcs(0, 1, (40 + windows) * INTERVAL_S) == 1:
-        control.sent(0, 1, (40 + windows) * INTERVAL_S, 1, 1000, (0.0, 1.0))
+        control.sent(0, 1, (40 + windows) * INTERVAL_S, ((100, 100), (900, 0)))
         windows += 1
     # 100 · KEEP^n falls below 0.1 · 100 or below 10 · 0.9
     assert windows == int(np.ceil(np.log(0.1) / np.log(KEEP)))
 
 
-def test_links_draw_from_streams_of_their_own() -> None:
-    alone, beside = Minstrel(RATES, 3, 0), Minstrel(RATES, 3, 0)
-    seen = []
-    for control in (alone, beside):
-        used = []
-        for k in range(60):
-            used.append(control.mcs(0, 1, k * 0.1))
-            control.sent(0, 1, k * 0.1, used[-1], 30, _pers(17.0))
-            if control is beside:
-                control.mcs(1, 0, k * 0.1)
-                control.sent(1, 0, k * 0.1, 3, 30, _pers(17.0))
-        seen.append(used)
-    assert seen[0] == seen[1]
-    assert len(set(seen[0])) > 1
+def test_links_do_not_know_of_each_other() -> None:
+    control = Minstrel((10.0, 100.0))
+    for k in range(20):
+        control.mcs(0, 1, k * INTERVAL_S)
+        control.mcs(1, 0, k * INTERVAL_S)
+        control.sent(0, 1, k * INTERVAL_S, ((0, 0), (50, 50)))
+        control.sent(1, 0, k * INTERVAL_S, ((50, 50), (50, 0)))
+    assert (control.mcs(0, 1, 2.0), control.mcs(1, 0, 2.0)) == (1, 0)
 
 
 def _delivered(control: str, loss_db: float) -> list[Transmission]:

@@ -42,6 +42,7 @@ TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_res
 MADE = "fleet.makes=[{name: slow, drones: [1], airframe: solo, battery: {}, computer: {}, camera: {}, antenna: isotropic, tx_power_dbm: 10, policy: all-4, policy_params: {received_budget: 0.2}, feature_space: theirs}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
 HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
+QUIET_TOO = "radio.preamble_detection_dbm=-110"
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
 FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
 OTHER = "mission.more_targets=[{waypoints_m: [[0, 0], [60, 0]], speed_mps: 3}]"
@@ -209,9 +210,27 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "radio.shadowing_time_s": ("2", ()),
     "radio.shadowing_distance_m": ("20", ()),
     "radio.rician_k_db": ("3", ()),
+    "radio.fading": ("frame", (FAR,)),
+    "radio.preamble_detection_dbm": ("-60", (FAR,)),
     "radio.group_rate_mbps": ("12", ()),
     "radio.rate_control": ("minstrel", (FAR,)),
-    "radio.retry_limit": ("1", (FAR,)),
+    "radio.context_class": ("best_effort", HEAVY),
+    "radio.payload_class": ("video", ()),
+    "radio.edca.voice.aifsn": ("5", HEAVY),
+    "radio.edca.voice.cw_min": ("7", HEAVY),
+    "radio.edca.voice.cw_max": ("31", (*HEAVY, "radio.payload_class=voice")),
+    "radio.edca.video.aifsn": ("5", (*HEAVY, "radio.payload_class=video")),
+    "radio.edca.video.cw_min": ("3", (*HEAVY, "radio.payload_class=video")),
+    "radio.edca.video.cw_max": ("255", (*HEAVY, "radio.payload_class=video")),
+    "radio.edca.best_effort.aifsn": ("9", HEAVY),
+    "radio.edca.best_effort.cw_min": ("3", HEAVY),
+    "radio.edca.best_effort.cw_max": ("15", HEAVY),
+    "radio.edca.background.aifsn": ("3", (*HEAVY, "radio.payload_class=background")),
+    "radio.edca.background.cw_min": ("3", (*HEAVY, "radio.payload_class=background")),
+    "radio.edca.background.cw_max": ("15", (*HEAVY, "radio.payload_class=background")),
+    "radio.rts": ("true", ()),
+    "radio.block_ack_window": ("256", ()),
+    "radio.retry_limit": ("0", (FAR,)),
     "radio.max_ampdu_frames": ("8", ()),
     "radio.fragment_bytes": ("8000", ()),
     "radio.framing": ("tiles", ()),
@@ -222,8 +241,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "radio.bursts.loss_good": ("0.1", (BURSTS,)),
     "radio.bursts.loss_bad": ("0.5", (BURSTS,)),
     "radio.trace": (LINKS, ()),
-    "radio.heartbeat_s": ("0.05", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
-    "radio.nack_delay_s": ("0.02", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0")),
+    "radio.heartbeat_s": ("0.05", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0", QUIET_TOO)),
+    "radio.nack_delay_s": ("0.02", (BOXES, FAR, "radio.retry_limit=0", "radio.tx_power_dbm=0", QUIET_TOO)),
     "context.rate_hz": ("5", ()),
     "context.degraded_after_periods": ("5", (LOST, "policy.name=all-4", "policy.params={received_budget: 0.02}")),
     "context.detached_after_periods": ("15", (LOST,)),

@@ -1,0 +1,1067 @@
+"""802.11's channel access (EDCA), exchange by exchange: the compiled state machine behind `sortie.radio.mac.medium`.
+
+Every station has its own view of the medium. It senses frames whose preamble it detects, and energy; it counts its
+backoff down while the medium is idle; its frames overlap others' at each receiver, whose signal-to-interference ratio
+(SINR) decides what is received. Times are integers, in nanoseconds. One event is the begin or the end of a frame, never
+a fragment of it.
+
+State lives in plain arrays, so that a copy can be run ahead and thrown away (`Medium` does so). Random numbers are a
+hash of a station's key and of how many it has drawn, so a replay draws the same. The rows of the arrays are stations,
+jobs (a group frame or a sample) and flows (a link with unicast traffic); the columns are the constants below.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sortie.scenarios.compiled import compiled, part
+
+# constants of the file itself: kept machine code does not see that another file has changed
+SLOT, SIFS = 9_000, 16_000
+LEGACY_PREAMBLE = 20_000
+CCA = 4_000
+"""How long a preamble takes to be detected; within it the strongest of several frames is taken."""
+EIFS_EXTRA = SIFS + 44_000
+"""After a frame that could not be read: SIFS and an ack at 6 Mb/s, before the AIFS."""
+FAR = 1 << 62
+ACK, BLOCK_ACK, BLOCK_ACK_LONG, CONTROL = 28_000, 32_000, 40_000, 28_000
+"""At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request, RTS and CTS (24, 20 and 14 B)."""
+GROUP_CURVE, CONTROL_CURVE = 12, 13
+"""Packet error rates: of HE MCS 0 … 11, of group frames, of control frames at 24 Mb/s."""
+CONTROL_BYTES = 32.0
+REFERENCE_BYTES = 1458.0
+OVERLAPS = 12
+"""Changes of interference within one reception that are kept apart; later ones count as the strongest."""
+
+# what a station sends
+NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
+
+# columns of a station
+(
+    TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, NEXT_AT,
+    IDLE_AT, NAV, EIFS_UNTIL, BEGIN, BEGIN_LOW,
+    TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN,
+    RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
+    LOCK, LOCK_LINK, LOCK_AT, CANDIDATE, CANDIDATE_LINK, CANDIDATE_AT, SEGMENTS,
+    IS_BUSY, SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
+    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, REACHED,
+) = range(51)  # fmt: skip
+STATION_COLUMNS = 51
+
+# columns of a job
+(
+    KIND, STATION, FLOW, FOLLOWING, COUNT, LOW, HIGH, FULL_BYTES, LAST_BYTES, ARRIVED, DROPPED, IS_LIVE,
+    JOB_ACCESS, AIR_NS, READY_AT, HEAD_AT, IS_TOLD, DEAD_TRIES,
+) = range(18)  # fmt: skip
+JOB_COLUMNS = 18
+
+# columns of a flow
+FLOW_FROM, FLOW_TO, FLOW_LINK, FLOW_MCS, FLOW_FRAMES, FLOW_DEAD, FLOW_PROBED, FLOW_SENT = range(8)
+FLOW_COLUMNS = 8
+FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
+
+# the settings, as integers and as floats
+(
+    C_STATIONS, C_AIFSN, C_AIFSN_LOW, C_WINDOW, C_WINDOW_LOW, C_LARGEST, C_LARGEST_LOW, C_RETRIES, C_BLOCK, C_RTS,
+    C_FRAME, C_BY_FRAME, C_SQUARE, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
+) = range(17)  # fmt: skip
+# totals
+G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS = range(5)
+
+F_SENSED, F_PREAMBLE, F_LEGACY_NOISE = range(3)
+"""Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz."""
+
+# why a receiver did not hear a group frame, and that it did
+UNKNOWN, COLLISION_CONTEXT, COLLISION_DATA, HIDDEN, WEAK, HALF_DUPLEX, HEARD = range(7)
+
+# what the run tells: kind, job
+T_GROUP, T_ARRIVED, T_OVER, T_DEAD = range(4)
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_30, _27, _31, _11, _16 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11), np.uint64(16)
+_LEVEL = np.uint64(0xFFFF)
+_TRIES = 63
+_RECEIVED, _RESOLVED = 64, 128
+_PROBE_EVERY = 10
+
+
+@part
+def mix(z):
+    """SplitMix64's finaliser."""
+    z = z * _GOLDEN
+    z = (z ^ (z >> _30)) * _MIX_1
+    z = (z ^ (z >> _27)) * _MIX_2
+    return z ^ (z >> _31)
+
+
+@part
+def uniform(bits):
+    """A number in [0, 1)."""
+    return np.float64(bits >> _11) * 2.0**-53
+
+
+@part
+def renew(s, S):
+    """When the next thing happens at a station."""
+    at = S[s, TX_END]
+    for k in range(1, 6):
+        at = min(at, S[s, k])
+    S[s, NEXT_AT] = at
+
+
+@part
+def is_engaged(s, S):
+    """Whether a station is sending or in an exchange of its own."""
+    return S[s, TX_END] != FAR or S[s, AWAITS] != NOTHING
+
+
+@part
+def draw_backoff(s, a, S, keys):
+    S[s, DRAWN] += 1
+    u = uniform(mix(mix(keys[s]) + np.uint64(S[s, DRAWN])))
+    S[s, SLOTS + a] = np.int64(u * (S[s, WINDOW + a] + 1))
+
+
+@part
+def fail_window(s, a, S, C):
+    if S[s, FAILS + a] < C[C_RETRIES]:
+        S[s, FAILS + a] += 1
+        S[s, WINDOW + a] = min(C[C_LARGEST + a], ((C[C_WINDOW + a] + 1) << min(S[s, FAILS + a], 20)) - 1)
+    else:
+        S[s, FAILS + a] = 0
+        S[s, WINDOW + a] = C[C_WINDOW + a]
+
+
+@part
+def count_down(s, t, S):
+    """Take off the slots that have passed: one at the end of the AIFS and one after each idle slot."""
+    if S[s, IS_BUSY] == 1 or is_engaged(s, S):
+        return
+    for a in range(2):
+        if S[s, SLOTS + a] > 0 and S[s, BEGIN + a] <= t:
+            passed = min(S[s, SLOTS + a], (t - S[s, BEGIN + a]) // SLOT + 1)
+            S[s, SLOTS + a] -= passed
+            S[s, BEGIN + a] += passed * SLOT
+
+
+@part
+def freeze(s, t, S):
+    """The medium has become busy at t, which shows `CCA` later; who was to send by then does."""
+    count_down(s, t + CCA, S)
+    for a in range(2):
+        if S[s, GRANT + a] > t + CCA:
+            S[s, GRANT + a] = FAR
+
+
+@part
+def plan_access(s, S, C):
+    """The medium is idle since IDLE_AT: when each class may send."""
+    for a in range(2):
+        S[s, BEGIN + a] = S[s, IDLE_AT] + SIFS + C[C_AIFSN + a] * SLOT
+        S[s, GRANT + a] = S[s, BEGIN + a] + S[s, SLOTS + a] * SLOT if S[s, HEAD + a] >= 0 else FAR
+
+
+@part
+def sense(s, S, P, F):
+    if S[s, TX_END] != FAR:
+        return True
+    return S[s, LOCK] >= 0 or P[s] >= F[F_SENSED]
+
+
+@part
+def look(s, t, S, P, W, C, F):
+    """Bring a station's view of the medium up to now."""
+    busy = sense(s, S, P, F)
+    if busy and S[s, IS_BUSY] == 0:
+        freeze(s, t, S)
+        S[s, IS_BUSY] = 1
+    elif not busy and S[s, IS_BUSY] == 1:
+        S[s, IS_BUSY] = 0
+        S[s, IDLE_AT] = max(t, S[s, NAV], S[s, EIFS_UNTIL])
+        if not is_engaged(s, S):
+            plan_access(s, S, C)
+    renew(s, S)
+
+
+@part
+def enqueue(s, job, t, S, J, C, keys):
+    """A job has come: behind its station's others of the same class, or at once to the access."""
+    a = J[job, JOB_ACCESS]
+    J[job, FOLLOWING] = -1
+    if S[s, HEAD + a] >= 0:
+        J[S[s, TAIL + a], FOLLOWING] = job
+        S[s, TAIL + a] = job
+        return
+    S[s, HEAD + a] = S[s, TAIL + a] = job
+    J[job, HEAD_AT] = t
+    begin_access(s, a, t, S, C, keys)
+
+
+@part
+def begin_access(s, a, t, S, C, keys):
+    """A class has something to send again."""
+    engaged = is_engaged(s, S)
+    count_down(s, t, S)
+    if (
+        S[s, SLOTS + a] == 0
+        and (S[s, IS_BUSY] == 1 or engaged or S[s, NAV] > t)
+        and not (engaged and S[s, ACCESS] == a)
+    ):
+        draw_backoff(s, a, S, keys)
+    if engaged or S[s, IS_BUSY] == 1:
+        return
+    if S[s, SLOTS + a] == 0 and t > S[s, BEGIN + a]:  # operations begin at slot boundaries
+        S[s, BEGIN + a] += (t - S[s, BEGIN + a] + SLOT - 1) // SLOT * SLOT
+    S[s, GRANT + a] = S[s, BEGIN + a] + S[s, SLOTS + a] * SLOT
+
+
+@part
+def remove(job, t, S, J):
+    """Take a job out of its station's queue; true if it was at the head."""
+    s, a = J[job, STATION], J[job, JOB_ACCESS]
+    J[job, IS_LIVE] = 0
+    if S[s, TX_JOB] == job:
+        S[s, TX_JOB] = -1
+    if S[s, HEAD + a] == job:
+        following = J[job, FOLLOWING]
+        S[s, HEAD + a] = following
+        if following < 0:
+            S[s, TAIL + a] = -1
+            S[s, GRANT + a] = FAR
+        else:
+            J[following, HEAD_AT] = t
+        if J[job, KIND] == DATA:
+            S[s, REQUEST] = 0
+        return True
+    before = S[s, HEAD + a]
+    while before >= 0 and J[before, FOLLOWING] != job:
+        before = J[before, FOLLOWING]
+    if before >= 0:
+        J[before, FOLLOWING] = J[job, FOLLOWING]
+        if S[s, TAIL + a] == job:
+            S[s, TAIL + a] = before
+    return False
+
+
+@part
+def release(s, t, S, P, W, C, F):
+    """An exchange of a station's own is over; the medium is watched again."""
+    S[s, AWAITS] = NOTHING
+    S[s, TIMEOUT_AT] = FAR
+    if sense(s, S, P, F):
+        S[s, IS_BUSY] = 1
+        S[s, GRANT] = S[s, GRANT_LOW] = FAR
+    else:
+        S[s, IS_BUSY] = 0
+        S[s, IDLE_AT] = max(t, S[s, NAV], S[s, EIFS_UNTIL])
+        plan_access(s, S, C)
+    renew(s, S)
+
+
+@part
+def log_success(sinr, mcs, curves):
+    """Of a frame of `REFERENCE_BYTES`."""
+    if sinr <= 1e-9:
+        return -700.0
+    x = curves[mcs, 1] * (10.0 * np.log10(sinr) - curves[mcs, 0])
+    if x > 36.0:
+        return 0.0
+    return -curves[mcs, 2] * np.log1p(np.exp(-x)) if x > -200.0 else -700.0
+
+
+@part
+def link_of(s, r, begin, receiver, C):
+    """Where the link stands in the list; −1 where none is listed."""
+    if C[C_SQUARE] == 1:
+        return begin[s] + r
+    low, high = begin[s], begin[s + 1]
+    while low < high:
+        middle = (low + high) // 2
+        if receiver[middle] < r:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < begin[s + 1] and receiver[low] == r else -1
+
+
+@part
+def blame(other, victim, begin, receiver, gain, S, C, F):
+    """What a group frame of `victim` that `other` spoils is lost to."""
+    link = link_of(victim, other, begin, receiver, C)
+    if S[other, TX_BEGIN] - S[victim, TX_BEGIN] > CCA or S[victim, TX_BEGIN] - S[other, TX_BEGIN] > CCA:
+        if link < 0 or gain[link] < F[F_SENSED]:
+            return HIDDEN
+    return COLLISION_CONTEXT if S[other, TX_KIND] == GROUP else COLLISION_DATA
+
+
+@part
+def add_segment(j, t, level, S, SEG_AT, SEG):
+    """The interference of a running reception has changed."""
+    k = S[j, SEGMENTS]
+    if k > 0 and SEG_AT[j, k - 1] == t:
+        SEG[j, k - 1] = level
+    elif k < OVERLAPS:
+        SEG_AT[j, k], SEG[j, k] = t, level
+        S[j, SEGMENTS] = k + 1
+    else:
+        SEG[j, k - 1] = max(SEG[j, k - 1], level)
+
+
+@part
+def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F):
+    """Frames that begin at one instant reach the receivers."""
+    touched = 0
+    for x in range(count):
+        s = starters[x]
+        group = S[s, TX_KIND] == GROUP
+        counter = np.uint64(C[C_FRAME] if C[C_BY_FRAME] == 1 else S[s, SENT])
+        for k in range(begin[s], begin[s + 1]):
+            j = receiver[k]
+            if j == s:
+                continue
+            power = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
+            W[k] = power
+            P[j] += power
+            S[j, INCIDENT] += 1
+            WHY[k] = UNKNOWN
+            if S[j, TX_END] != FAR:
+                WHY[k] = HALF_DUPLEX
+                continue
+            if S[j, LOCK] >= 0 and t - S[j, LOCK_AT] > CCA:
+                add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
+                if group:
+                    WHY[k] = blame(S[j, LOCK], s, begin, receiver, gain, S, C, F)
+                if S[S[j, LOCK], TX_KIND] == GROUP:
+                    WHY[S[j, LOCK_LINK]] = blame(s, S[j, LOCK], begin, receiver, gain, S, C, F)
+                look(j, t, S, P, W, C, F)
+                continue
+            if S[j, CANDIDATE] < 0 or t - S[j, CANDIDATE_AT] > CCA:
+                S[j, CANDIDATE], S[j, CANDIDATE_LINK], S[j, CANDIDATE_AT] = s, k, t
+            else:
+                c, link = S[j, CANDIDATE], S[j, CANDIDATE_LINK]
+                WHY[link] = blame(s, c, begin, receiver, gain, S, C, F)
+                WHY[k] = blame(c, s, begin, receiver, gain, S, C, F)
+                if power > W[link]:
+                    S[j, CANDIDATE], S[j, CANDIDATE_LINK] = s, k
+            if S[j, TOUCHED] == 0:
+                S[j, TOUCHED] = 1
+                TOUCH[touched] = j
+                touched += 1
+    for x in range(touched):
+        j = TOUCH[x]
+        S[j, TOUCHED] = 0
+        link = S[j, CANDIDATE_LINK]
+        power = W[link]
+        others = max(0.0, P[j] - power)
+        if power >= F[F_SENSED] and power >= F[F_PREAMBLE] * (F[F_LEGACY_NOISE] + others):
+            S[j, LOCK], S[j, LOCK_LINK], S[j, LOCK_AT] = S[j, CANDIDATE], link, S[j, CANDIDATE_AT]
+            S[j, SEGMENTS] = 1
+            SEG_AT[j, 0], SEG[j, 0] = t, others
+            S[j, EIFS_UNTIL] = 0
+        else:
+            S[j, LOCK] = -1
+            if WHY[link] == UNKNOWN:
+                WHY[link] = WEAK
+                if power >= F[F_SENSED] and power >= F[F_PREAMBLE] * F[F_LEGACY_NOISE]:
+                    c = S[j, CANDIDATE]
+                    for i in range(C[C_STATIONS]):  # spoilt by a frame that it had not locked to
+                        if i != c and S[i, TX_END] != FAR:
+                            other = link_of(i, j, begin, receiver, C)
+                            if other >= 0 and i != j and W[other] * 4.0 >= others:
+                                WHY[link] = blame(i, c, begin, receiver, gain, S, C, F)
+                                break
+        look(j, t, S, P, W, C, F)
+    for x in range(count):
+        s = starters[x]
+        if S[s, IS_BUSY] == 0:
+            S[s, IS_BUSY] = 1
+        renew(s, S)
+
+
+@compiled
+def account(t, G):
+    """Add up how long frames have been on the air."""
+    if G[G_OTHERS] > 0:
+        G[G_OTHER_NS] += t - G[G_SINCE]
+    elif G[G_GROUPS] > 0:
+        G[G_GROUP_NS] += t - G[G_SINCE]
+    G[G_SINCE] = t
+
+
+@part
+def transmit(s, t, kind, to, duration, S, G):
+    """A station's radio turns to sending; what it was receiving is lost."""
+    count_down(s, t, S)
+    S[s, GRANT] = S[s, GRANT_LOW] = FAR
+    S[s, TX_KIND], S[s, TX_TO], S[s, TX_END], S[s, TX_BEGIN] = kind, to, t + duration, t
+    S[s, TRANSMITTED_NS] += duration
+    S[s, RESPONSE_AT] = FAR
+    S[s, SENT] += 1
+    S[s, EIFS_UNTIL] = 0
+    S[s, CANDIDATE] = S[s, LOCK] = -1
+    account(t, G)
+    G[G_GROUPS if kind == GROUP else G_OTHERS] += 1
+
+
+@part
+def build(s, job, S, J, M, T, LI, LF, RATES, LIMITS, C):
+    """The fragments of the next A-MPDU of a job; returns the frame's duration."""
+    flow = J[job, FLOW]
+    mcs = S[s, TX_MCS]
+    rate = LF[flow, FLOW_RATE] if LF[flow, FLOW_RATE] > 0.0 else RATES[mcs]
+    most = LI[flow, FLOW_FRAMES] if LF[flow, FLOW_RATE] > 0.0 else LIMITS[mcs]
+    if LI[flow, FLOW_DEAD] > 0:
+        most = 1
+    most = min(most, C[C_BLOCK])
+    total, n = 0, 0
+    index = J[job, LOW]
+    beyond = min(J[job, COUNT], J[job, LOW] + C[C_BLOCK])
+    while index < beyond and n < most:
+        if index >= J[job, HIGH]:
+            M[s, index % C[C_BLOCK]] = 0
+            J[job, HIGH] = index + 1
+        if M[s, index % C[C_BLOCK]] & _RESOLVED == 0:
+            size = J[job, FULL_BYTES] if index < J[job, COUNT] - 1 else J[job, LAST_BYTES]
+            total += (size + 7) // 4 * 4
+            T[s, n] = index
+            n += 1
+        index += 1
+    S[s, TX_COUNT] = n
+    bits = 22.0 + 8.0 * total
+    return C[C_PREAMBLE_NS] + C[C_SYMBOL_NS] * np.int64(np.ceil(bits / (rate * C[C_SYMBOL_NS]) - 1e-9))
+
+
+@part
+def choose_mcs(flow, LI, ORDER, C):
+    """The MCS of the next exchange: every tenth of a learning sender looks around."""
+    if C[C_LEARNS] == 0 or LI[flow, FLOW_DEAD] > 0:
+        return max(LI[flow, FLOW_MCS], 0)
+    LI[flow, FLOW_SENT] += 1
+    if LI[flow, FLOW_SENT] % _PROBE_EVERY != 0 or ORDER.shape[1] < 2:
+        return LI[flow, FLOW_MCS]
+    at = ORDER[flow, LI[flow, FLOW_PROBED] % ORDER.shape[1]]
+    LI[flow, FLOW_PROBED] += 1
+    if at == LI[flow, FLOW_MCS]:
+        at = ORDER[flow, LI[flow, FLOW_PROBED] % ORDER.shape[1]]
+        LI[flow, FLOW_PROBED] += 1
+    return at
+
+
+@part
+def answer_ns(s, S, C):
+    if S[s, TX_KIND] == DATA and S[s, TX_COUNT] == 1:
+        return ACK
+    return BLOCK_ACK if C[C_BLOCK] <= 64 else BLOCK_ACK_LONG
+
+
+@part
+def send_data(s, t, job, S, J, M, T, LI, LF, RATES, LIMITS, C, G):
+    duration = build(s, job, S, J, M, T, LI, LF, RATES, LIMITS, C)
+    transmit(s, t, DATA, LI[J[job, FLOW], FLOW_TO], duration, S, G)
+    S[s, TX_NAV] = SIFS + answer_ns(s, S, C)
+    J[job, AIR_NS] += duration + S[s, TX_NAV]
+
+
+@part
+def access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
+    """A station's turn: the class of higher priority sends, the other one's equal counter is a collision within."""
+    a = 0 if S[s, GRANT] <= t and S[s, HEAD] >= 0 else 1
+    if S[s, HEAD + a] < 0:
+        S[s, GRANT] = S[s, GRANT_LOW] = FAR
+        renew(s, S)
+        return False
+    if a == 0 and S[s, GRANT_LOW] <= t and S[s, HEAD_LOW] >= 0:
+        fail_window(s, 1, S, C)
+        draw_backoff(s, 1, S, keys)
+    job = S[s, HEAD + a]
+    S[s, ACCESS], S[s, TX_JOB] = a, job
+    S[s, SLOTS + a] = 0
+    if J[job, KIND] == GROUP:
+        transmit(s, t, GROUP, -1, J[job, AIR_NS], S, G)
+        S[s, AWAITS] = GROUP
+        S[s, TX_NAV] = 0
+        return True
+    flow = J[job, FLOW]
+    to = LI[flow, FLOW_TO]
+    if S[s, REQUEST] == 1:
+        transmit(s, t, BLOCK_REQUEST, to, CONTROL, S, G)
+        S[s, TX_NAV] = SIFS + answer_ns(s, S, C)
+        J[job, AIR_NS] += CONTROL + S[s, TX_NAV]
+        S[s, AWAITS] = BLOCK_REQUEST
+        return True
+    S[s, TX_MCS] = choose_mcs(flow, LI, ORDER, C)
+    if C[C_RTS] == 1 and LI[flow, FLOW_DEAD] == 0:
+        duration = build(s, job, S, J, M, T, LI, LF, RATES, LIMITS, C)
+        transmit(s, t, RTS, to, CONTROL, S, G)
+        S[s, TX_NAV] = 3 * SIFS + CONTROL + duration + BLOCK_ACK
+        J[job, AIR_NS] += 2 * (CONTROL + SIFS)
+        S[s, AWAITS] = RTS
+        return True
+    send_data(s, t, job, S, J, M, T, LI, LF, RATES, LIMITS, C, G)
+    S[s, AWAITS] = DATA
+    return True
+
+
+@part
+def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys):
+    """No answer has come."""
+    a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
+    fail_window(s, a, S, C)
+    if job >= 0:
+        if LI[J[job, FLOW], FLOW_DEAD] > 0:
+            J[job, DEAD_TRIES] += 1
+            if J[job, DEAD_TRIES] > C[C_RETRIES]:
+                OUT[told, 0], OUT[told, 1] = T_DEAD, job
+                told += 1
+                remove(job, t, S, J)
+        elif what == DATA:
+            LS[J[job, FLOW], S[s, TX_MCS], 0] += S[s, TX_COUNT]
+            if S[s, TX_COUNT] == 1:
+                told = settle(s, t, job, False, True, S, J, M, T, OUT, told, DROPS, C)
+            else:  # ask what has arrived, for as long as it takes
+                S[s, REQUEST] = 1
+    draw_backoff(s, a, S, keys)
+    release(s, t, S, P, W, C, F)
+    return told
+
+
+@part
+def settle(s, t, job, is_answered, counts, S, J, M, T, OUT, told, DROPS, C):
+    """The sender learns what has arrived of the fragments that it sent last; `counts`: a missing one has used up a try."""
+    for x in range(S[s, TX_COUNT]):
+        at = T[s, x] % C[C_BLOCK]
+        state = M[s, at]
+        if state & _RESOLVED:
+            continue
+        if is_answered and state & _RECEIVED:
+            M[s, at] = state | _RESOLVED
+        elif counts and (state & _TRIES) >= C[C_RETRIES]:
+            M[s, at] = state | _RESOLVED
+            if state & _RECEIVED == 0:
+                DROPS[0, 0] += 1
+                if DROPS[0, 0] < DROPS.shape[0]:
+                    DROPS[DROPS[0, 0], 0], DROPS[DROPS[0, 0], 1] = job, T[s, x]
+                J[job, DROPPED] += 1
+        elif counts:
+            M[s, at] = state + 1
+    low = J[job, LOW]
+    while low < J[job, HIGH] and M[s, low % C[C_BLOCK]] & _RESOLVED:
+        low += 1
+    J[job, LOW] = low
+    if low == J[job, COUNT]:
+        if J[job, IS_TOLD] == 0:
+            OUT[told, 0], OUT[told, 1] = T_OVER, job
+            told += 1
+        J[job, IS_TOLD] = 2
+        remove(job, t, S, J)
+    return told
+
+
+@part
+def is_read(j, s, t, S, W, SEG_AT, SEG, mcs, length, noise, whole, curves, bits):
+    """Whether a lone frame is received; `whole` false: whether anything of it is, for those it is not meant for."""
+    link = S[j, LOCK_LINK]
+    n = S[j, SEGMENTS]
+    if not whole:
+        least = SEG[j, 0]
+        for k in range(1, n):
+            least = min(least, SEG[j, k])
+        return log_success(W[link] / (noise + least), mcs, curves) > -0.7
+    total, span = 0.0, max(1, t - S[j, LOCK_AT])
+    for k in range(n):
+        until = SEG_AT[j, k + 1] if k + 1 < n else t
+        begin_at = S[j, LOCK_AT] if k == 0 else SEG_AT[j, k]
+        part = (until - begin_at) / span
+        if part > 0.0:
+            total += part * log_success(W[link] / (noise + SEG[j, k]), mcs, curves)
+    total *= length / REFERENCE_BYTES
+    return total > -1e-15 or uniform(bits) < np.exp(total)
+
+
+@part
+def receive_fragments(s, r, t, job, S, J, M, T, W, SEG_AT, SEG, LF, C, curves, keys):
+    """Which fragments of an A-MPDU arrive; returns how many."""
+    flow, mcs, n = J[job, FLOW], S[s, TX_MCS], S[s, TX_COUNT]
+    link = S[r, LOCK_LINK]
+    segments = S[r, SEGMENTS]
+    burst, given = LF[flow, FLOW_BURST], LF[flow, FLOW_LOSS]
+    seed = mix(mix(keys[s] ^ np.uint64(0x51)) + np.uint64(S[s, SENT]))
+    body_at = S[s, TX_BEGIN] + C[C_PREAMBLE_NS]
+    body_ns = max(1, S[s, TX_END] - body_at)
+    full, last = J[job, FULL_BYTES], J[job, LAST_BYTES]
+    arrived, each_ns = 0, body_ns / n
+    alike = log_success(W[link] / (1.0 + SEG[r, 0]), mcs, curves) / REFERENCE_BYTES
+    for x in range(n):
+        index = T[s, x]
+        length = full if index < J[job, COUNT] - 1 else last
+        good = alike * length
+        if segments > 1:
+            good, from_ns, until_ns = 0.0, body_at + x * each_ns, body_at + (x + 1) * each_ns
+            for k in range(segments):
+                a = max(from_ns, np.float64(SEG_AT[r, k])) if k else from_ns
+                b = min(until_ns, np.float64(SEG_AT[r, k + 1])) if k + 1 < segments else until_ns
+                if b > a:
+                    good += (b - a) / each_ns * log_success(W[link] / (1.0 + SEG[r, k]), mcs, curves)
+            good *= length / REFERENCE_BYTES
+        if given >= 0.0:
+            good = np.log1p(-given) if given < 1.0 else -700.0
+        elif burst > 0.0:
+            good += np.log1p(-burst) if burst < 1.0 else -700.0
+        if good < -1e-12 and uniform(mix(seed + np.uint64(x))) >= np.exp(good):
+            continue
+        arrived += 1
+        at = index % C[C_BLOCK]
+        if M[s, at] & _RECEIVED == 0:
+            M[s, at] |= _RECEIVED
+            J[job, ARRIVED] += 1
+    return arrived
+
+
+@part
+def finish(
+    s,
+    t,
+    S,
+    P,
+    W,
+    WHY,
+    G,
+    J,
+    M,
+    T,
+    SEG_AT,
+    SEG,
+    OUT,
+    told,
+    DROPS,
+    begin,
+    receiver,
+    gain,
+    extra,
+    LI,
+    LF,
+    LS,
+    RATES,
+    LIMITS,
+    C,
+    F,
+    curves,
+    keys,
+    TOUCH,
+):
+    """A frame ends."""
+    kind, to, a = S[s, TX_KIND], S[s, TX_TO], S[s, ACCESS]
+    job = S[s, TX_JOB] if kind == GROUP or kind == DATA else -1
+    seed = mix(mix(keys[s] ^ np.uint64(0x77)) + np.uint64(S[s, SENT]))
+    touched = 0
+    is_meant, is_answered = False, False
+    for k in range(begin[s], begin[s + 1]):
+        j = receiver[k]
+        if j == s:
+            continue
+        if S[j, LOCK] == s:
+            S[j, LOCK] = -1
+            if kind == GROUP:
+                bits = mix(seed ^ keys[j])
+                length = np.float64(J[job, FULL_BYTES]) if job >= 0 else 334.0
+                good = is_read(j, s, t, S, W, SEG_AT, SEG, GROUP_CURVE, length, F[F_LEGACY_NOISE], True, curves, bits)
+                if good and C[C_EXTRA] == 1 and extra[k] > 0.0:
+                    if uniform(mix(bits)) < extra[k]:
+                        good = False
+                        WHY[k] = WEAK
+                if good:
+                    WHY[k] = HEARD
+                elif WHY[k] == UNKNOWN:
+                    WHY[k] = WEAK
+            elif j == to:
+                is_meant = True
+                if kind == DATA:
+                    good = False
+                    if job >= 0 and LI[J[job, FLOW], FLOW_DEAD] == 0:
+                        good = receive_fragments(s, j, t, job, S, J, M, T, W, SEG_AT, SEG, LF, C, curves, keys) > 0
+                else:
+                    good = is_read(
+                        j,
+                        s,
+                        t,
+                        S,
+                        W,
+                        SEG_AT,
+                        SEG,
+                        CONTROL_CURVE,
+                        CONTROL_BYTES,
+                        F[F_LEGACY_NOISE],
+                        True,
+                        curves,
+                        mix(seed ^ keys[j]),
+                    )
+                is_answered = good
+            elif kind == DATA:
+                good = is_read(j, s, t, S, W, SEG_AT, SEG, S[s, TX_MCS], 1500.0, 1.0, False, curves, seed)
+            else:
+                good = is_read(
+                    j, s, t, S, W, SEG_AT, SEG, CONTROL_CURVE, CONTROL_BYTES, F[F_LEGACY_NOISE], False, curves, seed
+                )
+            S[j, EIFS_UNTIL] = 0 if good else t + EIFS_EXTRA
+            if good and j != to and S[s, TX_NAV] > 0:
+                S[j, NAV] = max(S[j, NAV], t + S[s, TX_NAV])
+        elif kind == GROUP and WHY[k] == UNKNOWN:
+            WHY[k] = HALF_DUPLEX  # it began to send meanwhile
+        if S[j, CANDIDATE] == s:
+            S[j, CANDIDATE] = -1
+        S[j, INCIDENT] -= 1
+        P[j] = P[j] - W[k] if S[j, INCIDENT] > 0 else 0.0
+        if S[j, LOCK] >= 0:
+            add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
+        TOUCH[touched] = j
+        touched += 1
+    S[s, TX_END] = FAR
+    account(t, G)
+    G[G_GROUPS if kind == GROUP else G_OTHERS] -= 1
+    for x in range(touched):
+        look(TOUCH[x], t, S, P, W, C, F)
+    if kind == GROUP:
+        S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
+        if job >= 0:
+            OUT[told, 0], OUT[told, 1] = T_GROUP, job
+            told += 1
+            remove(job, t, S, J)
+        draw_backoff(s, a, S, keys)
+        release(s, t, S, P, W, C, F)
+    elif kind == ANSWER or kind == CTS:
+        # the sender that waits for it
+        if S[to, AWAITS] != NOTHING and S[to, TX_TO] == s and S[to, TX_END] == FAR and S[to, RESPONSE_AT] == FAR:
+            if is_meant and is_answered:
+                told = conclude(to, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys)
+            elif S[to, TIMEOUT_AT] == FAR:
+                told = miss(to, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys)
+        release(s, t, S, P, W, C, F) if S[s, AWAITS] == NOTHING else renew(s, S)
+    else:
+        if job >= 0 and J[job, ARRIVED] == J[job, COUNT] and J[job, IS_TOLD] == 0:
+            J[job, IS_TOLD] = 1
+            OUT[told, 0], OUT[told, 1] = T_ARRIVED, job
+            told += 1
+        S[s, TIMEOUT_AT] = t + SIFS + SLOT + LEGACY_PREAMBLE
+        if kind == DATA:
+            S[s, REACHED] = is_meant
+        if is_answered and not is_engaged(to, S):
+            if kind == RTS:
+                if S[to, NAV] <= t:
+                    S[to, RESPONSE_AT], S[to, RESPONSE_KIND], S[to, RESPONSE_TO] = t + SIFS, CTS, s
+                    S[to, RESPONSE_NS] = S[s, TX_NAV] - SIFS - CONTROL
+            else:
+                S[to, RESPONSE_AT], S[to, RESPONSE_KIND], S[to, RESPONSE_TO] = t + SIFS, ANSWER, s
+                S[to, RESPONSE_NS] = S[s, TX_NAV] - SIFS
+            renew(to, S)
+        S[s, IS_BUSY] = 1
+        renew(s, S)
+    return told
+
+
+@part
+def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys):
+    """The answer has come."""
+    a, what = S[s, ACCESS], S[s, AWAITS]
+    S[s, TIMEOUT_AT] = FAR
+    if what == RTS:  # clear to send
+        S[s, RESPONSE_AT], S[s, RESPONSE_KIND] = t + SIFS, DATA
+        renew(s, S)
+        return told
+    job = S[s, TX_JOB]
+    S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
+    if job >= 0:
+        if what == DATA:
+            flow = J[job, FLOW]
+            LS[flow, S[s, TX_MCS], 0] += S[s, TX_COUNT]
+            for x in range(S[s, TX_COUNT]):
+                if M[s, T[s, x] % C[C_BLOCK]] & _RECEIVED:
+                    LS[flow, S[s, TX_MCS], 1] += 1
+        S[s, REQUEST] = 0
+        told = settle(s, t, job, True, what == DATA or S[s, REACHED] == 1, S, J, M, T, OUT, told, DROPS, C)
+    draw_backoff(s, a, S, keys)
+    release(s, t, S, P, W, C, F)
+    return told
+
+
+@compiled
+def run(
+    until,
+    S,
+    P,
+    W,
+    WHY,
+    G,
+    J,
+    M,
+    T,
+    SEG_AT,
+    SEG,
+    LI,
+    LS,
+    DROPS,
+    LF,
+    OUT,
+    TOUCH,
+    begin,
+    receiver,
+    gain,
+    extra,
+    fade,
+    keys,
+    RATES,
+    LIMITS,
+    ORDER,
+    C,
+    F,
+    curves,
+):
+    """Run the stations until something has to be told, or until a time.
+
+    Returns: the time reached, and how many rows of OUT are to be told.
+    """
+    n = C[C_STATIONS]
+    starters = TOUCH[TOUCH.shape[0] // 2 :]
+    while True:
+        t = FAR
+        for s in range(n):
+            t = min(t, S[s, NEXT_AT])
+        if t > until:
+            return until, 0
+        told = 0
+        for s in range(n):  # frames that end
+            if S[s, TX_END] == t:
+                told = finish(
+                    s,
+                    t,
+                    S,
+                    P,
+                    W,
+                    WHY,
+                    G,
+                    J,
+                    M,
+                    T,
+                    SEG_AT,
+                    SEG,
+                    OUT,
+                    told,
+                    DROPS,
+                    begin,
+                    receiver,
+                    gain,
+                    extra,
+                    LI,
+                    LF,
+                    LS,
+                    RATES,
+                    LIMITS,
+                    C,
+                    F,
+                    curves,
+                    keys,
+                    TOUCH,
+                )
+        count = 0
+        for s in range(n):
+            if S[s, NEXT_AT] > t:
+                continue
+            while S[s, ARRIVE_AT] <= t:
+                job = S[s, COMING]
+                S[s, COMING] = J[job, FOLLOWING]
+                S[s, ARRIVE_AT] = J[S[s, COMING], READY_AT] if S[s, COMING] >= 0 else FAR
+                enqueue(s, job, t, S, J, C, keys)
+            if S[s, TIMEOUT_AT] <= t:
+                if (
+                    S[s, LOCK] == S[s, TX_TO]
+                    and S[s, LOCK] >= 0
+                    and S[S[s, LOCK], TX_KIND] >= CTS
+                    and S[S[s, LOCK], TX_TO] == s
+                ):
+                    S[s, TIMEOUT_AT] = FAR
+                else:
+                    told = miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys)
+            if S[s, RESPONSE_AT] <= t:
+                if S[s, RESPONSE_KIND] == DATA:
+                    job = S[s, TX_JOB]
+                    if job >= 0:
+                        send_data(s, t, job, S, J, M, T, LI, LF, RATES, LIMITS, C, G)
+                        S[s, AWAITS] = DATA
+                        starters[count] = s
+                        count += 1
+                    else:
+                        S[s, RESPONSE_AT] = FAR
+                        release(s, t, S, P, W, C, F)
+                else:
+                    duration = CONTROL
+                    if S[s, RESPONSE_KIND] == ANSWER:
+                        duration = S[s, RESPONSE_NS]
+                    transmit(s, t, S[s, RESPONSE_KIND], S[s, RESPONSE_TO], duration, S, G)
+                    S[s, TX_NAV] = S[s, RESPONSE_NS] if S[s, RESPONSE_KIND] == CTS else 0
+                    starters[count] = s
+                    count += 1
+            elif min(S[s, GRANT], S[s, GRANT_LOW]) <= t:
+                if access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
+                    starters[count] = s
+                    count += 1
+            renew(s, S)
+        if count > 0:
+            start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F)
+        if told > 0:
+            return t, told
+
+
+# --- from outside -------------------------------------------------------------------------------------
+
+
+@part
+def fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J):
+    for k in range(JOB_COLUMNS):
+        J[job, k] = 0
+    J[job, KIND], J[job, STATION], J[job, FLOW], J[job, JOB_ACCESS] = kind, station, flow, access_class
+    J[job, COUNT], J[job, FULL_BYTES], J[job, LAST_BYTES], J[job, AIR_NS] = count, full_bytes, last_bytes, air_ns
+    J[job, READY_AT], J[job, IS_LIVE], J[job, HEAD_AT] = at, 1, -1
+
+
+@compiled
+def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
+    """A job comes to its station at a time that is not yet over."""
+    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J)
+    before, following = -1, S[station, COMING]
+    while following >= 0 and J[following, READY_AT] <= at:
+        before, following = following, J[following, FOLLOWING]
+    J[job, FOLLOWING] = following
+    if before < 0:
+        S[station, COMING], S[station, ARRIVE_AT] = job, at
+        renew(station, S)
+    else:
+        J[before, FOLLOWING] = job
+
+
+@compiled
+def cancel(job, t, S, J):
+    """Take a job out, wherever it is; a frame of it that is on the air goes on to its end."""
+    s = J[job, STATION]
+    before, at = -1, S[s, COMING]
+    while at >= 0 and at != job:
+        before, at = at, J[at, FOLLOWING]
+    if at == job:
+        J[job, IS_LIVE] = 0
+        if before < 0:
+            S[s, COMING] = J[job, FOLLOWING]
+            S[s, ARRIVE_AT] = J[S[s, COMING], READY_AT] if S[s, COMING] >= 0 else FAR
+        else:
+            J[before, FOLLOWING] = J[job, FOLLOWING]
+    else:
+        remove(job, t, S, J)
+    renew(s, S)
+
+
+@compiled
+def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
+    """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
+    is_first = S[station, COMING] == old
+    before = S[station, HEAD + access_class]
+    while before >= 0 and J[before, FOLLOWING] != old:
+        before = J[before, FOLLOWING]
+    if before < 0 and not is_first:  # it has come at this very instant
+        before = S[station, COMING]
+        while before >= 0 and J[before, FOLLOWING] != old:
+            before = J[before, FOLLOWING]
+        if before < 0:
+            return False
+    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, J[old, READY_AT], J)
+    J[job, FOLLOWING] = J[old, FOLLOWING]
+    if is_first:
+        S[station, COMING] = job
+    else:
+        J[before, FOLLOWING] = job
+    J[old, IS_LIVE] = 0
+    if S[station, TAIL + access_class] == old:
+        S[station, TAIL + access_class] = job
+    return True
+
+
+@compiled
+def copy(
+    S,
+    P,
+    W,
+    WHY,
+    G,
+    J,
+    M,
+    T,
+    SEG_AT,
+    SEG,
+    LI,
+    LS,
+    DROPS,
+    S2,
+    P2,
+    W2,
+    WHY2,
+    G2,
+    J2,
+    M2,
+    T2,
+    SEG_AT2,
+    SEG2,
+    LI2,
+    LS2,
+    DROPS2,
+    begin,
+):
+    """Make the second state equal to the first; what is not in use is left out."""
+    for s in range(S.shape[0]):
+        P2[s] = P[s]
+        for k in range(STATION_COLUMNS):
+            S2[s, k] = S[s, k]
+    for k in range(G.shape[0]):
+        G2[k] = G[k]
+    for x in range(J.shape[0]):
+        for k in range(JOB_COLUMNS):
+            J2[x, k] = J[x, k]
+    for x in range(LI.shape[0]):
+        for k in range(FLOW_COLUMNS):
+            LI2[x, k] = LI[x, k]
+        for m in range(LS.shape[1]):
+            LS2[x, m, 0], LS2[x, m, 1] = LS[x, m, 0], LS[x, m, 1]
+    for s in range(S.shape[0]):
+        if S[s, TX_END] != FAR:
+            for k in range(begin[s], begin[s + 1]):
+                W2[k], WHY2[k] = W[k], WHY[k]
+        if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
+            for k in range(M.shape[1]):
+                M2[s, k], T2[s, k] = M[s, k], T[s, k]
+        if S[s, LOCK] >= 0:
+            for k in range(S[s, SEGMENTS]):
+                SEG_AT2[s, k], SEG2[s, k] = SEG_AT[s, k], SEG[s, k]
+    for x in range(DROPS[0, 0] + 1):
+        DROPS2[x, 0], DROPS2[x, 1] = DROPS[x, 0], DROPS[x, 1]
+
+
+@compiled
+def relink(S, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain, fade, keys, C):
+    """The list of links is another one: find the frames on the air in it."""
+    for j in range(C[C_STATIONS]):
+        P[j] = 0.0
+        S[j, INCIDENT] = 0
+        if S[j, LOCK] >= 0:
+            S[j, LOCK_LINK] = link_of(S[j, LOCK], j, begin, receiver, C)
+            if S[j, LOCK_LINK] < 0:
+                S[j, LOCK] = -1
+        S[j, CANDIDATE] = -1
+    for s in range(C[C_STATIONS]):
+        if S[s, TX_END] == FAR:
+            continue
+        counter = np.uint64(C[C_FRAME] if C[C_BY_FRAME] == 1 else S[s, SENT])
+        at = old_begin[s]
+        for k in range(begin[s], begin[s + 1]):
+            j = receiver[k]
+            while at < old_begin[s + 1] and old_receiver[at] < j:
+                at += 1
+            WHY[k] = old_why[at] if at < old_begin[s + 1] and old_receiver[at] == j else WEAK
+            W[k] = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
+            P[j] += W[k]
+            S[j, INCIDENT] += 1
