@@ -13,6 +13,9 @@ jobs (a group frame or a sample) and flows (a link with unicast traffic); the co
 from __future__ import annotations
 
 import numpy as np
+from numba import carray, types
+from numba.core.cgutils import voidptr_t
+from numba.extending import intrinsic
 
 from sortie.scenarios.compiled import compiled, part
 
@@ -44,9 +47,9 @@ NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
     RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
     LOCK, LOCK_LINK, LOCK_AT, CANDIDATE, CANDIDATE_LINK, CANDIDATE_AT, SEGMENTS,
     IS_BUSY, SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
-    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, REACHED,
-) = range(51)  # fmt: skip
-STATION_COLUMNS = 51
+    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB,
+) = range(50)  # fmt: skip
+STATION_COLUMNS = 50
 
 # columns of a job
 (
@@ -696,6 +699,10 @@ def finish(
                         curves,
                         mix(seed ^ keys[j]),
                     )
+                if good and kind == BLOCK_REQUEST and S[s, TX_JOB] >= 0:
+                    flow = J[S[s, TX_JOB], FLOW]
+                    lost = LF[flow, FLOW_LOSS] if LF[flow, FLOW_LOSS] >= 0.0 else LF[flow, FLOW_BURST]
+                    good = uniform(mix(seed)) >= lost
                 is_answered = good
             elif kind == DATA:
                 good = is_read(j, s, t, S, W, SEG_AT, SEG, S[s, TX_MCS], 1500.0, 1.0, False, curves, seed)
@@ -743,8 +750,6 @@ def finish(
             OUT[told, 0], OUT[told, 1] = T_ARRIVED, job
             told += 1
         S[s, TIMEOUT_AT] = t + SIFS + SLOT + LEGACY_PREAMBLE
-        if kind == DATA:
-            S[s, REACHED] = is_meant
         if is_answered and not is_engaged(to, S):
             if kind == RTS:
                 if S[to, NAV] <= t:
@@ -778,7 +783,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys):
                 if M[s, T[s, x] % C[C_BLOCK]] & _RECEIVED:
                     LS[flow, S[s, TX_MCS], 1] += 1
         S[s, REQUEST] = 0
-        told = settle(s, t, job, True, what == DATA or S[s, REACHED] == 1, S, J, M, T, OUT, told, DROPS, C)
+        told = settle(s, t, job, True, what == DATA, S, J, M, T, OUT, told, DROPS, C)
     draw_backoff(s, a, S, keys)
     release(s, t, S, P, W, C, F)
     return told
@@ -982,7 +987,7 @@ def substitute(old, job, kind, station, flow, access_class, count, full_bytes, l
     return True
 
 
-@compiled
+@part
 def copy(
     S,
     P,
@@ -1065,3 +1070,164 @@ def relink(S, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain
             W[k] = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
             P[j] += W[k]
             S[j, INCIDENT] += 1
+
+
+def _pointer(_, address):
+    def generate(_, builder, __, values):
+        return builder.inttoptr(values[0], voidptr_t)
+
+    return types.voidptr(address), generate
+
+
+pointer = intrinsic(_pointer)
+"""An address as numba's `carray` wants it."""
+SIZES = 8
+"""Sizes that come before the addresses: stations, links, jobs, window, flows, MCS, drops, extra losses."""
+
+
+@compiled
+def ahead(at, since, until, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, ready_at):
+    """Bring the first state up to `since`, let a job come to it (−1: none), and run a copy of it ahead.
+
+    Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
+    `SIZES` sizes, the 13 arrays of the first state, those of its copy, and what they share. an `until` before `since` is no copy.
+
+    Returns: the time that the copy has reached, and how many rows of OUT are to be told.
+    """
+    n, links, jobs, window, flows, mcs, drops, extras = at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7]
+    S = carray(pointer(at[8]), (n, STATION_COLUMNS), np.int64)
+    P = carray(pointer(at[9]), (n,), np.float64)
+    W = carray(pointer(at[10]), (links,), np.float64)
+    WHY = carray(pointer(at[11]), (links,), np.uint8)
+    G = carray(pointer(at[12]), (5,), np.int64)
+    J = carray(pointer(at[13]), (jobs, JOB_COLUMNS), np.int64)
+    M = carray(pointer(at[14]), (n, window), np.uint8)
+    T = carray(pointer(at[15]), (n, window), np.int32)
+    SEG_AT = carray(pointer(at[16]), (n, OVERLAPS), np.int64)
+    SEG = carray(pointer(at[17]), (n, OVERLAPS), np.float64)
+    LI = carray(pointer(at[18]), (flows, FLOW_COLUMNS), np.int64)
+    LS = carray(pointer(at[19]), (flows, mcs, 2), np.int64)
+    DROPS = carray(pointer(at[20]), (drops, 2), np.int64)
+    LF = carray(pointer(at[34]), (flows, 3), np.float64)
+    OUT = carray(pointer(at[35]), (2 * n + 8, 2), np.int64)
+    TOUCH = carray(pointer(at[36]), (2 * n + 2,), np.int64)
+    begin = carray(pointer(at[37]), (n + 1,), np.int64)
+    receiver = carray(pointer(at[38]), (links,), np.int64)
+    gain = carray(pointer(at[39]), (links,), np.float64)
+    extra = carray(pointer(at[40]), (extras,), np.float64)
+    fade = carray(pointer(at[41]), (1 << 16,), np.float32)
+    keys = carray(pointer(at[42]), (n,), np.uint64)
+    RATES = carray(pointer(at[43]), (mcs,), np.float64)
+    LIMITS = carray(pointer(at[44]), (mcs,), np.int64)
+    ORDER = carray(pointer(at[45]), (flows, mcs), np.int64)
+    C = carray(pointer(at[46]), (17,), np.int64)
+    F = carray(pointer(at[47]), (3,), np.float64)
+    curves = carray(pointer(at[48]), (14, 3), np.float64)
+    run(
+        since,
+        S,
+        P,
+        W,
+        WHY,
+        G,
+        J,
+        M,
+        T,
+        SEG_AT,
+        SEG,
+        LI,
+        LS,
+        DROPS,
+        LF,
+        OUT,
+        TOUCH,
+        begin,
+        receiver,
+        gain,
+        extra,
+        fade,
+        keys,
+        RATES,
+        LIMITS,
+        ORDER,
+        C,
+        F,
+        curves,
+    )
+    if until < since:
+        return since, 0
+    if job >= 0:
+        submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, ready_at, S, J)
+    S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
+    P2 = carray(pointer(at[22]), (n,), np.float64)
+    W2 = carray(pointer(at[23]), (links,), np.float64)
+    WHY2 = carray(pointer(at[24]), (links,), np.uint8)
+    G2 = carray(pointer(at[25]), (5,), np.int64)
+    J2 = carray(pointer(at[26]), (jobs, JOB_COLUMNS), np.int64)
+    M2 = carray(pointer(at[27]), (n, window), np.uint8)
+    T2 = carray(pointer(at[28]), (n, window), np.int32)
+    SEG_AT2 = carray(pointer(at[29]), (n, OVERLAPS), np.int64)
+    SEG2 = carray(pointer(at[30]), (n, OVERLAPS), np.float64)
+    LI2 = carray(pointer(at[31]), (flows, FLOW_COLUMNS), np.int64)
+    LS2 = carray(pointer(at[32]), (flows, mcs, 2), np.int64)
+    DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
+    copy(
+        S,
+        P,
+        W,
+        WHY,
+        G,
+        J,
+        M,
+        T,
+        SEG_AT,
+        SEG,
+        LI,
+        LS,
+        DROPS,
+        S2,
+        P2,
+        W2,
+        WHY2,
+        G2,
+        J2,
+        M2,
+        T2,
+        SEG_AT2,
+        SEG2,
+        LI2,
+        LS2,
+        DROPS2,
+        begin,
+    )
+    return run(
+        until,
+        S2,
+        P2,
+        W2,
+        WHY2,
+        G2,
+        J2,
+        M2,
+        T2,
+        SEG_AT2,
+        SEG2,
+        LI2,
+        LS2,
+        DROPS2,
+        LF,
+        OUT,
+        TOUCH,
+        begin,
+        receiver,
+        gain,
+        extra,
+        fade,
+        keys,
+        RATES,
+        LIMITS,
+        ORDER,
+        C,
+        F,
+        curves,
+    )

@@ -37,6 +37,7 @@ PREAMBLE_SINR_DB = 4.0
 _NS = 1e-9
 _AHEAD_NS = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
+_NO_ENTRY = (-1, *[0] * 9)
 _MODULE: list[Any] = []
 
 
@@ -167,6 +168,7 @@ class Medium(Generic[J, F]):
         self._gain: FloatArray = np.zeros(0)
         self._extra = np.zeros(1)
         self._shared: tuple[Any, ...] = ()
+        self._tables: dict[int, IntArray] = {}
 
     @staticmethod
     def _ns(t_s: float) -> int:
@@ -221,6 +223,23 @@ class Medium(Generic[J, F]):
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
         )  # fmt: skip
 
+        self._tables = {}
+
+    def _table(self, first: _State) -> IntArray:
+        """Sizes and addresses of the arrays, as `edca.ahead` wants them; made anew when one of them is another."""
+        found = self._tables.get(id(first))
+        if found is None:
+            second = self._planned if first is self._settled else self._settled
+            a = first.arrays
+            sizes = (
+                self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LI]), len(self._rates), len(a[_DROPS]),
+                len(self._extra),
+            )  # fmt: skip
+            arrays = (*a, *second.arrays, *self._shared)
+            assert all(each.flags.c_contiguous for each in arrays)  # noqa: S101 (addresses know no strides)
+            found = self._tables[id(first)] = np.array([*sizes, *(each.ctypes.data for each in arrays)], np.int64)
+        return found
+
     def flow(self, sender: int, receiver: int) -> int:
         """The number of an ordered link that carries unicast frames."""
         found = self._flows.get((sender, receiver))
@@ -257,15 +276,12 @@ class Medium(Generic[J, F]):
 
     def submit(self, job: J) -> None:
         """Queue a job behind its sender's others; its `flow`, `frames`, `full_bytes` and `last_bytes` are set."""
-        self.sync()
-        entry = self._enter(job)  # may make room in the tables
-        a = self._settled.arrays
-        self._e.submit(*entry, a[_S], a[_J])
+        entry = self._enter(job)
         queue = self._queues[job.sender]
         queue.append(job)
         if len(queue) == 1:
             self._on_begin(job, self._env.now)
-        self._plan()
+        self._plan(entry)
 
     def replace(self, old: J, new: J) -> None:
         """Drop `old` (queued or in service) for `new`.
@@ -317,6 +333,7 @@ class Medium(Generic[J, F]):
         self._free = [row for row in self._finished if not live[row]]
         self._finished = [row for row in self._finished if live[row]]
         if not self._free:
+            self._tables = {}
             n = self._settled.jobs
             self._settled, self._planned = (_sized(state, {_J: 2 * n}) for state in (self._settled, self._planned))
             self._free = list(range(n, 2 * n))[::-1]
@@ -392,14 +409,9 @@ class Medium(Generic[J, F]):
 
     def announce(self, frame: F, in_s: float = 0.0) -> None:
         """A group frame comes to its station's queue, `in_s` from now."""
-        self.sync()
-        row, at_ns = self._open(frame), self._ns(self._env.now + in_s)
-        a = self._settled.arrays
-        self._e.submit(
-            row, self._e.GROUP, frame.sender, 0, self._group_access, 1, frame.wire_bytes, frame.wire_bytes,
-            round(frame.airtime_s * 1e9), at_ns, a[_S], a[_J],
-        )  # fmt: skip
-        self._plan()
+        row, length = self._open(frame), frame.wire_bytes
+        at_ns, air_ns = self._ns(self._env.now + in_s), round(frame.airtime_s * 1e9)
+        self._plan((row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns))
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames, waiting or to come; one that is on the air ends."""
@@ -422,14 +434,17 @@ class Medium(Generic[J, F]):
         """Bring the settled state up to now; what happens at this very instant is still to come."""
         until = self._ns(self._env.now) - 1
         if self._settled.now_ns < until:
-            self._e.run(until, *self._settled.arrays, *self._shared)
+            self._e.ahead(self._table(self._settled), until, until - 1, *_NO_ENTRY)
             self._settled.now_ns = until
 
-    def _plan(self) -> None:
-        """Run a copy ahead to whatever must be told next, and set the timer there."""
+    def _plan(self, entry: tuple[int, ...] = _NO_ENTRY) -> None:
+        """Let a job come, run a copy ahead to whatever must be told next, and set the timer there."""
+        settled, planned = self._settled, self._planned
+        now = self._env.now
         if self._is_telling:
+            if entry is not _NO_ENTRY:
+                self._e.submit(*entry, settled.arrays[_S], settled.arrays[_J])
             return
-        e, settled, planned = self._e, self._settled, self._planned
         self._timer = None
         self._told = []
         if not self._at_row:
@@ -437,14 +452,14 @@ class Medium(Generic[J, F]):
         deadlines = self._deadlines
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
-        until = settled.now_ns + _AHEAD_NS
+        since = max(self._ns(now) - 1, settled.now_ns)
+        until = since + _AHEAD_NS
         if deadlines:
-            until = min(until, max(deadlines[0][0], settled.now_ns))
-        e.copy(*settled.arrays, *planned.arrays, self._begin)
-        planned.now_ns, told = e.run(until, *planned.arrays, *self._shared)
+            until = min(until, max(deadlines[0][0], since))
+        planned.now_ns, told = self._e.ahead(self._table(settled), since, until, *entry)
+        settled.now_ns = since
         if told:
             self._told = [(kind, row, self._at_row.get(row)) for kind, row in self._out[:told].tolist()]
-        now = self._env.now
         self._timer = timer = self._env.timeout(max(0.0, planned.now_ns * _NS - now))
         timer.callbacks.append(self._on_timer)
 
