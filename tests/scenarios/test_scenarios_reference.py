@@ -101,6 +101,10 @@ def test_units_stand_in_names() -> None:
         "moving_cars_per_km",
         "near_probability",
         "relay_max_hops",
+        "aifsn",  # slots, by the standard's own names
+        "cw_min",
+        "cw_max",
+        "block_ack_window",
         "good_to_bad",
         "bad_to_good",
         "loss_good",

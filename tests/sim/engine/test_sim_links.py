@@ -107,7 +107,7 @@ def test_a_link_is_first_unknown_then_probed_then_measured_then_silent() -> None
     reasons = [r["reason"] for r in record.tables["directives"].to_pylist() if r["drone"] == 1]
     assert reasons[0] == "goodput not measured lately"
     assert "goodput: link silent, nothing got through" in reasons
-    assert not any("goodput 0.0" in reason for reason in reasons)
+    assert sum("goodput 0.0" in reason for reason in reasons) <= 1  # of a payload that waited behind the silent link
 
 
 def test_given_context_makes_the_policy_do_what_the_paper_tells() -> None:
