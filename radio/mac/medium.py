@@ -201,12 +201,17 @@ class Medium(Generic[J, F]):
         settled = self._settled
         is_same = receiver is self._receiver
         old = self._begin, self._receiver, settled.arrays[_WHY]
-        self._begin, self._receiver, self._gain = begin, receiver, gain
         ints[e.C_SQUARE], ints[e.C_FRAME], ints[e.C_EXTRA] = is_square, frame, extra is not None
-        if extra is not None:
-            self._extra = extra
-        self._share()
-        if not is_same:
+        if extra is not None and len(extra) == len(self._extra):
+            self._extra[:] = extra
+        elif extra is not None:
+            self._extra = extra.copy()
+            self._share()
+        if is_same:
+            self._gain[:] = gain
+        else:
+            self._begin, self._receiver, self._gain = begin, receiver, gain.copy()
+            self._share()
             if len(settled.arrays[_W]) != len(receiver):
                 sized = {_W: len(receiver), _WHY: len(receiver)}
                 self._settled, self._planned = (_sized(x, sized) for x in (settled, self._planned))
@@ -411,7 +416,12 @@ class Medium(Generic[J, F]):
         """A group frame comes to its station's queue, `in_s` from now."""
         row, length = self._open(frame), frame.wire_bytes
         at_ns, air_ns = self._ns(self._env.now + in_s), round(frame.airtime_s * 1e9)
-        self._plan((row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns))
+        entry = (row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns)
+        if self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling:
+            for state in (self._settled, self._planned):  # the plan stands: it ends before
+                self._e.submit(*entry, state.arrays[_S], state.arrays[_J])
+        else:
+            self._plan(entry)
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames, waiting or to come; one that is on the air ends."""
