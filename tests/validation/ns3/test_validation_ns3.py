@@ -32,19 +32,10 @@ needs_ns3 = pytest.mark.skipif("not _is_there()", reason="ns-3's wheel or a C++ 
 
 @needs_ns3
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "measured"),
-    [
-        (Case("light", payload_bytes=50_000, pairs=8, mcs=9, stop_s=2.0, load=0.1), {"delivered"}),
-        (Case("half", payload_bytes=163_840, pairs=10, mcs=9, stop_s=2.5, load=0.39), {"delivered", "p50_ms"}),
-        (SATURATED[1], {"saturated_mbps"}),
-    ],
-    ids=lambda value: value.name if isinstance(value, Case) else "",
-)
-def test_the_air_stays_within_its_bounds_of_ns3(case: Case, measured: set[str]) -> None:
-    ns3, ours = (means([run(case, seed) for seed in (1, 2)]) for run in (through_ns3, through_air))
-    assert measured <= ns3.keys()
-    assert measured & set(beyond(case, ns3, ours)) == set(), (ns3, ours)
+@pytest.mark.parametrize("case", [*LOADS[1:4], LOADS[6], *LOADS[13:15], *SATURATED[1:3]], ids=lambda case: case.name)
+def test_the_air_stays_within_its_bounds_of_ns3(case: Case) -> None:
+    ns3, ours = (means([run(case, seed) for seed in (1, 2, 3)]) for run in (through_ns3, through_air))
+    assert beyond(case, ns3, ours) == [], (ns3, ours)
 
 
 @needs_ns3
@@ -172,7 +163,7 @@ def test_what_lies_beyond_its_bound() -> None:
     assert beyond(Case("a", load=1.5), ns3, far) == ["delivered", "p50_ms", "p99_ms"]  # within a factor of 1.5
     flows = {"saturated_mbps": 100.0, "best_flow": 0.9}
     assert beyond(SATURATED[0], flows, {"saturated_mbps": 107.0, "best_flow": 0.5}) == ["saturated_mbps"]
-    assert beyond(SATURATED[-1], flows, {"saturated_mbps": 120.0, "best_flow": 0.6}) == ["best_flow"]
+    assert beyond(SATURATED[-2], flows, {"saturated_mbps": 120.0, "best_flow": 0.6}) == ["best_flow"]
 
 
 def test_every_case_is_named_once() -> None:
