@@ -63,7 +63,7 @@ def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> 
     weight = freshness(view.age_s[peer], view.period_s)
     goodput_mbps = me.goodput_to(peer)
     if me.battery_soc < LOW_BATTERY or goodput_mbps < MIN_GOODPUT_MBPS:
-        weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+        weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.2g} < {MIN_GOODPUT_MBPS:g} Mb/s"
         cause = "battery < 30 %" if me.battery_soc < LOW_BATTERY else weak
         return Directive(
             view.ego, peer, Representation.DETECTIONS, 0.0, roi, SLOW_RATE_HZ, SLOW_DEADLINE_S, weight,

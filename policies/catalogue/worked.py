@@ -63,7 +63,7 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
         if peer not in chosen:
             directives.append(nothing(ego, peer, NOT_CHOSEN))
         elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
-            weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.1f} < {MIN_GOODPUT_MBPS:g} Mb/s"
+            weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.2g} < {MIN_GOODPUT_MBPS:g} Mb/s"
             low = min(rung, DETECTIONS)
             directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
         else:

@@ -62,7 +62,7 @@ def test_a_sortie_s_outcome_has_the_fields_of_the_reference() -> None:
 def test_every_number_of_an_outcome_may_be_named() -> None:
     """Of a sortie with losses, drops, doubts and a second policy; what is no number, or wall clock, may not."""
     flown = example(
-        "radio.framing=tiles", "radio.tx_power_dbm=-8", "policy.changes=[{at_s: 4, name: silence}]",
+        "radio.framing=tiles", "radio.tx_power_dbm=-4", "radio.bandwidth_mhz=20", "policy.changes=[{at_s: 4, name: silence}]",
         "events=[{kind: drone_lost, at_s: 2, drone: 3}, {kind: spoof, at_s: 1, drone: 1, until_s: 3},"
         " {kind: lie, at_s: 1, drone: 1, about: battery}]",
     )  # fmt: skip
