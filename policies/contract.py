@@ -14,6 +14,7 @@ import functools
 import inspect
 import math
 import operator
+import re
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
@@ -533,13 +534,14 @@ def _compares(value: Any, low: float, high: float) -> bool:
     return True
 
 
+_HALF_PAIR = re.compile("[\ud800-\udfff]")
+
+
 def _reason_fault(reason: object) -> str | None:
     """Why a reason cannot stand in the record; None if it can."""
     if not isinstance(reason, str):
         return f"reason is {reason!r}, must be text"
-    try:
-        reason.encode()
-    except UnicodeEncodeError:  # half of a surrogate pair
+    if _HALF_PAIR.search(reason):
         return f"reason is {reason!r}, must be text that UTF-8 can write"
     return None
 

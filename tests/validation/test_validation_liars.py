@@ -104,7 +104,10 @@ def test_honest_fleets_doubt_nobody_at_any_rate_of_the_plane(rate_hz: float) -> 
 
 def test_honest_fleets_doubt_nobody_at_the_edge_of_range() -> None:
     """There a payload that is lost brings its sender's estimate to nothing, beside those that came before it."""
-    weak = ["radio.tx_power_dbm=-8", "fleet.formation.spacing_m=60", "perception.detector=none", "duration_s=20"]
+    weak = [
+        "radio.tx_power_dbm=-8", "radio.preamble_detection_dbm=-95", "fleet.formation.spacing_m=60", "perception.detector=none",
+        "duration_s=20",
+    ]  # fmt: skip
     lost = 0
     for seed in (1, 2):
         record = run_sortie(
@@ -128,6 +131,7 @@ def test_who_claims_more_than_a_full_channel_carries_is_found_out() -> None:
 def test_honest_fleets_doubt_nobody_where_slow_descriptors_are_lost() -> None:
     """One each ten seconds, of which links of 200 m lose some: a charge does not stand still because nobody tells it."""
     slow = ["context.rate_hz=1", "context.publish_every=10", "radio.tx_power_dbm=0", "fleet.formation.spacing_m=200"]
+    slow.append("radio.preamble_detection_dbm=-95")
     asked = ["perception.detector=none", "duration_s=60", "events=[]", "fleet.formation.shape=line", *slow]
     lost = 0
     for seed in range(1, 7):
@@ -158,5 +162,5 @@ def test_honest_traces_are_not_doubted(tmp_path: Path) -> None:
     record = run_sortie(load("track_target", asked))
     told = record.tables["descriptors"].filter(pc.equal(record.tables["descriptors"]["drone"], 1))
     assert set(np.round(told["soc"].to_numpy(), 4)) == {0.9, 0.89, 0.88}
-    assert max(map(max, told["goodput_mbps"].to_pylist())) > 900  # half more than the channel's fastest frames
+    assert max(map(max, told["goodput_mbps"].to_pylist())) > 700  # the channel's fastest frames have 600
     assert outcome(record)["distrusted_by"] == {}

@@ -132,7 +132,7 @@ def no_file_beyond(size_b: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("size_b", [100, 9_000, 13_000, 17_000])
+@pytest.mark.parametrize("size_b", [100, 9_000, 17_000, 21_000])
 def test_a_full_disk_is_one_line_and_costs_nothing(tmp_path: Path, size_b: int) -> None:
     p, folder = plan(tmp_path), tmp_path / "a"
     first, rest = Pretended(), Pretended()
@@ -143,7 +143,7 @@ def test_a_full_disk_is_one_line_and_costs_nothing(tmp_path: Path, size_b: int) 
         run_campaign(p, folder, first)
     kept = rows_on_disk(folder)
     assert kept == max(0, len(first.flown) - 1)  # the last one had no room
-    assert (kept > 0) == (size_b > 10_000)
+    assert (kept > 0) == (size_b > 15_000)  # the plan comes first, of some 13 kB
     run_campaign(p, folder, rest)
     assert rest.flown == list(range(kept, 48))
     assert table_bytes(folder) == flown(p, tmp_path / "b")
