@@ -20,6 +20,11 @@ policy: {name: worked, params: {rho: 0.25}, dwell_s: 0.3}
 """
 
 
+PATIENT = ("context.degraded_after_periods=100", "context.detached_after_periods=1000")
+"""Links stay fresh however many descriptors are lost: some collide, and a degraded link sends boxes instead of what was
+asked. For tests of what is asked."""
+
+
 def example(*overrides: str, text: str = BASE) -> Scenario:
     """The base scenario with `--set` overrides."""
     return loads(text, overrides=overrides)

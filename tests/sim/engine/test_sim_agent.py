@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from sim_examples import PATIENT
 
 import sortie.fleet.agent
 from sortie.fleet.agent import Agent
@@ -23,7 +24,7 @@ def test_what_goes_to_four_peers_is_made_once(monkeypatch: pytest.MonkeyPatch) -
         return made[-1]
 
     monkeypatch.setattr(sortie.fleet.agent, "make_payload", counted)
-    sent = run_sortie(load("track_target", SETS), "all-4").tables["transmissions"].num_rows
+    sent = run_sortie(load("track_target", [*SETS, *PATIENT]), "all-4").tables["transmissions"].num_rows
     assert sent > 200
     assert 3.8 * len(made) < sent <= 4 * len(made)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sim_examples import PATIENT
 
 import sortie
 from sortie.fleet.coverage import unpack_grid
@@ -61,7 +62,7 @@ def maps_to_all(view: FleetView) -> list[Directive]:
 
 
 def test_maps_of_another_network_take_the_air_and_are_refused() -> None:
-    record = run_sortie(fleet(OTHER), maps_to_all)
+    record = run_sortie(fleet(OTHER, *PATIENT), maps_to_all)
     delivered = {(i, j, why) for i, j, what, status, why in sent(record) if (what, status) == ("features", "delivered")}
     own = {(0, 1, ""), (1, 0, "")}
     foreign = {(i, j, "other_feature_space") for i, j in ((0, 2), (1, 2), (2, 0), (2, 1))}
@@ -69,7 +70,7 @@ def test_maps_of_another_network_take_the_air_and_are_refused() -> None:
     assert fused(record) == {(0, 1, "features"), (1, 0, "features")}
     fates = outcome(record)["payload_fates"]
     assert fates["delivered/other_feature_space"] == sum(why != "" for *_, s, why in sent(record) if s == "delivered")
-    together = run_sortie(fleet(), maps_to_all)
+    together = run_sortie(fleet("", *PATIENT), maps_to_all)
     assert (0, 2, "features") in fused(together), "one network: the same fleet fuses them"
 
 
@@ -100,7 +101,10 @@ def test_descriptors_say_it_and_views_compare_it() -> None:
 
 
 def test_a_fleet_of_old_and_new_drones_flies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One drone publishes the paper's bytes alone, another fields that nobody knows."""
+    """One drone publishes the paper's bytes alone, another fields that nobody knows.
+
+    With longer descriptors others collide, so neither the links' health nor the policy may go by which were heard.
+    """
     import sortie.fleet.agent as agent
 
     encode = agent.encode_descriptor
@@ -108,9 +112,9 @@ def test_a_fleet_of_old_and_new_drones_flies(monkeypatch: pytest.MonkeyPatch) ->
     def versions(d: Descriptor) -> bytes:
         return encode(d) + (b"" if d.agent_id else b"\x09\xf0\x02\x00hi")
 
-    plain = run_sortie(fleet())
+    plain = run_sortie(fleet("", *PATIENT), maps_to_all)
     monkeypatch.setattr(agent, "encode_descriptor", versions)
-    mixed = run_sortie(fleet())
+    mixed = run_sortie(fleet("", *PATIENT), maps_to_all)
     assert mixed.tables["drops"].num_rows == 0
     assert mixed.tables["directives"].num_rows == plain.tables["directives"].num_rows > 0
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from cli_examples import command, refusal
+from sim_examples import PATIENT
 
 import sortie
 from sortie.policies.catalogue.worked import worked
@@ -25,7 +26,9 @@ def fly(**fields: object) -> sortie.Run:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> sortie.Run:
-    flown = sortie.fly("track_target", {**SHORT, **DROP})
+    """In the drop drone 1 hears hardly a descriptor: patient links go on sending, so that its policy decides throughout."""
+    patient = dict(field.split("=") for field in PATIENT)
+    flown = sortie.fly("track_target", {**SHORT, **DROP, **{field: float(n) for field, n in patient.items()}})
     return sortie.open_run(flown.save(tmp_path_factory.mktemp("replay") / "run", recording=False))
 
 
