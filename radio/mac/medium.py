@@ -169,6 +169,7 @@ class Medium(Generic[J, F]):
         self._extra = np.zeros(1)
         self._shared: tuple[Any, ...] = ()
         self._tables: dict[int, IntArray] = {}
+        self._share()
 
     @staticmethod
     def _ns(t_s: float) -> int:
