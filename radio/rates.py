@@ -235,9 +235,3 @@ def choose_mcs(
 def group_curve(rate_mbps: float) -> PerCurve:
     """PER of group-addressed frames at a basic rate, or at the next 802.11a rate above it that has a curve."""
     return next((c for rate, c in LEGACY_CURVES.items() if rate >= rate_mbps - 1e-9), LEGACY_CURVES[54.0])
-
-
-@lru_cache(maxsize=64)
-def mean_group_per(rate_mbps: float, k_db: float, frame_bytes: int) -> tuple[float, ...]:
-    """Mean PER of group-addressed frames at each mean SNR of `RateTable`'s grid."""
-    return tuple(_mean_per([group_curve(rate_mbps)], k_db, frame_bytes)[0].tolist())

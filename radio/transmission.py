@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from math import exp, log1p
 from typing import NamedTuple
-
-import numpy as np
-from scipy.special import bdtr
 
 
 class Status(StrEnum):
@@ -65,28 +61,3 @@ class Transmission(NamedTuple):
     hops: int = 1
     arrived_bytes: int = 0
     missing: tuple[int, ...] = ()
-
-
-def losses(u: float, count: int, q: float) -> int:
-    """Binomial(count, q) from one uniform number by inversion: the smallest k with P(X ≤ k) > u.
-
-    Walks up from the likely end, because q is tiny or the sample is lost anyhow.
-    """
-    if q <= 0.0 or u < 1.0 - count * q:  # (1 − q)^count ≥ 1 − count · q
-        return 0
-    if q >= 1.0:
-        return count
-    none = exp(count * log1p(-q))
-    if u < none:
-        return 0
-    if none < 1e-200:  # far from both ends; rare
-        return min(count, int(np.searchsorted(bdtr(np.arange(count), count, q), u, side="right")))
-    k, term, total = 0, none, none
-    odds = q / (1.0 - q)
-    while total <= u and k < count:
-        k += 1
-        term *= (count - k + 1) / k * odds
-        total += term
-        if term < 1e-18 and k > count * q:
-            break
-    return k

@@ -50,18 +50,18 @@ def walk(bad: BoolArray, draws: FloatArray, good_to_bad: float, bad_to_good: flo
 class PairNumbers:
     """Uniform numbers for pairs of drones, row after row; the stream of drone h draws for the drones of lower id.
 
-    So one more drone changes nobody's numbers. `ordered` gives each direction a number of its own.
+    So one more drone changes nobody's numbers.
     """
 
-    def __init__(self, seed: int, replication: int, n: int, purpose: str, *, ordered: bool) -> None:
-        self._n, self._ordered = n, ordered
+    def __init__(self, seed: int, replication: int, n: int, purpose: str) -> None:
+        self._n = n
         self._streams = [stream(seed, replication, h, purpose) for h in range(n)]
         self._block = max(1, min(1024, _BLOCK_NUMBERS // (n * n)))
         self._numbers: FloatArray = np.zeros((0, n, n))
         self._next = 0
 
     def row(self) -> FloatArray:
-        """[N, N], sender by receiver; 0 on the diagonal."""
+        """[N, N], symmetric; 0 on the diagonal."""
         if self._next == len(self._numbers):
             self._refill()
         self._next += 1
@@ -71,9 +71,8 @@ class PairNumbers:
         self._next = 0
         self._numbers = numbers = np.zeros((self._block, self._n, self._n))
         for h in range(1, self._n):
-            drawn = self._streams[h].random((self._block, 1 + self._ordered, h))
-            numbers[:, h, :h] = drawn[:, 0]
-            numbers[:, :h, h] = drawn[:, -1]
+            numbers[:, h, :h] = drawn = self._streams[h].random((self._block, h))
+            numbers[:, :h, h] = drawn
 
 
 class PairStates:
@@ -89,7 +88,7 @@ class PairStates:
     def __init__(self, settings: BurstSettings, n: int, seed: int, replication: int, frame_s: float) -> None:
         self.settings = settings
         self._frame_s = frame_s
-        self._numbers = PairNumbers(seed, replication, n, "bursts", ordered=False)
+        self._numbers = PairNumbers(seed, replication, n, "bursts")
         self._frame = self._step = -1
         self.bad: BoolArray = np.zeros((n, n), bool)
         """[N, N], symmetric."""

@@ -1,7 +1,7 @@
-"""The random numbers of links, by stream for small fleets and by counter for large ones.
+"""The random numbers of shadowing, by stream for small fleets and by counter for large ones; the table of fades.
 
-**By stream**: one stream a drone and purpose; the stream of drone h draws for its links to the drones of *lower* id,
-so that each link has numbers of its own and one more drone changes none of the others', with N streams and not N².
+**By stream**: one stream a drone; the stream of drone h draws for its links to the drones of *lower* id, so that each pair
+has numbers of its own and one more drone changes none of the others', with N streams and not N².
 
 **By counter**: a number for a link and a frame, without those of any other link or frame before it.
 A stream of numbers has to be drawn in order, also for links that nobody needs; where a fleet is large, most links
@@ -12,7 +12,6 @@ a frame is SplitMix64's finaliser of key and frame (Steele, Lea & Flood, OOPSLA 
 from __future__ import annotations
 
 from functools import lru_cache
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,53 +28,32 @@ FloatArray = NDArray[np.float64]
 _LEVELS = 1 << 16
 
 
-def rician_gain(x: FloatArray, y: FloatArray, k_db: float) -> FloatArray:
-    """Power gain of mean 1 from two standard normals: a fixed path of K/(K + 1) and a scattered one of 1/(K + 1)."""
-    k = 10.0 ** (k_db / 10.0)
-    scatter = sqrt(0.5 / (k + 1.0))
-    return np.asarray((sqrt(k / (k + 1.0)) + scatter * x) ** 2 + (scatter * y) ** 2)
-
-
-class StreamDraws:
-    """Shadowing, fades and uniform draws for every link of n drones, block after block."""
+class StreamShadowing:
+    """Shadowing of every pair of n drones, block after block."""
 
     def __init__(self, settings: AirSettings, seed: int, replication: int, n: int, frame_s: float) -> None:
-        self._settings, self._n = settings, n
+        self._sigma_db, self._n = settings.shadowing_sigma_db, n
         self._keep = keep(frame_s, settings.shadowing_time_s)
-        self._shadow = [stream(seed, replication, h, "shadowing") for h in range(n)]
-        self._fade = [stream(seed, replication, h, "fading") for h in range(n)]
-        self._loss_streams = [stream(seed, replication, h, "group loss") for h in range(n)]
+        self._streams = [stream(seed, replication, h, "shadowing") for h in range(n)]
         self._last_db: FloatArray | None = None
 
-    def block(self, frames: int, flown: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the next frames: shadowing in dB, fades in dB, and draws (uniform; NaN on the diagonal).
+    def block(self, frames: int, flown: int) -> FloatArray:
+        """Of the next frames, dB.
 
         Args:
             frames: how many to draw, the same in every block.
             flown: how many of them are wanted.
 
         Returns:
-            [flown, n, n] each, sender by receiver.
+            [flown, n, n], symmetric.
         """
-        b, n = frames, self._n
-        shadow_z, x, y, draws = (np.zeros((b, n, n)) for _ in range(4))
-        for h in range(1, n):
-            z = self._shadow[h].standard_normal((b, h))
-            shadow_z[:, h, :h] = z
-            shadow_z[:, :h, h] = z
-            self._scatter(x, h, f := self._fade[h].standard_normal((b, 2, 2, h)), 0)
-            self._scatter(y, h, f, 1)
-            self._scatter(draws, h, self._loss_streams[h].random((b, 1, 2, h)), 0)
-        draws[:, range(n), range(n)] = np.nan
-        shadow_db = gauss_markov(shadow_z, self._settings.shadowing_sigma_db, self._keep, self._last_db)
+        normals = np.zeros((frames, self._n, self._n))
+        for h in range(1, self._n):
+            normals[:, h, :h] = drawn = self._streams[h].standard_normal((frames, h))
+            normals[:, :h, h] = drawn
+        shadow_db = gauss_markov(normals, self._sigma_db, self._keep, self._last_db)
         self._last_db = shadow_db[-1]
-        gain = rician_gain(x[:flown], y[:flown], self._settings.rician_k_db)
-        return shadow_db[:flown], 10.0 * np.log10(np.maximum(gain, 1e-12)), draws[:flown]
-
-    @staticmethod
-    def _scatter(into: FloatArray, h: int, drawn: FloatArray, part: int) -> None:
-        into[:, h, :h] = drawn[:, part, 0]  # h sends
-        into[:, :h, h] = drawn[:, part, 1]  # h receives
+        return shadow_db[:flown]
 
 
 def mix(z: Keys) -> Keys:
@@ -106,14 +84,9 @@ def numbers(keys: Keys, first_frame: int, frames: int) -> Keys:
     return mix(keys[None, :] + counters[:, None])
 
 
-def uniforms(bits: Keys) -> NDArray[np.float32]:
-    """Numbers in [0, 1), in steps of 2⁻²⁴, from 24 of the lower 32 bits."""
-    return np.asarray((bits.astype(np.uint32) >> np.uint32(8)) * np.float32(2.0**-24))
-
-
-def levels(bits: Keys, which: int) -> NDArray[np.uint64]:
-    """0 … 65,535, indices into the tables below: from bits 32 to 47 (0) or 48 to 63 (1)."""
-    return np.asarray((bits >> np.uint64(32 + 16 * which)) & np.uint64(_LEVELS - 1))
+def levels(bits: Keys) -> NDArray[np.uint64]:
+    """0 … 65,535, indices into the tables below: the upper 16 bits."""
+    return np.asarray(bits >> np.uint64(48))
 
 
 @lru_cache(maxsize=1)

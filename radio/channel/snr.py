@@ -1,27 +1,26 @@
-"""Positions to signal-to-noise ratios: path loss, antennas, shadowing, fading, noise and jammers.
+"""Positions to mean signal-to-noise ratios: path loss, antennas, shadowing, noise and jammers.
 
-Small fleets work out every link, with the random numbers of `sortie.radio.channel.draws.StreamDraws`; large ones the links within
-earshot (`sortie.radio.channel.large_fleet`).
+Small fleets work out every link, with the random numbers of `sortie.radio.channel.draws.StreamShadowing`; large ones the
+links within earshot (`sortie.radio.channel.large_fleet`). What fades is each frame on the air (`sortie.radio.mac.edca`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log10
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sortie.radio.channel.antenna import Antennas
-from sortie.radio.channel.draws import StreamDraws, fade_table_db
-from sortie.radio.channel.earshot import IntArray, LinkList, all_links
+from sortie.radio.channel.draws import StreamShadowing, fade_table_db
+from sortie.radio.channel.earshot import LinkList, all_links
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
-from sortie.radio.rates import CURVES, REFERENCE_BYTES, PerCurve, group_curve
+from sortie.radio.rates import CURVES, group_curve
 from sortie.radio.settings import AirSettings
-from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
 AnyFloats = NDArray[np.floating[Any]]
@@ -33,8 +32,6 @@ SQUARE = 32
 """Fleets of up to so many drones work out every link; larger ones those within earshot."""
 OUT_OF_RANGE_DB = -100.0
 """SNR that is reported for a link out of earshot."""
-_SURE_PER = 1e-12
-"""In large fleets a link on which fewer group frames than this are lost loses none."""
 _EARSHOT_SIGMA = 5.0
 _BLOCK_NUMBERS = 1 << 18
 
@@ -55,14 +52,6 @@ def earshot_m(settings: AirSettings) -> float:
     needed_db = min(CURVES[0].snr_db(0.5), group_db)
     noise = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
     return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
-
-
-def _reach_at_1(draws: AnyFloats, curve: PerCurve) -> AnyFloats:
-    """How long a frame may be, bytes, to arrive with these draws where −log s (see `Channel._reach`) is the weight."""
-    scale = -REFERENCE_BYTES / curve.weight
-    if draws.dtype == np.float32:  # in steps of 2⁻²⁴, whose difference from 1 is exact
-        return np.asarray(scale * np.log(1.0 - draws))
-    return np.asarray(scale * np.log1p(-draws))
 
 
 class FrameLinks:
@@ -94,9 +83,8 @@ class Channel:
     """The SNR of every link, frame by frame.
 
     `now` is the mean (over small-scale fading) SNR of the links in this frame, in the whole channel; `before` that of
-    the frame before (the first frame's own, in the first). `reach_bytes` is the longest group-addressed frame that
-    each link carries in this frame, its fade and its random draw. `snr_db`, `fade_db`, `shadow_db` and
-    `group_reach_bytes` show the same as squares [N, N], sender by receiver, NaN on the diagonal.
+    the frame before (the first frame's own, in the first). `snr_db` and `shadow_db` are squares [N, N], sender by receiver,
+    NaN on the diagonal.
 
     What follows from the flight alone is worked out for a block of frames in one pass; a frame in which nothing
     else interferes is only looked up.
@@ -138,9 +126,6 @@ class Channel:
         self._antennas = Antennas(settings.antennas(n_drones))
         self.frame = -1
         self.noise_dbm = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
-        # group frames go out in the primary 20 MHz with the whole power, so over less noise
-        self._group_gain_db = 10.0 * log10(settings.bandwidth_mhz / 20.0)
-        self._curve = group_curve(settings.group_rate_mbps)
         self._frame_s = frame_s
         self._field: ShadowField | None = None
         if settings.shadowing_distance_m is not None:
@@ -148,11 +133,11 @@ class Channel:
                 settings.shadowing_sigma_db, settings.shadowing_distance_m, settings.shadowing_time_s, seed, replication
             )
         early = min(n_drones, SQUARE)
-        self._draws = StreamDraws(settings, seed, replication, early, frame_s)
+        self._drawn = StreamShadowing(settings, seed, replication, early, frame_s)
         self._crowd: Crowd | None = None
         if n_drones > SQUARE:
             self._crowd = Crowd(
-                settings, n_drones, self._draws, self._field,
+                settings, n_drones, self._drawn, self._field,
                 n_early=early, earshot_m=earshot_m(settings), seed=seed, replication=replication, frame_s=frame_s,
             )  # fmt: skip
         self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
@@ -161,17 +146,7 @@ class Channel:
         # the block, [frames, L] each
         self._snr_db: AnyFloats
         self._shadow_db: AnyFloats
-        self._fades_db: AnyFloats
-        self._losses: AnyFloats
-        self._reach_bytes: AnyFloats
         self._snr_rows: list[list[list[float]]] = []  # of a small fleet: the block as lists, which one looks up faster
-        self._reach_rows: list[list[list[float]]] = []
-        self._reach_now: list[list[float]] = []
-        # who hears whom in this frame, if every frame is of this length
-        self._heard_bytes = -1
-        self._all_ids: IntArray
-        self._heard_ids: Sequence[int] = []
-        self._heard_from: list[int] = []
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
@@ -187,15 +162,11 @@ class Channel:
         if self.frame + 1 >= len(self._positions_m):
             raise IndexError(f"the flight has {len(self._positions_m)} frames")
         self.frame += 1
-        self._heard_bytes = -1
         row = self.frame % self._block
         if row == 0:
             self._refill()
         links, snr = self.links, self._snr_db[row]
-        self.reach_bytes = self._reach_bytes[row]
-        rows_db = None
-        if self._crowd is None:
-            rows_db, self._reach_now = self._snr_rows[row], self._reach_rows[row]
+        rows_db = self._snr_rows[row] if self._crowd is None else None
         if extra_loss_db is not None or jammers:
             snr = snr.copy()
             if extra_loss_db is not None:
@@ -205,16 +176,12 @@ class Channel:
                 snr -= extra[links.sender, links.receiver]
             if jammers:
                 snr -= self.noise_rise_db(jammers)[links.receiver]
-            fades_db, draws = self._chance(row)
-            self.reach_bytes = self._reach(snr + fades_db, draws)
             rows_db = None
-            if self._crowd is None:
-                self._reach_now = self.reach_bytes.reshape(self.n, self.n).tolist()
         self.before = self.now if self.frame else FrameLinks(links, snr, rows_db)
         self.now = FrameLinks(links, snr, rows_db)
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
-        """From the next frame on the fleet flies another way; what was drawn of shadowing, fades and losses stays.
+        """From the next frame on the fleet flies another way; what was drawn of shadowing stays.
 
         In fleets of more than `SQUARE` drones links follow it from the next block of `EPOCH` frames on.
 
@@ -239,59 +206,9 @@ class Channel:
         return self.now.square_db
 
     @property
-    def fade_db(self) -> FloatArray:
-        """[N, N] of this frame."""
-        return self.links.square(self._chance(self.frame % self._block)[0], np.nan)
-
-    @property
     def shadow_db(self) -> FloatArray:
         """[N, N] of this frame."""
         return self.links.square(self._shadow_db[self.frame % self._block], np.nan)
-
-    @property
-    def group_reach_bytes(self) -> FloatArray:
-        """[N, N] of this frame."""
-        return self.links.square(self.reach_bytes, 0.0)
-
-    def heard(self, sender: int, length_bytes: int, times: int = 0) -> Sequence[int]:
-        """Who receives a group-addressed frame, ascending; an array of integers in large fleets, else a list.
-
-        Args:
-            sender: whose frame.
-            length_bytes: its length.
-            times: how many frames it has sent before in this frame of time: same fade, new draws. The draws are the
-                first frame's shifted by multiples of the golden ratio, modulo 1.
-        """
-        links = self.links
-        if times:
-            mine = links.by_sender[links.begin[sender] : links.begin[sender + 1]]
-            fades_db, draws = self._chance(self.frame % self._block, mine)
-            draws = (draws + times * 0.6180339887498949) % 1.0
-            reach = self._reach(self.now.snr_db[mine] + fades_db, draws)
-            again = links.receiver[mine[reach >= length_bytes]]
-            return cast(Sequence[int], again if self._crowd else again.tolist())
-        if self._crowd is None:
-            return [i for i, reach in enumerate(self._reach_now[sender]) if reach >= length_bytes]
-        if self._heard_bytes != length_bytes:  # most frames of a moment have one length: look at all links together
-            self._heard_bytes = length_bytes
-            if self.reach_bytes.min(initial=np.inf) >= length_bytes:
-                self._heard_ids, self._heard_from = cast(Sequence[int], self._all_ids), links.begin
-            else:
-                through = (self.reach_bytes >= length_bytes)[links.by_sender]
-                self._heard_ids = cast(Sequence[int], links.receiver[links.by_sender[through]])
-                self._heard_from = np.concatenate([[0], np.cumsum(through)])[links.begin].tolist()
-        return self._heard_ids[self._heard_from[sender] : self._heard_from[sender + 1]]
-
-    def _reach(self, faded_db: AnyFloats, draws: AnyFloats) -> AnyFloats:
-        # a frame of L bytes arrives with probability s^(w L / 1458), w being the curve's weight: so while u is below that
-        x = faded_db + (self._group_gain_db - self._curve.centre_db)
-        x *= -self._curve.slope_per_db
-        is_single = x.dtype == np.float32
-        np.minimum(x, 80.0 if is_single else 700.0, out=x)  # keeps the exponential finite
-        minus_log_s: AnyFloats = np.log1p(np.exp(x, out=x), out=x)
-        np.maximum(minus_log_s, 1e-30 if is_single else 1e-300, out=minus_log_s)
-        minus_log_s = np.divide(_reach_at_1(draws, self._curve), minus_log_s, out=minus_log_s)
-        return minus_log_s
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
@@ -317,16 +234,9 @@ class Channel:
         if self._crowd is not None:
             self.links, gain_db, self._shadow_db = self._crowd.block(self.frame, p, up)
             self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
-            sure_db = self._curve.snr_db(_SURE_PER) - self._group_gain_db
-            safe_db = sure_db - float(fade_table_db(c.rician_k_db)[0])
-            risky = np.flatnonzero(self._snr_db.min(axis=0) < safe_db)
-            fades_db, draws = self._crowd.chance(0, len(p), risky)
-            self._all_ids = self.links.receiver[self.links.by_sender]
-            self._reach_bytes = np.full_like(self._snr_db, np.inf)
-            self._reach_bytes[:, risky] = self._reach(self._snr_db[:, risky] + fades_db, draws)
             return
-        drawn = self._draws.block(self._block, len(p))
-        self._shadow_db, self._fades_db, self._losses = (x.reshape(len(p), -1) for x in drawn)
+        if self._field is None:
+            self._shadow_db = self._drawn.block(self._block, len(p)).reshape(len(p), -1)
         self._work_out(self.frame)
 
     def _work_out(self, first: int) -> None:
@@ -338,20 +248,7 @@ class Channel:
             at = [self._field.between(q, (first + t) * self._frame_s) for t, q in enumerate(p)]
             self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
-        self._reach_bytes = self._reach(self._snr_db + self._fades_db, self._losses)
-        square = (len(p), self.n, self.n)
-        self._snr_rows = self._snr_db.reshape(square).tolist()
-        self._reach_rows = self._reach_bytes.reshape(square).tolist()
-
-    def _chance(self, row: int, links: IntArray | None = None) -> tuple[AnyFloats, AnyFloats]:
-        """Fades in dB and uniform draws of some links, or all, in a frame of the block."""
-        if self._crowd is not None:
-            which = np.arange(len(self.links.sender)) if links is None else links
-            fades_db, draws = self._crowd.chance(row, 1, which)
-            return fades_db[0], draws[0]
-        if links is None:
-            return self._fades_db[row], self._losses[row]
-        return self._fades_db[row, links], self._losses[row, links]
+        self._snr_rows = self._snr_db.reshape(len(p), self.n, self.n).tolist()
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""
@@ -366,30 +263,3 @@ class Channel:
                 cosine = along[..., 2] if up is None else np.einsum("tlk,tlk->tl", along, up[:, end])
                 loss_db = loss_db + self._antennas.loss_db(end, cosine)
         return loss_db
-
-
-class SampleDraws:
-    """Uniform draws for unicast samples, keyed per ordered link and taken by the link's own sample number.
-
-    Each sample gets `ROUNDS` numbers whether it needs them or not, so that what one sample needed (its repair
-    rounds) never moves the next one's.
-    """
-
-    ROUNDS = 4
-    _BLOCK = 64
-
-    def __init__(self, seed: int, replication: int) -> None:
-        self._key = (seed, replication)
-        self._streams: dict[tuple[int, int], np.random.Generator] = {}
-        self._ready: dict[tuple[int, int], list[list[float]]] = {}
-
-    def next(self, sender: int, receiver: int) -> list[float]:
-        """The numbers of the link's next sample."""
-        link = (sender, receiver)
-        ready = self._ready.get(link)
-        if ready is None:
-            ready = self._ready[link] = []
-            self._streams[link] = stream(*self._key, link, "fragment loss")
-        if not ready:
-            ready.extend(self._streams[link].random((self._BLOCK, self.ROUNDS)).tolist()[::-1])
-        return ready.pop()

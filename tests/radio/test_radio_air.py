@@ -9,16 +9,14 @@ from math import isnan
 import numpy as np
 import pytest
 import simpy
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from radio_examples import CROSS_M, still
-from scipy import stats
 
 from sortie.radio import Air, Status, Transmission
 from sortie.radio.goodput import Goodput
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
-from sortie.radio.transmission import losses
 from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
 
 DEFAULT = AirSettings()
@@ -115,27 +113,6 @@ def test_the_row_of_one_sample() -> None:
     assert row.airtime_s == pytest.approx(ppdu_s + 16e-6 + 32e-6)  # with its block ack
     assert ppdu_s <= row.t_done_s <= ppdu_s + 9e-6  # at once on an idle medium, at the next slot
     assert row.deadline_s == 0.1
-
-
-@pytest.mark.parametrize("q", [1e-3, 1e-2])
-@pytest.mark.parametrize("payload", [655_360, 163_840, 13_120, 1000])
-def test_best_effort_delivers_the_power_of_its_fragments(q: float, payload: int) -> None:
-    k = -(-payload // 1344)
-    u = np.random.default_rng(5).random(20_000)
-    delivered = np.mean([losses(x, k, q) == 0 for x in u])
-    expected = (1 - q) ** k
-    assert delivered == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9)
-
-
-@example(0.0, 1075, 0.5)
-@example(2.3e-308, 805, 0.625)
-@given(st.floats(0, 1, exclude_max=True), st.integers(1, 2000), st.floats(0, 1))
-def test_losses_invert_the_binomial(u: float, count: int, q: float) -> None:
-    k = losses(u, count, q)
-    assert 0 <= k <= count
-    if 1e-12 < q < 1 - 1e-12:
-        assert stats.binom.cdf(k, count, q) >= u - 1e-9
-        assert k == 0 or stats.binom.cdf(k - 1, count, q) <= u + 1e-9
 
 
 def test_a_lossy_link_loses_best_effort_samples_and_repairs_reliable_ones() -> None:
@@ -420,6 +397,17 @@ def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
     assert fates(5) == fates(5)
     assert fates(5) == fates(6)
     assert fates(5) != fates(5, seed=2)
+
+
+def test_the_first_frame_may_begin_after_the_air_is_there() -> None:
+    f = Flight(STILL)
+    f.env.run(until=0.25)
+    f.air.advance()
+    f.send(0, 1, 2000)
+    f.publish(0)
+    f.env.run(until=0.5)
+    assert [r.status for r in f.rows] == [Status.DELIVERED]
+    assert [ids for _, _, ids in f.heard] == [(1, 2, 3, 4)]
 
 
 def test_arguments_out_of_bounds_are_refused() -> None:

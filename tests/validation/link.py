@@ -73,21 +73,39 @@ def two_rays() -> Rows:
     return rows
 
 
+def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_frame: int = 1) -> np.ndarray:
+    """[frames, n, n]: the fades of group frames that stations send one after another, sender by receiver; NaN to itself.
+
+    Args: `per_frame`: how many a station sends within one frame of the flight.
+    """
+    env = simpy.Environment()
+    gain = 1e6
+    found: list[list[np.ndarray]] = [[] for _ in range(n)]
+
+    def end(frame: GroupFrame, receivers: np.ndarray, fates: np.ndarray) -> None:
+        power = medium._settled.arrays[2].reshape(n, n)[frame.sender]  # as the kernel has it of the last frame
+        found[frame.sender].append(10.0 * np.log10(np.where(np.arange(n) == frame.sender, np.nan, power / gain)))
+
+    medium = Medium[AirJob, GroupFrame](env, settings, n, seed, 0, -88.0, lambda *_: None, lambda *_: None, end)
+    begin, receiver = np.arange(n + 1) * n, np.tile(np.arange(n), n)
+    for k in range(frames):
+        medium.set_links(begin, receiver, np.full(n * n, gain), is_square=True, frame=k // per_frame)
+        for sender in range(n):
+            medium.announce(GroupFrame(sender, 1e-4, 334), 1e-3 * sender)
+        env.run(until=(k + 1) * 1e-3 * n)
+    return np.array(found).swapaxes(0, 1)
+
+
 def outage(frames: int) -> Rows:
     """Small-scale fading against the Rician outage 1 − Q1(√2K, √(2 (1 + K) g))."""
     rows = []
     for k_db in (6.0, 12.0):
         k = 10 ** (k_db / 10)
-        channel = Channel(AirSettings(rician_k_db=k_db), np.broadcast_to(CROSS_M, (frames, 5, 3)), 1, 0, 0.1)
-        gains = []
-        for _ in range(frames):
-            channel.advance()
-            gains.append(channel.fade_db[~np.eye(5, dtype=bool)])
-        fades_db = np.array(gains).ravel()
+        drawn_db = fades_db(AirSettings(rician_k_db=k_db), 5, frames)[:, ~np.eye(5, dtype=bool)].ravel()
         for depth_db in (-3.0, -6.0, -10.0):
             exact = float(stats.ncx2.cdf(2 * (1 + k) * 10 ** (depth_db / 10), 2, 2 * k))  # 1 − Marcum's Q1
-            seen = float((fades_db < depth_db).mean())
-            error = float(np.sqrt(exact * (1 - exact) / fades_db.size))
+            seen = float((drawn_db < depth_db).mean())
+            error = float(np.sqrt(exact * (1 - exact) / drawn_db.size))
             rows.append(
                 {
                     "K, dB": k_db,
@@ -516,14 +534,10 @@ def draw(path: Path) -> None:
     a.invert_yaxis()
     fades = np.geomspace(1e-3, 2, 200)
     for k_db, colour in ((6.0, "C0"), (12.0, "C1")):
-        channel = Channel(AirSettings(rician_k_db=k_db), np.broadcast_to(CROSS_M, (3000, 5, 3)), 1, 0, 0.1)
-        gains = []
-        for _ in range(3000):
-            channel.advance()
-            gains.append(channel.fade_db[~np.eye(5, dtype=bool)])
+        drawn_db = fades_db(AirSettings(rician_k_db=k_db), 5, 3000)[:, ~np.eye(5, dtype=bool)]
         k = 10 ** (k_db / 10)
         b.loglog(fades, stats.ncx2.cdf(2 * (1 + k) * fades, 2, 2 * k), colour, label=f"Marcum Q, K = {k_db:g} dB")
-        seen = np.sort(10 ** (np.array(gains).ravel() / 10))
+        seen = np.sort(10 ** (drawn_db.ravel() / 10))
         b.loglog(seen[::97], (np.arange(len(seen)) + 1)[::97] / len(seen), colour + ".", ms=3)
     b.set(xlabel="power gain", ylabel="probability below", ylim=(1e-5, 1))
     snr = np.linspace(-5, 35, 400)

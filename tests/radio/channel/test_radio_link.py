@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import link
 import numpy as np
 import pytest
 from radio_examples import CROSS_M, still
@@ -16,11 +17,9 @@ from sortie.radio.rates import (
     STANDARDS,
     choose_mcs,
     group_curve,
-    mean_group_per,
     per,
     rate_table,
     rescale,
-    snr_index,
 )
 from sortie.radio.settings import AirSettings
 
@@ -96,12 +95,8 @@ def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> N
 
 
 def test_fading_is_rician_in_mean_and_outage() -> None:
-    channel = Channel(AirSettings(rician_k_db=8.0), still(CROSS_M), 3, 0, 0.1)
-    gains = []
-    for _ in range(4000):
-        channel.advance()
-        gains.append(10 ** (channel.fade_db[~np.eye(6, dtype=bool)] / 10))
-    envelope = np.sqrt(np.array(gains).ravel())  # 120,000 values
+    gains = 10 ** (link.fades_db(AirSettings(rician_k_db=8.0), 6, 4000)[:, ~np.eye(6, dtype=bool)] / 10)
+    envelope = np.sqrt(gains.ravel())  # 120,000 values
     k = 10**0.8
     rice = stats.rice(b=np.sqrt(2 * k), scale=np.sqrt(1 / (2 * (k + 1))))
     assert envelope.mean() == pytest.approx(rice.mean(), rel=2e-3)
@@ -109,6 +104,19 @@ def test_fading_is_rician_in_mean_and_outage() -> None:
     for depth_db in (-3.0, -6.0, -9.0):
         outage = rice.cdf(10 ** (depth_db / 20))
         assert (envelope < 10 ** (depth_db / 20)).mean() == pytest.approx(outage, abs=4 * np.sqrt(outage / 120_000))
+    bound = 4 / np.sqrt(gains.size)
+    assert abs(np.corrcoef(gains[:-1].ravel(), gains[1:].ravel())[0, 1]) < bound  # from one frame to the next
+    assert abs(np.corrcoef(gains[:, :-1].ravel(), gains[:, 1:].ravel())[0, 1]) < bound  # from one link to another
+
+
+def test_a_fade_is_of_a_direction_and_of_an_exchange_or_a_frame() -> None:
+    own, frame = (link.fades_db(AirSettings(fading=name), 3, 400, per_frame=2) for name in ("exchange", "frame"))
+    off = ~np.eye(3, dtype=bool)
+    for fades in (own, frame):
+        assert (fades != fades.transpose(0, 2, 1))[:, off].mean() > 0.99
+    assert (frame[0::2] == frame[1::2])[:, off].all()
+    assert (own[0::2] != own[1::2])[:, off].mean() > 0.99
+    assert (frame[1:-1:2] != frame[2::2])[:, off].mean() > 0.99
 
 
 def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None:
@@ -116,31 +124,12 @@ def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None
     for _ in range(1100):  # past the first block of draws
         a, b = step(five), step(six)
         np.testing.assert_array_equal(a, b[:5, :5])
-        np.testing.assert_array_equal(five.fade_db, six.fade_db[:5, :5])
-        np.testing.assert_array_equal(five.group_reach_bytes, six.group_reach_bytes[:5, :5])
     other = Channel(AirSettings(), still(CROSS_M[:5]), 9, 3, 0.1)
     assert not np.array_equal(step(other), a, equal_nan=True)
-
-
-def test_group_frames_arrive_as_often_as_their_per_says() -> None:
-    config = AirSettings(shadowing_sigma_db=0.0, rician_k_db=40.0)
-    channel = Channel(config, still(CROSS_M[:2]), 1, 0, 0.1)
-    curve = group_curve(6.0)
-    left_db = curve.snr_db(0.5, 700)
-    loss_db = 20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - channel.noise_dbm + 10 * np.log10(4) - left_db
-    extra = np.full((2, 2), loss_db)  # leaves so much in the primary 20 MHz that half the frames of 700 B are lost
-    fade_db = stats.norm(0, 10 / np.log(10) * np.sqrt(2 / 1e4))  # what K = 40 dB leaves of it
-    for length in (304, 1458):
-        heard, again = [], []
-        for _ in range(6000):
-            channel.advance(extra)
-            heard.append(channel.group_reach_bytes[0, 1] >= length)
-            again.append(channel.heard(0, length, 1) == [1])
-        expected = integrate.quad(
-            lambda g, n=length, fade_db=fade_db: (1 - curve.per(left_db + g, n)) * fade_db.pdf(g), -0.5, 0.5
-        )[0]
-        assert np.mean(heard) == pytest.approx(expected, abs=0.025)
-        assert np.mean(again) == pytest.approx(expected, abs=0.025)
+    fades = link.fades_db(AirSettings(), 5, 50, seed=9)
+    off = ~np.eye(5, dtype=bool)
+    np.testing.assert_array_equal(fades[:, off], link.fades_db(AirSettings(), 6, 50, seed=9)[:, :5, :5][:, off])
+    assert (fades != link.fades_db(AirSettings(), 5, 50, seed=10))[:, off].mean() > 0.99
 
 
 def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:
@@ -149,10 +138,8 @@ def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:
         expected = step(clear)
         if frame % 3 == 1:
             assert np.nanmax(step(disturbed, np.full((6, 6), 10.0)) - expected) == pytest.approx(-10.0)
-            assert not np.array_equal(disturbed.group_reach_bytes, clear.group_reach_bytes, equal_nan=True)
         else:
             np.testing.assert_array_equal(step(disturbed), expected)
-            np.testing.assert_array_equal(disturbed.group_reach_bytes, clear.group_reach_bytes)
 
 
 def test_a_flight_of_many_blocks_is_one_flight() -> None:
@@ -179,7 +166,6 @@ def test_a_flight_that_goes_another_way_is_as_if_it_had_been_planned(distance_m:
         changed.advance()
         known.advance()
         assert np.array_equal(changed.snr_db, known.snr_db, equal_nan=True)
-        assert np.array_equal(changed.group_reach_bytes, known.group_reach_bytes, equal_nan=True)
         assert changed.now.rows_db[2][1] == known.now.rows_db[2][1]
     with pytest.raises(ValueError, match=r"positions_m has shape \(1300, 4, 3\), must be \(1300, 6, 3\) and finite"):
         changed.reroute(other[:, :4])
@@ -254,9 +240,3 @@ def test_basic_rates_have_curves_of_their_own() -> None:
     halves_db = [curve.snr_db(0.5, 334) for curve in LEGACY_CURVES.values()]
     assert halves_db == sorted(halves_db)
     assert all(legacy > he.snr_db(0.5, 334) for legacy, he in zip(halves_db, CURVES, strict=False))  # no LDPC
-
-
-def test_mean_per_of_group_frames_without_fading_is_their_curve() -> None:
-    mean = mean_group_per(24.0, 40.0, 334)
-    for snr_db in (4.0, 8.0, 9.0, 10.0, 14.0):
-        assert mean[snr_index(snr_db)] == pytest.approx(group_curve(24.0).per(snr_db, 334), abs=0.02)

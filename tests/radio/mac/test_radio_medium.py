@@ -9,12 +9,14 @@ import pytest
 import simpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import integrate, stats
 
 from sortie.radio.mac import edca
 from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frame_bytes, frames_exchanges, ppdu_s
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, saturation_mbps
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 from sortie.radio.mac.medium import Link, Medium
+from sortie.radio.rates import group_curve
 from sortie.radio.settings import AccessSettings, AirSettings, EdcaSettings
 
 NOISE_DBM = -88.0
@@ -69,8 +71,8 @@ class Bench:
         self.medium.submit(job)
         return job
 
-    def announce(self, sender: int, in_s: float = 0.0) -> None:
-        self.medium.announce(GroupFrame(sender, GROUP_S, 334), in_s)
+    def announce(self, sender: int, in_s: float = 0.0, length: int = 334) -> None:
+        self.medium.announce(GroupFrame(sender, GROUP_S, length), in_s)
 
     def saturate(self, senders: int, frames: int, until: float) -> float:
         """Mb/s of fragments at their receivers, of senders that always have more."""
@@ -195,6 +197,25 @@ def test_below_the_preamble_threshold_nothing_is_heard() -> None:
     b.announce(0)
     b.run(1.0)
     assert b.heard[0][2] == (edca.HEARD, edca.WEAK)
+
+
+@pytest.mark.parametrize("length", [304, 1458])
+def test_group_frames_arrive_as_often_as_their_per_says(length: int) -> None:
+    curve = group_curve(24.0)
+    left_db = curve.snr_db(0.5, 700)  # in the primary 20 MHz, so that half the frames of 700 B are lost
+    power_dbm = NOISE_DBM - 10 * np.log10(4) + left_db
+    b = Bench(power_dbm, group_rate_mbps=24.0, preamble_detection_dbm=-95.0)
+    for k in range(6000):
+        b.run(1e-3 * (k + 1))
+        b.announce(0, length=length)
+    b.run(7.0)
+    fates = np.array([fates for _, _, fates in b.heard])
+    assert fates.shape == (6000, 2)
+    assert set(fates.ravel().tolist()) == {edca.HEARD, edca.WEAK}
+    fade_db = stats.norm(0, 10 / np.log(10) * np.sqrt(2 / 1e4))  # what K = 40 dB leaves of it
+    expected = integrate.quad(lambda g: (1 - curve.per(left_db + g, length)) * fade_db.pdf(g), -0.5, 0.5)[0]
+    assert 0.1 < expected < 0.9
+    assert (fates == edca.HEARD).mean() == pytest.approx(expected, abs=0.02)
 
 
 FAR = np.full((3, 3), -76.4)
