@@ -55,7 +55,7 @@ def test_lost_frames_of_an_ampdu_cost_their_share() -> None:
 
 
 def test_senders_take_turns_whatever_their_rate() -> None:
-    """Why the fluid medium differs with unequal rates: a slow sender takes as many turns, so more of the time."""
+    """A slow sender takes as many turns, so more of the time."""
     slow, fast = csma.Turn(4e-3, BLOCK_ACK_S, 16, 12_000.0), csma.Turn(0.5e-3, BLOCK_ACK_S, 16, 12_000.0)
     ran = csma.run([slow, fast], 20_000, np.random.default_rng(3))
     assert ran.delivered_bits[0] == pytest.approx(ran.delivered_bits[1], rel=0.05)
