@@ -17,7 +17,7 @@ from sortie.radio import Air
 from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.pathloss import LIGHT_MPS, free_space_loss_db, two_ray_loss_db
 from sortie.radio.channel.shadowing import ShadowField
-from sortie.radio.channel.snr import Channel, earshot_m
+from sortie.radio.channel.snr import Channel, earshot_m, noise_dbm
 from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frames_exchanges, legacy_ppdu_s
 from sortie.radio.mac.contention import DIFS_S, SIFS_S, contention, saturation_mbps
 from sortie.radio.mac.jobs import AirJob, GroupFrame
@@ -344,16 +344,18 @@ def goodput(seconds: float) -> Rows:
             ("still", AirSettings(shadowing_sigma_db=0.0), lambda t: 12.0),
             ("shadowing 3.5 dB", AirSettings(), lambda t: 12.0),
         ):
-            service, read, true = Service(config, 1, 0), [], []
+            service = Service(config, noise_dbm(config.bandwidth_mhz, config.noise_figure_db))
+            read: list[float] = []
+            true: list[float] = []
 
             def tick(
                 air: Air,
                 k: int,
                 payload: int = payload,
                 service: Service = service,
-                read: list = read,
-                true: list = true,
-            ) -> None:  # type: ignore[type-arg]
+                read: list[float] = read,
+                true: list[float] = true,
+            ) -> None:
                 if k > 20:
                     read.append(air.goodput_mbps(0)[0])
                     true.append(float(service.link_mbps(air.channel.now.square_db)[0, 1]))
