@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, resolve
 from sortie.scenarios.schema import Perception
 
 
@@ -87,8 +88,31 @@ def make_detector(scene: SceneModel, config: Perception, seed: int, replication:
     Raises:
         ValueError: weights or a recording that are missing or do not fit, naming the file.
     """
+    if config.detector not in DETECTORS:
+        return _own(scene, config, seed, replication)
     make = DETECTORS[config.detector].make
     return None if make is None else make(scene, config, seed, replication)
+
+
+def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
+    """A detector from outside: a class, or a function, that takes the arguments of a `Constructor`."""
+    constructor = resolve("detector", config.detector, config.detector_params)
+    made = checked_call("detector", constructor, scene, config, seed, replication)
+    needed = ("detect", "truth", "count_boxes", "camera_views")
+    found: Any = Guard("detector", made, needed, Path(config.detector).name, timed=False)  # a network takes its time
+    detect = found.detect
+
+    def checked(jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
+        boxes = detect(jobs)
+        if len(boxes) != len(jobs) or not all(isinstance(each, Boxes) for each in boxes):
+            raise PluginError(
+                f"detector {found.name}: detect returns {boxes!r:.60}, must be Boxes for each of the jobs"
+            )
+        return list(boxes)
+
+    found.detect = checked
+    detector: Detector = found
+    return detector
 
 
 def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:

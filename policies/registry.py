@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
-import inspect
 import math
 import numbers
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +14,12 @@ from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.catalogue.prior import METHODS, STAND_IN
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Viewpoint
-from sortie.policies.user_calls import LOAD_S, Guarded, guarded, watched
-from sortie.policies.user_code import imported_files, is_users, load
+from sortie.policies.contract import Directive, Policy, PolicyError, Viewpoint
+from sortie.scenarios.plugins import reference
+from sortie.scenarios.plugins.reference import describe_error, parameters
+from sortie.scenarios.plugins.user_calls import Guarded, guarded
+
+__all__ = ["POLICIES", "describe_error", "parameters", "resolve"]
 
 POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "worked": worked,
@@ -70,48 +70,30 @@ user's file."""
 
 
 def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
-    """A registered policy, or `path/to/file.py:function`, with its parameters bound.
+    """A registered policy, an installed one, or `path/to/file.py:function`, with its parameters bound.
 
     Raises:
         PolicyError: unknown name or parameter, a parameter out of its bounds, missing file or function.
     """
-    if name.endswith(".py"):
-        raise PolicyError(f"policy file {name!r} without its function, must be {name}:function")
-    function = _from_file(name) if ":" in name else POLICIES.get(name)
-    if function is None and (stand_in := METHODS.get(name + STAND_IN)) is not None:
+    if name not in POLICIES and (stand_in := METHODS.get(name + STAND_IN)) is not None:
         raise PolicyError(
             f"policy {name!r} is here as a stand-in alone, name it {stand_in.name}; it lacks {stand_in.missing}"
         )
-    if function is None:
-        near = difflib.get_close_matches(name, POLICIES, 1)
-        hint = f", did you mean {near[0]}?" if near else ","
-        raise PolicyError(f"unknown policy {name!r}{hint} known: {', '.join(POLICIES)}, or path/to/file.py:function")
-    known = parameters(function)
+    found = reference.resolve("policy", name, params, POLICIES, PolicyError)
     for key, value in (params or {}).items():
-        if key not in known:
-            raise PolicyError(f"policy {name!r} has no parameter {key!r}, it has: {', '.join(known) or 'none'}")
-        bound = BOUNDS.get(key) if name in POLICIES else None
-        if bound is not None and not bound.holds(value):
-            raise PolicyError(f"{name}: {key} is {value!r}, must be {bound.text}")
-    return functools.partial(function, **params) if params else function
+        limit = BOUNDS.get(key) if name in POLICIES else None
+        if limit is not None and not limit.holds(value):
+            raise PolicyError(f"{name}: {key} is {value!r}, must be {limit.text}")
+    return found
 
 
-def modules_of(reference: str) -> tuple[Path, ...]:
+def modules_of(name: str) -> tuple[Path, ...]:
     """The files that a policy's code is in: its own and those that it imports (`imported_files`); none if registered.
 
     Raises:
         PolicyError: the file is missing.
     """
-    return imported_files(_file_of(reference)[0]) if ":" in reference else ()
-
-
-def describe_error(error: Exception) -> str:
-    """An exception that a policy raised, and the last line of the user's own files that it passed through."""
-    frames = traceback.walk_tb(error.__traceback__)
-    lines = [(f.f_code.co_filename, n) for f, n in frames if is_users(f.f_globals.get("__name__"))]
-    place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
-    text = f"{type(error).__name__}: {error}{place}"
-    return text.encode(errors="backslashreplace").decode()  # a table and a terminal take no half of a surrogate pair
+    return reference.modules_of("policy", name, PolicyError)
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:
@@ -143,12 +125,6 @@ def viewpoint_of(policy: Policy) -> Viewpoint | None:
     return functools.partial(found, **shared) if found is not None and shared else found
 
 
-def parameters(function: Callable[..., object]) -> dict[str, object]:
-    """The policy's keyword-only parameters and their defaults."""
-    signature = inspect.signature(function)
-    return {p.name: p.default for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
-
-
 def within_budget(policy: Callable[..., object], budget: float) -> dict[str, float]:
     """The parameter that keeps a policy within a budget, whichever of the three it has; none if it has none of them.
 
@@ -159,34 +135,3 @@ def within_budget(policy: Callable[..., object], budget: float) -> dict[str, flo
     """
     known = parameters(policy)
     return {name: budget for name in ("received_budget", "sent_budget", "rho") if name in known}
-
-
-def _file_of(reference: str) -> tuple[Path, str]:
-    """The file and the function that `path/to/file.py:function` names."""
-    file, _, attribute = reference.rpartition(":")
-    path = Path(file)
-    if not path.is_file():
-        raise PolicyError(f"policy file {file!r} not found")
-    if path.suffix != ".py":
-        raise PolicyError(f"policy file {file!r} is not a Python file")
-    return path, attribute
-
-
-def _from_file(reference: str) -> Callable[[FleetView], Sequence[Directive]]:
-    path, attribute = _file_of(reference)
-    file = str(path)
-    try:
-        with watched(LOAD_S):
-            module = Guarded(load)(path)
-    except Exception as error:
-        raise PolicyError(f"policy file {file!r} does not load: {describe_error(error)}") from error
-    function = getattr(module, attribute, None)
-    if not callable(function):
-        raise PolicyError(f"policy file {file!r} has no function {attribute!r}")
-    try:
-        inspect.signature(function)
-    except (TypeError, ValueError) as error:  # some of those written in C
-        raise PolicyError(
-            f"policy file {file!r}: {attribute!r} names no parameters, must be a Python function"
-        ) from error
-    return guarded(function)

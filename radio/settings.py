@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from sortie.radio.own_links import LinkModel, OwnPathLoss
 from sortie.radio.rates import STANDARDS, StandardName
 
 AntennaName = Literal["isotropic", "dipole"]
@@ -86,7 +87,8 @@ class AirSettings:
     """Of every drone that `own_antennas` does not name."""
     own_antennas: Mapping[int, AntennaName] = field(default_factory=dict, hash=False)
     """Antennas of single drones, by id."""
-    path_loss: PathLossName = "log_distance"
+    path_loss: PathLossName | OwnPathLoss = "log_distance"
+    """A name, or a function of one's own (`sortie.radio.own_links`)."""
     path_loss_exponent: float = 2.1
     """Exponent of `log_distance` beyond 1 m."""
     ground_roughness_m: float = 0.05
@@ -123,6 +125,9 @@ class AirSettings:
     relay_max_hops: int = 1
     """Most hops of a payload's route; 1 sends directly."""
     bursts: BurstSettings = BurstSettings()
+    link: Callable[..., LinkModel] | None = None
+    """Makes a model of one's own that changes the SNR of every link, frame by frame; called with the number of drones, the
+    time between two frames, and a random generator."""
     trace: str | None = None
     """CSV or Parquet file of links whose SNR, loss or goodput replaces the models' (`radio/channel/traces.py`)."""
     heartbeat_s: float = 0.02
@@ -140,7 +145,7 @@ class AirSettings:
 
     def _check(self, name: str, allowed: Iterable[object]) -> None:
         value, choices = getattr(self, name), list(allowed)
-        if value not in choices:
+        if value not in choices and not (name == "path_loss" and callable(value)):
             raise ValueError(f"{name} is {value!r}, must be one of {choices}")
 
     def antennas(self, drones: int) -> tuple[AntennaName, ...]:

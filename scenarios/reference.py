@@ -19,7 +19,7 @@ from pydantic_core import PydanticUndefined
 from sortie.scenarios.reading.explain import sections_of
 from sortie.scenarios.report_text import replace_section, table
 from sortie.scenarios.schema import Scenario, json_schema
-from sortie.scenarios.schema.base import PresetSection
+from sortie.scenarios.schema.base import ModelName, PresetSection
 
 HERE = Path(__file__).parent
 BEGIN, END = "<!-- fields:begin -->", "<!-- fields:end -->"
@@ -63,8 +63,16 @@ def _sections(section: type[BaseModel], path: str) -> Iterator[tuple[str, type[B
 
 
 def _values(field: FieldInfo) -> str:
+    if names := _model_names(field.metadata):
+        return names
     bounds = _bounds(field.metadata)
     return _type(field.annotation) + (f", {bounds}" if bounds else "")
+
+
+def _model_names(metadata: list[Any] | tuple[Any, ...]) -> str:
+    """The values of a field that names a model which can be replaced from outside."""
+    known = next((item.builtin for item in metadata if isinstance(item, ModelName)), None)
+    return "" if known is None else ", ".join([*(f"`{name}`" for name in known), "`path/to/file.py:Name`, a plug-in"])
 
 
 def _bounds(metadata: list[Any] | tuple[Any, ...]) -> str:
@@ -81,6 +89,8 @@ def _bounds(metadata: list[Any] | tuple[Any, ...]) -> str:
 def _type(annotation: Any) -> str:
     origin, args = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
+        if names := _model_names(args[1:]):
+            return names
         bounds = _bounds(args[1:])
         return _type(args[0]) + (f", {bounds}" if bounds else "")
     if origin is Literal:

@@ -13,8 +13,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from sortie.policies.user_code import imported_files
-from sortie.scenarios.reading.files import named_files
+from sortie.scenarios.plugins.reference import is_file, package_of
+from sortie.scenarios.plugins.user_code import imported_files
+from sortie.scenarios.reading.files import named_files, named_models
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.traces import located
 
@@ -81,14 +82,19 @@ def name_of(thing: object) -> str:
     return f"{source.__module__}.{source.__qualname__}"
 
 
+def runs_user_code(scenario: Scenario) -> bool:
+    """Whether a scenario names a model in a file of a user's own."""
+    return any(is_file(name) for _, name in named_models(scenario.model_dump(mode="json")))
+
+
 def own_files(
     scenario: Scenario, policy: str | Callable[..., object] | None = None, detector: object = None
 ) -> dict[str, str]:
     """The files beside the package that a sortie reads.
 
-    Those are the files that the scenario names (policies, weights, recordings, fusion, traces), the files of objects
+    Those are the files that the scenario names (models of one's own, weights, recordings, traces), the files of objects
     that were passed in, and the modules that Python files among them import. The standard library and installed
-    packages do not count.
+    packages do not count, but for packages that offer a model which flies.
 
     Args:
         scenario: what flies.
@@ -96,7 +102,7 @@ def own_files(
         detector: the detector that flies.
 
     Returns:
-        16 hex digits of SHA-256 by path. An object without a file stands under its name, with the digest of its
+        16 hex digits of SHA-256 by path, or by name and version of a package. An object without a file stands under its name, with the digest of its
         source, or of nothing where Python has none.
 
     Raises:
@@ -122,6 +128,8 @@ def own_files(
             code.append(file)
         else:
             found[name_of(thing)] = hashlib.sha256(source.encode()).hexdigest()[:16]
+    offered = (package_of(kind, name) for kind, name in named_models(sections))
+    found |= dict(package for package in offered if package is not None)
     modules = {file for path in code for file in imported_files(path)}
     return found | {_shown(path): _digest(path) for path in sorted(modules)}
 

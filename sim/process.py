@@ -2,7 +2,7 @@
 
 import gc
 
-from sortie.policies.user_calls import end_when_stuck
+from sortie.scenarios.plugins.user_calls import end_when_stuck
 
 ALLOCATIONS = 200_000
 """Net allocations between two looks for reference cycles; Python's own 700 cost a flight of twenty drones a tenth."""

@@ -9,11 +9,13 @@ factor is exactly 1.
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.motion import Trajectories
+from sortie.scenarios.plugins.reference import PluginError, checked_call, name_of, resolve
 from sortie.scenarios.schema import Airframe, Fleet
 
 Array = npt.NDArray[np.float64]
@@ -102,19 +104,69 @@ def induced_speed(forward: npt.ArrayLike, climb: npt.ArrayLike) -> Array:
     return root
 
 
+class PowerModel(Protocol):
+    """A power model of one's own, `fleet.airframe.power_model`. Keyword-only arguments are its parameters.
+
+    Example, a machine that needs 100 W for each kilogram:
+
+    >>> def heavy(air_velocity_mps, acceleration_mps2, climb_mps, mass_kg, *, w_per_kg=100.0):
+    ...     return np.full_like(climb_mps, w_per_kg) * mass_kg
+    """
+
+    def __call__(
+        self, air_velocity_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array
+    ) -> npt.ArrayLike:
+        """Power at the rotors, W [T, n], before the drivetrain's losses.
+
+        Args:
+            air_velocity_mps: [T, n, 3], the velocity through the air, ENU.
+            acceleration_mps2: [T, n, 3], ENU, gravity not included.
+            climb_mps: [T, n], the vertical speed over ground.
+            mass_kg: [n], all-up mass with payload.
+        """
+
+
 def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
-    """Power at the rotors of every drone in every frame, W [T, N], by the airframes' models and payloads."""
+    """Power at the rotors of every drone in every frame, W [T, N], by the airframes' models and payloads.
+
+    Raises:
+        PluginError: a power model of one's own that is not there, fails, or returns something else.
+    """
     machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
     power_w = np.empty(motion.position_m.shape[:2])
-    for airframe in dict.fromkeys(a for a, _ in machines):
+    distinct: list[Airframe] = []
+    for airframe, _ in machines:
+        if airframe not in distinct:
+            distinct.append(airframe)
+    for airframe in distinct:
         of = [i for i, (a, _) in enumerate(machines) if a == airframe]
         mass_kg = airframe.mass_kg + np.array([machines[i][1] for i in of])
-        if airframe.power_model == "momentum":
-            air_mps = (motion.velocity_mps - motion.wind_mps)[:, of]
-            power_w[:, of] = momentum_power_w(air_mps, motion.acceleration_mps2[:, of], airframe, mass_kg)
-        else:
+        climb_mps = motion.velocity_mps[:, of, 2]
+        if airframe.power_model == "level":
             level_w = rotor_power_w(motion.air_speed_mps[:, of], airframe, mass_kg)
-            power_w[:, of] = level_w + climb_power_w(motion.velocity_mps[:, of, 2], airframe, mass_kg)
+            power_w[:, of] = level_w + climb_power_w(climb_mps, airframe, mass_kg)
+            continue
+        air_mps = (motion.velocity_mps - motion.wind_mps)[:, of]
+        acceleration_mps2 = motion.acceleration_mps2[:, of]
+        if airframe.power_model == "momentum":
+            power_w[:, of] = momentum_power_w(air_mps, acceleration_mps2, airframe, mass_kg)
+        else:
+            model = resolve("power", airframe.power_model, airframe.power_params)
+            power_w[:, of] = _own_power_w(model, air_mps, acceleration_mps2, climb_mps, mass_kg)
+    return power_w
+
+
+def _own_power_w(
+    model: PowerModel, air_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array
+) -> Array:
+    """What a power model of one's own returns, checked."""
+    given = checked_call("power", model, air_mps, acceleration_mps2, climb_mps.copy(), mass_kg)
+    power_w = np.asarray(given, dtype=float)
+    if power_w.shape != climb_mps.shape:
+        raise PluginError(f"power {name_of(model)}: returns shape {power_w.shape}, must be {climb_mps.shape}")
+    wrong = ~(np.isfinite(power_w) & (power_w >= 0.0))
+    if wrong.any():
+        raise PluginError(f"power {name_of(model)}: returns {power_w[wrong][0]:g} W, must be finite and ≥ 0")
     return power_w
 
 

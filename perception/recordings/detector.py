@@ -15,10 +15,11 @@ from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import NMS_IOU, EgoSources, SourceBoxes, joined_many, sendable, source_of
 from sortie.perception.lateness import own_age_s, weighed
 from sortie.perception.metrics.ap import suppress
-from sortie.perception.recordings.exchange import Sent, fused, load_fusion, received_boxes
+from sortie.perception.recordings.exchange import Sent, fused, received_boxes
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.plugins.reference import resolve
 from sortie.scenarios.schema import Perception
 
 NEAR_M = 5.0
@@ -45,7 +46,7 @@ class RecordedDetector:
     def __init__(self, config: Perception) -> None:
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
-        self._fuse = None if config.recorded_fusion is None else load_fusion(config.recorded_fusion)
+        self._fuse = None if config.recorded_fusion is None else resolve("fusion", config.recorded_fusion)
         scenes = len(set(rec.scene.tolist()))
         if scenes > 1:
             raise RecordingError(f"{rec.path}: scene names {scenes} scenes, must be one to be flown")

@@ -7,7 +7,6 @@ its centre was sent. It cannot find a car that neither drone found alone, and si
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,29 +40,6 @@ class Sent:
     weight: float = 1.0
     age_s: float = 0.0
     """From the capture to the fusion."""
-
-
-def load_fusion(reference: str) -> Fuse:
-    """The function that `path/to/file.py:function` names. It is the user's own code and runs as such.
-
-    Raises:
-        RecordingError: no such file or function, or the file does not load.
-    """
-    file, _, name = reference.rpartition(":")
-    if not Path(file).is_file():
-        raise RecordingError(f"fusion {reference!r}: no file {file!r}, must be path/to/file.py:function")
-    spec = importlib.util.spec_from_file_location(f"sortie_fusion_{Path(file).stem}", file)
-    if spec is None or spec.loader is None:
-        raise RecordingError(f"fusion {reference!r}: {file!r} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise RecordingError(f"fusion {reference!r}: does not load, {type(error).__name__}: {error}") from error
-    function = getattr(module, name, None)
-    if not callable(function):
-        raise RecordingError(f"fusion {reference!r}: no function {name!r} in it")
-    return function  # type: ignore[no-any-return]
 
 
 def fusion_hash(reference: str | None) -> str:

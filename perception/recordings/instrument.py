@@ -14,8 +14,9 @@ from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames
 from sortie.perception.evaluation.evaluate import FLOOR, evaluate
 from sortie.perception.evaluation.matched import Evaluation
-from sortie.perception.recordings.exchange import Fuse, Sent, fused, fusion_hash, load_fusion, received_boxes
+from sortie.perception.recordings.exchange import Fuse, Sent, fused, fusion_hash, received_boxes
 from sortie.perception.recordings.recording import Floats, Ints, Recording, RecordingError, open_recording
+from sortie.scenarios.plugins.reference import resolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class RecordedInstrument:
     def __init__(self, recording: Recording, fusion: str | None = None) -> None:
         self.geometry = recording.geometry
         self._recording = recording
-        self._fuse: Fuse | None = None if fusion is None else load_fusion(fusion)
+        self._fuse: Fuse | None = None if fusion is None else resolve("fusion", fusion)
         if fusion is not None and "features" not in recording.large:
             raise RecordingError(f"{recording.path}: features are missing, must be there for a fusion")
         self.fingerprint = f"{content_hash(recording.path)}{fusion_hash(fusion)}"

@@ -18,8 +18,8 @@ import types
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar, cast
 
-from sortie.policies.user_calls import Guarded, guarded
-from sortie.policies.user_code import is_users
+from sortie.scenarios.plugins.user_calls import Guarded, guarded
+from sortie.scenarios.plugins.user_code import is_users
 
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 

@@ -7,6 +7,7 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sortie.radio import own_links
 from sortie.radio.settings import AirSettings
 
 FloatArray = NDArray[np.float64]
@@ -68,6 +69,10 @@ def path_loss_db(
     settings: AirSettings, distance_m: ArrayLike, height_a_m: ArrayLike, height_b_m: ArrayLike
 ) -> FloatArray:
     """Path loss by the model of the settings, dB; arguments as for `two_ray_loss_db`."""
+    if not isinstance(settings.path_loss, str):
+        free_db = free_space_loss_db(np.maximum(distance_m, 1.0), settings.carrier_ghz)
+        ends = distance_m, height_a_m, height_b_m
+        return own_links.path_loss(settings.path_loss, *ends, settings.carrier_ghz, free_db)
     if settings.path_loss == "two_ray":
         return two_ray_loss_db(distance_m, height_a_m, height_b_m, settings.carrier_ghz, settings.ground_roughness_m)
     exponents = {"free_space": 2.0, "log_distance": settings.path_loss_exponent}
@@ -75,8 +80,8 @@ def path_loss_db(
 
 
 def range_m(settings: AirSettings, loss_db: float) -> float:
-    """The distance beyond which the loss exceeds `loss_db` for certain (two rays can add up to 6 dB of gain)."""
+    """The distance beyond which the loss exceeds `loss_db` for certain."""
     exponent = settings.path_loss_exponent if settings.path_loss == "log_distance" else 2.0
-    gain_db = 6.1 if settings.path_loss == "two_ray" else 0.0
+    gain_db = 0.0 if settings.path_loss in ("log_distance", "free_space") else own_links.GAIN_DB
     beyond_1m_db = loss_db + gain_db - float(free_space_loss_db(1.0, settings.carrier_ghz))
     return float(10.0 ** (max(0.0, beyond_1m_db) / (10.0 * exponent)))

@@ -19,8 +19,10 @@ from sortie.radio.channel.earshot import LinkList, all_links
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
+from sortie.radio.own_links import changed_snr, own_link
 from sortie.radio.rates import CURVES, group_curve
 from sortie.radio.settings import AirSettings
+from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
 AnyFloats = NDArray[np.floating[Any]]
@@ -133,6 +135,8 @@ class Channel:
                 settings.shadowing_sigma_db, settings.shadowing_distance_m, settings.shadowing_time_s, seed, replication
             )
         early = min(n_drones, SQUARE)
+        rng = stream(seed, replication, (), "link model")
+        self._own = None if settings.link is None else own_link(settings.link, n_drones, frame_s, rng)
         self._drawn = StreamShadowing(settings, seed, replication, early, frame_s)
         self._crowd: Crowd | None = None
         if n_drones > SQUARE:
@@ -167,6 +171,11 @@ class Channel:
             self._refill()
         links, snr = self.links, self._snr_db[row]
         rows_db = self._snr_rows[row] if self._crowd is None else None
+        if self._own is not None:
+            square_db = links.square(snr, OUT_OF_RANGE_DB)
+            at_m, t_s = self._positions_m[self.frame], self.frame * self._frame_s
+            snr = changed_snr(self._own, t_s, at_m, square_db)[links.sender, links.receiver]
+            rows_db = None
         if extra_loss_db is not None or jammers:
             snr = snr.copy()
             if extra_loss_db is not None:

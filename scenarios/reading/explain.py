@@ -68,6 +68,10 @@ def _say(detail: ErrorDetails, node: Node, path: Path, root: Node, top: type[Bas
         return "missing, must be given"
     if kind == "literal_error":
         return f"{node.shown()}, must be {context['expected'].replace(chr(39), '')}{_meant(node, context['expected'])}"
+    if kind == "model_name":
+        names = context["expected"].replace(chr(39), "")
+        listed = f"{names} or path/to/file.py:Name" if names else "path/to/file.py:Name"
+        return f"{node.shown()}, must be {listed}{_meant(node, context['expected'])}"
     if kind == "union_tag_invalid":
         tags = re.findall(r"'(\w+)'", context["expected_tags"])
         return f"{node.shown()}, must be {one_of(tags)}{_meant(node, context['expected_tags'])}"

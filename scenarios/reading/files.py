@@ -3,17 +3,46 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
+from sortie.scenarios.plugins.reference import is_file
+from sortie.scenarios.reading.explain import sections_of
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.base import ModelName
 from sortie.scenarios.traces import located
 
-FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.recording", "perception.recorded_fusion")
-"""Fields that name a file; so do the weights of a make, and a policy's name, those of its changes and those of makes where
-they are `file.py:function`."""
+FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.recording")
+"""Fields that name a file; so do the weights of a make."""
+MODELS = {
+    "radio.path_loss": "path_loss",
+    "radio.link": "link",
+    "perception.detector": "detector",
+    "perception.recorded_fusion": "fusion",
+    "fleet.airframe.power_model": "power",
+    "policy.name": "policy",
+}
+"""The kind of model that a field names. Makes name policies and power models too, and changes of policy name policies."""
+
+
+def builtin(field: str) -> tuple[str, ...]:
+    """The built-in models that a field of the schema may name.
+
+    Example:
+        >>> builtin("fleet.airframe.power_model")
+        ('level', 'momentum')
+    """
+    section: type[BaseModel] = Scenario
+    *above, key = field.split(".")
+    for name in above:
+        (section,) = sections_of(section.model_fields[name].annotation)
+    named = (item for item in section.model_fields[key].metadata if isinstance(item, ModelName))
+    return next((item.builtin for item in named), ())
 
 
 def named_files(sections: dict[str, Any]) -> list[str]:
@@ -43,21 +72,39 @@ def placed(name: str, folder: Path) -> str:
     return name if here.exists() or not (folder / name).exists() else str(folder / name)
 
 
+def named_models(sections: dict[str, Any]) -> list[tuple[str, str]]:
+    """Every model that a scenario's plain sections name, with its kind first: built-in, installed and in files."""
+    return [(kind, holder[key]) for kind, holder, key in _models(sections)]
+
+
 def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
     """Where files are named: the section and its key."""
-    for field in FIELDS:
-        room, _, key = field.partition(".")
-        if sections.get(room, {}).get(key) is not None:
-            yield sections[room], key
+    yield from _given(sections, FIELDS)
     for make in sections.get("fleet", {}).get("makes", ()):
-        if make.get("weights") is not None:
-            yield make, "weights"
-        if ":" in (make.get("policy") or ""):
-            yield make, "policy"
-    policy = sections.get("policy", {})
-    for named in (policy, *policy.get("changes", ())):
-        if ":" in named.get("name", ""):
-            yield named, "name"
+        yield from _given(make, ("weights",))
+    for _, holder, key in _models(sections):
+        if is_file(holder[key]):
+            yield holder, key
+
+
+def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Where models are named: the kind, the section and its key."""
+    for field, kind in MODELS.items():
+        yield from ((kind, *at) for at in _given(sections, (field,)))
+    for make in sections.get("fleet", {}).get("makes", ()):
+        yield from (("policy", *at) for at in _given(make, ("policy",)))
+        yield from (("power", *at) for at in _given(make, ("airframe.power_model",)))
+    for change in sections.get("policy", {}).get("changes", ()):
+        yield "policy", change, "name"
+
+
+def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[dict[str, Any], str]]:
+    """The section and the key of each field that is there."""
+    for field in fields:
+        *above, key = field.split(".")
+        section = functools.reduce(lambda inside, name: inside.get(name) or {}, above, sections)
+        if section.get(key) is not None:
+            yield section, key
 
 
 def _split(text: str) -> tuple[str, str]:

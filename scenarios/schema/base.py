@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from sortie.scenarios.plugins.reference import FILE, installed
 
 PointM = tuple[Annotated[float, Field(ge=-5000, le=5000)], Annotated[float, Field(ge=-5000, le=5000)]]
 Soc = Annotated[float, Field(gt=0, le=1)]
 DroneId = Annotated[int, Field(ge=0, le=254)]
+Params = dict[str, float | int | bool | str]
+"""Keyword arguments of a model that can be replaced from outside."""
 PhaseName = Literal["transit", "search", "track", "return"]
 
 
@@ -45,3 +51,24 @@ class PresetSection(Section):
     def names_in_schema(cls, schema: dict[str, Any]) -> None:
         """For `json_schema_extra`: let editors accept a preset's name beside the section."""
         schema["anyOf"] = [{"enum": list(cls.presets)}, {"$ref": schema.pop("$ref")}]
+
+
+@dataclass(frozen=True)
+class ModelName:
+    """Marks text that names a model: a built-in one, an installed plug-in, or `path/to/file.py:Name`."""
+
+    kind: str
+    builtin: tuple[str, ...] = ()
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._known, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        names = [{"enum": list(self.builtin)}] if self.builtin else []
+        return {"anyOf": [*names, {"type": "string", "description": "An installed plug-in, or path/to/file.py:Name."}]}
+
+    def _known(self, name: str) -> str:
+        if name in self.builtin or FILE.fullmatch(name) or name in installed(self.kind):
+            return name
+        expected = ", ".join(map(repr, (*self.builtin, *installed(self.kind))))
+        raise PydanticCustomError("model_name", "unknown {kind}", {"kind": self.kind, "expected": expected})

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, PointM, PresetSection, Section, Soc, inconsistent
+from sortie.scenarios.schema.base import DroneId, ModelName, Params, PointM, PresetSection, Section, Soc, inconsistent
 
 
 class Formation(Section):
@@ -101,10 +101,11 @@ class Airframe(PresetSection):
     tip_speed_mps: float = Field(120.0, ge=10, le=300, description="Speed of the blades' tips in hover, no payload.")
     drag_area_m2: float = Field(0.01509, ge=0, le=5, description="Drag over dynamic pressure.")
     air_density_kgpm3: float = Field(1.225, ge=0.3, le=1.5, description="1.225 at sea level, 1.11 at 1,000 m.")
-    power_model: Literal["level", "momentum"] = Field(
+    power_model: Annotated[str, ModelName("power", ("level", "momentum"))] = Field(
         "level",
         description="level: the formula for level flight, and m·g·v_z while climbing; momentum: momentum theory with climb's inflow, vertical gusts and acceleration.",
     )
+    power_params: Params = Field({}, description="Keyword arguments of a power model of one's own.")
 
 
 class Polarisation(Section):
@@ -258,7 +259,7 @@ class Make(Section):
         min_length=1,
         description="A policy of its own: a registered one, or path/to/file.py:function.",
     )
-    policy_params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of that policy.")
+    policy_params: Params = Field({}, description="Keyword arguments of that policy.")
     detector: Literal["torch", "surrogate", "none"] | None = Field(
         None,
         description="In place of perception.detector. With none its drones send context alone, and use the boxes that they are sent.",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import Section, inconsistent
+from sortie.scenarios.schema.base import ModelName, Params, Section, inconsistent
 from sortie.scenarios.schema.mission import Target
 
 
@@ -59,10 +59,11 @@ class Thermal(Section):
 
 
 class Perception(Section):
-    detector: Literal["torch", "surrogate", "recorded", "none"] = Field(
+    detector: Annotated[str, ModelName("detector", ("torch", "surrogate", "recorded", "none"))] = Field(
         "torch",
-        description="The detector: the network, its fast surrogate, a recording of another model, or none: the traffic alone.",
+        description="The detector: the network, its fast surrogate, a recording of another model, one of one's own (docs/guide), or none: the traffic alone.",
     )
+    detector_params: Params = Field({}, description="Keyword arguments of a detector of one's own.")
     fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "when2com", "where2comm"] = Field(
         "disconet",
         description="How what peers sent is fused; weights belong to a fusion, none and late take any; the surrogate takes its calibration's, or none.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, PhaseName, Section, inconsistent
+from sortie.scenarios.schema.base import DroneId, Params, PhaseName, Section, inconsistent
 
 
 class PolicyChange(Section):
@@ -12,7 +12,7 @@ class PolicyChange(Section):
     phase: PhaseName | None = Field(None, description="… or whenever a drone's own phase turns to this …")
     command: str | None = Field(None, min_length=1, description="… or on this command; one of the three is given.")
     name: str = Field(min_length=1, description="The policy that takes over, as policy.name.")
-    params: dict[str, float | int | bool | str] = Field({}, description="Its keyword arguments.")
+    params: Params = Field({}, description="Its keyword arguments.")
 
     @model_validator(mode="after")
     def _one_trigger(self) -> PolicyChange:
@@ -36,7 +36,7 @@ class ViewReplay(Section):
 
 class PolicySection(Section):
     name: str = Field("worked", min_length=1, description="A registered policy, or path/to/file.py:function.")
-    params: dict[str, float | int | bool | str] = Field({}, description="Keyword arguments of the policy.")
+    params: Params = Field({}, description="Keyword arguments of the policy.")
     dwell_s: float = Field(1.0, ge=0, le=60, description="How long an upgrade must be asked for before it is made.")
     hysteresis: float = Field(
         0.2,

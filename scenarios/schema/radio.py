@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import Section, inconsistent
+from sortie.scenarios.schema.base import ModelName, Params, Section, inconsistent
 
 MIN_TILE_BYTES = 206
 """A fragment that is usable alone: 44 B of header, and one cell of 160 B with its index (fleet/tiles.py)."""
@@ -85,9 +85,10 @@ class Radio(Section):
     antenna: Literal["isotropic", "dipole"] = Field(
         "isotropic", description="Pattern of every drone's antenna; a dipole stands along the airframe's z axis."
     )
-    path_loss: Literal["log_distance", "free_space", "two_ray"] = Field(
+    path_loss: Annotated[str, ModelName("path_loss", ("log_distance", "free_space", "two_ray"))] = Field(
         "log_distance", description="Path loss; two_ray adds the ground's reflection (ground is z = 0) to free space."
     )
+    path_loss_params: Params = Field({}, description="Keyword arguments of a path loss of one's own.")
     path_loss_exponent: float = Field(2.1, ge=1.5, le=6, description="Log-distance exponent beyond 1 m.")
     ground_roughness_m: float = Field(
         0.05, ge=0, le=10, description="Standard deviation of the ground's height, for two_ray: rough ground scatters."
@@ -136,6 +137,10 @@ class Radio(Section):
         1, ge=1, le=8, description="Most hops of a payload's route; 1 sends directly, whatever the link is worth."
     )
     bursts: Bursts = Bursts()
+    link: Annotated[str, ModelName("link")] | None = Field(
+        None, description="A model of one's own that changes the SNR of every link, frame by frame (docs/guide)."
+    )
+    link_params: Params = Field({}, description="Its keyword arguments.")
     trace: str | None = Field(
         None,
         description="CSV or Parquet (radio/channel/traces.py): links named in it take SNR, loss or goodput from it, not from the models.",

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from multiprocessing.connection import Connection
 
-from sortie.policies.user_calls import STUCK
+from sortie.scenarios.plugins.user_calls import STUCK
 from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
 
 ATTEMPTS = 4

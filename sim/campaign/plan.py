@@ -19,7 +19,7 @@ import numpy as np
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
-from sortie.policies.user_code import imported_files
+from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
 from sortie.scenarios.reading.load import loads

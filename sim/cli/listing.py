@@ -5,20 +5,23 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from sortie.perception.detectors import DETECTORS
 from sortie.policies.registry import POLICIES, missing_parts, parameters
+from sortie.scenarios.plugins.reference import installed
+from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load
 from sortie.scenarios.schema import json_schema
 from sortie.sim.cli.console import out
+
+WHAT = "policies, scenarios, campaigns, detectors, fusions, path_loss, link, power"
 
 
 def list_(
     what: Annotated[
         str,
-        typer.Argument(
-            help="What to list: policies, scenarios, campaigns, detectors, fusions or schema (JSON Schema)."
-        ),
+        typer.Argument(help=f"What to list: {WHAT} or schema (JSON Schema)."),
     ],
 ) -> None:
     """List policies, scenarios and other names that commands take."""
@@ -28,6 +31,7 @@ def list_(
             summary = (function.__doc__ or "").strip().splitlines()[0]
             missing = f" Missing: {missing_parts(name)}." if missing_parts(name) else ""
             out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}{missing}", soft_wrap=True)
+        _installed("policy")
     elif what == "scenarios":
         for name, path in library().items():
             out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
@@ -39,6 +43,11 @@ def list_(
     elif what == "detectors":
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
+        _installed("detector")
+    elif what in MODELS.values():
+        for name in next(builtin(field) for field, kind in MODELS.items() if kind == what):
+            out.print(f"[bold]{name}[/bold]", soft_wrap=True)
+        _installed(what)
     elif what == "fusions":
         from sortie.perception.network.fusion.registry import FUSIONS  # here: torch takes a second to import
 
@@ -47,4 +56,11 @@ def list_(
     elif what == "schema":
         out.print_json(data=json_schema())
     else:
-        raise typer.BadParameter(f"{what!r}, must be policies, scenarios, campaigns, detectors, fusions or schema")
+        raise typer.BadParameter(f"{what!r}, must be {WHAT} or schema")
+
+
+def _installed(kind: str) -> None:
+    """The models of a kind that installed packages offer."""
+    for name, entry in installed(kind).items():
+        package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+        out.print(f"[bold]{name}[/bold]  {escape(package)}", soft_wrap=True)

@@ -18,12 +18,12 @@ from rich.table import Table
 
 from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
-from sortie.policies.user_calls import DECISION_S, watched
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
 from sortie.policies.verification.proof import PLANE, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.views import to_json
+from sortie.scenarios.plugins.user_calls import DECISION_S, watched
 from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused

@@ -29,7 +29,6 @@ from sortie.policies.contract import (
     check_reposition,
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
-from sortie.policies.user_calls import is_guarded
 from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.enforced import Cap, Steps, judge, put_right
 from sortie.policies.verification.invariants import (
@@ -42,6 +41,7 @@ from sortie.policies.verification.invariants import (
 )
 from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
+from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.world import at, with_frame

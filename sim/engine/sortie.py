@@ -26,11 +26,11 @@ from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, m
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
-from sortie.policies.user_calls import guarded, watched
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
 from sortie.radio.settings import AirSettings
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.plugins.user_calls import guarded, watched
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
@@ -40,6 +40,7 @@ from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
+from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
@@ -47,7 +48,7 @@ from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, own_antennas, route_bounds, strongest_dbm
-from sortie.sim.identity import code_version, name_of, own_files
+from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
 from sortie.sim.results import disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.views import TABLES as VIEW_TABLES
@@ -113,13 +114,13 @@ def run_sortie(
         if progress is not None:
             progress(t_s)
 
-    parts = build(scenario, policies, seed, replication, detector_of)
-    files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited while the sortie flies
     with (
         watched(limits.decision_s, f"{limits.decision_s:g} s (limits.decision_s)")
-        if policies.of_users
+        if policies.of_users or runs_user_code(scenario)
         else nullcontext()
     ):
+        parts = build(scenario, policies, seed, replication, detector_of)
+        files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
         fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
@@ -175,7 +176,8 @@ def build(
     air = Air(
         env,
         AirSettings.of(
-            scenario.radio.model_dump(exclude={"framing"})
+            scenario.radio.model_dump(exclude={"framing", "path_loss_params", "link_params"})
+            | of_radio(scenario)
             | {"tx_power_dbm": strongest_dbm(scenario), "own_antennas": own_antennas(scenario)}
         ),
         motion.position_m,

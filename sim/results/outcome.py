@@ -19,6 +19,7 @@ from sortie.perception.types import Boxes
 from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.radio.transmission import Status
+from sortie.scenarios.plugins.reference import is_file
 from sortie.sim.results import disagreement
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.outcome_fields import REASONS
@@ -184,7 +185,8 @@ def _grounded_blind(record: SortieRecord, both: Both, ap: dict[str, float | None
 def _fusion(record: SortieRecord) -> str | None:
     """What fuses payloads, as the scenario names it; None where a detector flew that the scenario does not name."""
     section = record.scenario.perception
-    return (section.recorded_fusion or section.fusion) if record.detector == section.detector != "none" else None
+    fuses = record.detector == section.detector != "none" and not is_file(section.detector)
+    return (section.recorded_fusion or section.fusion) if fuses else None
 
 
 class _Fusions:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from sortie.policies.contract import Directive, PolicyError, Reposition, check_directives, nothing
 from sortie.policies.registry import viewpoint_of
-from sortie.policies.user_calls import watched
+from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.representation import NAME_OF
 from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, ask, ask_viewpoint
 from sortie.sim.folders import RunError

@@ -18,11 +18,12 @@ from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.recordings.detector import RecordedDetector
-from sortie.perception.recordings.exchange import load_fusion
 from sortie.perception.recordings.instrument import RecordedInstrument, evaluate_recording, frames_of
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Share
+from sortie.scenarios.plugins.reference import PluginError, resolve
 from sortie.scenarios.schema import Perception
+from sortie.scenarios.schema.base import ModelName
 
 GREEDY = """
 import numpy as np
@@ -128,7 +129,6 @@ def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Pa
         ("wrong", r"the fusion gave shape \[3, 5\], must be finite boxes \[m, 6\]"),
         ("raises", "the fusion failed, ValueError: no such layer"),
         ("torn", "the fusion failed, RuntimeError: "),
-        ("missing", "no function 'missing' in it"),
     ],
 )
 def test_a_fusion_that_fails_is_told(name: str, message: str, tmp_path: Path, fusion: str) -> None:
@@ -139,12 +139,18 @@ def test_a_fusion_that_fails_is_told(name: str, message: str, tmp_path: Path, fu
         )
 
 
+def test_a_fusion_that_is_not_in_its_file_is_told(tmp_path: Path, fusion: str) -> None:
+    rec = open_recording(small(tmp_path / "r.npz"))
+    with pytest.raises(PluginError, match="has no function or class 'missing'"):
+        RecordedInstrument(rec, fusion.replace("peaks", "missing"))
+
+
 def test_a_fusion_file_that_does_not_load_is_told(tmp_path: Path) -> None:
     (tmp_path / "f.py").write_text("1 / 0")
-    with pytest.raises(RecordingError, match="does not load, ZeroDivisionError: division by zero"):
-        load_fusion(f"{tmp_path / 'f.py'}:f")
-    with pytest.raises(RecordingError, match=r"no file .*g\.py', must be path/to/file\.py:function"):
-        load_fusion(f"{tmp_path / 'g.py'}:f")
+    with pytest.raises(PluginError, match=r"fusion file '.*f\.py' does not load: ZeroDivisionError: division by zero"):
+        resolve("fusion", f"{tmp_path / 'f.py'}:f")
+    with pytest.raises(PluginError, match=r"fusion file '.*g\.py' not found"):
+        resolve("fusion", f"{tmp_path / 'g.py'}:f")
 
 
 def flown(tmp_path: Path, boxes: Any = None, **settings: Any) -> RecordedDetector:
@@ -226,9 +232,8 @@ def test_what_cannot_be_flown_is_told(changes: Any, settings: Any, message: str,
 
 
 def test_every_detector_of_the_schema_is_in_the_table() -> None:
-    from typing import get_args
-
-    assert set(DETECTORS) == set(get_args(Perception.model_fields["detector"].annotation))
+    (named,) = (m for m in Perception.model_fields["detector"].metadata if isinstance(m, ModelName))
+    assert set(DETECTORS) == set(named.builtin)
     assert make_detector(only_target(0, 0), Perception(detector="none"), 1) is None
 
 

@@ -61,6 +61,8 @@ FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
 
 BURSTS = "radio.bursts.good_to_bad=0.3"
 LINKS = str(Path(__file__).parent / "links.csv")
+OWN = Path(__file__).parent / "own_models.py"
+WALL, NOISY, POWER, ALL_SEEN = (f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient"))
 
 AT_2 = "policy.changes=[{at_s: 2, name: worst-2}]"
 IN_TRACK = "policy.changes=[{phase: track, name: worst-2}]"
@@ -160,6 +162,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.airframe.drag_area_m2": ("0.03", ()),
     "fleet.airframe.air_density_kgpm3": ("1.1", ()),
     "fleet.airframe.power_model": ("momentum", ()),
+    "fleet.airframe.power_params": ("{power_w: 150}", (f"fleet.airframe.power_model={POWER}",)),
     "fleet.trace": ("TRACE", ()),
     "fleet.makes.drones": ("[2]", (MADE,)),
     "fleet.makes.airframe": ("zeng_2019", (MADE,)),
@@ -204,6 +207,9 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "radio.noise_figure_db": ("10", ()),
     "radio.antenna": ("dipole", ()),
     "radio.path_loss": ("free_space", ()),
+    "radio.path_loss_params": ("{wall_db: 3}", (f"radio.path_loss={WALL}",)),
+    "radio.link": (NOISY, ()),
+    "radio.link_params": ("{sigma_db: 3}", (f"radio.link={NOISY}",)),
     "radio.path_loss_exponent": ("2.6", ()),
     "radio.ground_roughness_m": ("5", ("radio.path_loss=two_ray", "fleet.formation.altitude_m=10", FAR)),
     "radio.shadowing_sigma_db": ("6", ()),
@@ -254,6 +260,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "context.roster": ("true", ()),
     "context.trust": ("false", (LIE,)),
     "perception.detector": ("torch", ("duration_s=4",)),
+    "perception.detector_params": ("{finds: false}", (f"perception.detector={ALL_SEEN}", "duration_s=4")),
     "perception.compute_delay_s": ("0.05", ()),
     "perception.tracking_rate_hz": ("5", (TRACK,)),
     "perception.people.waypoints_m": ("[[3, -8], [3, 0]]", (CROSSES,)),

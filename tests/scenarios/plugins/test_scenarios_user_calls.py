@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
-from sortie.policies import user_calls
 from sortie.policies.contract import FleetView, PolicyError
 from sortie.policies.registry import parameters, resolve, viewpoint_of
-from sortie.policies.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, watched
 from sortie.policies.verification.conformance import conform, full_view
+from sortie.scenarios.plugins import user_calls
+from sortie.scenarios.plugins.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, watched
 
 POLICY = """
 import os, re, sys, time
@@ -65,7 +65,7 @@ def looks(view, *, rho=0.5):
     return []
 """
 ENDS = """
-from sortie.policies import user_calls
+from sortie.scenarios.plugins import user_calls
 from sortie.policies.registry import resolve
 user_calls.GRACE_S = 0.3
 user_calls.end_when_stuck()

@@ -1,0 +1,92 @@
+"""Models in a user's files fly in a sortie: they act, they are named in the record, and their errors are of one line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sim_examples import example
+
+from sortie.scenarios.errors import SortieError
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.outcome import outcome
+
+SOURCE = Path(__file__).parent / "own_models.py"
+
+
+@pytest.fixture
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The file of models in a folder of its own, which is the working folder."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SOURCE, tmp_path / "mine.py")
+    return "mine.py"
+
+
+def fly(*overrides: str, seed: int = 1) -> dict[str, Any]:
+    return outcome(run_sortie(example("duration_s=3", *overrides), seed=seed))
+
+
+def test_power_of_ones_own_is_what_the_ledger_books(models: str) -> None:
+    own = fly(f"fleet.airframe.power_model={models}:constant")
+    scenario = example("duration_s=3")
+    drones, efficiency = scenario.fleet.drones, scenario.fleet.battery.drivetrain_efficiency
+    assert own["energy_j"]["rotor"] == pytest.approx(drones * 3 * 300.0 / efficiency)
+    more = fly(f"fleet.airframe={{power_model: '{models}:constant', power_params: {{power_w: 150}}}}")
+    assert more["energy_j"]["rotor"] == pytest.approx(own["energy_j"]["rotor"] / 2)
+
+
+def test_makes_fly_power_models_of_their_own(models: str) -> None:
+    plain = fly()
+    own = fly(f"fleet.makes=[{{name: mine, drones: [1], airframe: {{power_model: '{models}:constant'}}}}]")
+    assert own["own_files"].keys() == {models}
+    assert own["drones"]["0"]["energy_j"] == pytest.approx(plain["drones"]["0"]["energy_j"], rel=1e-3)
+    assert own["drones"]["1"]["energy_j"] > 1.2 * plain["drones"]["1"]["energy_j"]
+
+
+def test_a_detector_of_ones_own_is_scored_and_named(models: str) -> None:
+    own = fly(f"perception.detector={models}:Omniscient")
+    assert own["ap50"]["full_scene"] == 1.0
+    assert (own["ap50"]["detector"], own["ap50"]["fusion"]) == (f"{models}:Omniscient", None)
+    assert own["own_files"].keys() == {models}
+    blind = fly(f"perception={{detector: '{models}:Omniscient', detector_params: {{finds: false}}}}")
+    assert blind["ap50"]["full_scene"] == 0.0
+
+
+def test_the_same_seed_gives_the_same_record(models: str) -> None:
+    first, again, other = (fly(f"radio.link={models}:Noisy", seed=seed) for seed in (1, 1, 2))
+    assert first["fingerprint"] == again["fingerprint"] != other["fingerprint"]
+
+
+def test_an_edited_file_has_another_digest(models: str) -> None:
+    first = fly(f"radio.link={models}:Noisy")
+    with Path(models).open("a") as file:
+        file.write("\n# edited\n")
+    assert fly(f"radio.link={models}:Noisy")["own_files"] != first["own_files"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("radio.link=mine.py:Raises", r"^link Raises.snr_db: ZeroDivisionError: division by zero \(mine.py, line \d+\)$"),
+        ("radio.link=mine.py:Exits", r"^link Exits.snr_db: ProgramExitError: exit code 0, must return \(mine.py, line \d+\)$"),
+        ("radio.link=mine.py:Noisy3", r"^link file 'mine.py' has no function or class 'Noisy3'$"),
+        ("radio.link=mine.py:constant", r"^link constant: TypeError: "),
+        ("perception.detector=mine.py:Half", r"^detector mine.py:Half has no 'truth', must have detect, truth, count_boxes, camera_views$"),
+        ("perception.detector=mine.py:Short", r"^detector mine.py:Short: detect returns \[\], must be Boxes for each of the jobs$"),
+        ("fleet.airframe.power_model=mine.py:negative", r"^power negative: returns -1 W, must be finite and ≥ 0$"),
+        ("fleet.airframe.power_model=mine.py:scalar", r"^power scalar: returns shape \(\), must be \(30, \d\)$"),
+    ],
+)  # fmt: skip
+def test_what_a_model_does_wrong_is_told_in_one_line(setting: str, message: str, models: str) -> None:
+    with pytest.raises(SortieError, match=message):
+        fly(setting)
+
+
+def test_a_link_model_that_hangs_ends_by_the_limit_of_a_call(models: str) -> None:
+    with pytest.raises(
+        SortieError,
+        match=r"^link Hangs.snr_db: TookTooLongError: no answer within 0.2 s \(limits.decision_s\) \(mine.py, line \d+\)$",
+    ):
+        fly(f"radio.link={models}:Hangs", "limits.decision_s=0.2")
