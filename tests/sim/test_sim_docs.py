@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,6 @@ import typer
 from places import ROOT
 from typer.testing import CliRunner
 
-from sortie.perception.detectors import DETECTORS
 from sortie.policies.verification.conformance import conform
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
@@ -24,7 +24,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
 ]
-LANGUAGES = {"yaml", "python", "sh"}
+LANGUAGES = {"yaml", "python", "sh", "toml"}
 
 
 class Example(NamedTuple):
@@ -50,8 +50,6 @@ def test_every_example_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.syspath_prepend(tmp_path)
     for page_s_own in re.findall(r"^# file: (\w+)\.py$", page.read_text("utf-8"), re.M):
         monkeypatch.delitem(sys.modules, page_s_own, raising=False)  # and forgotten again after the test
-    for name, kind in list(DETECTORS.items()):
-        monkeypatch.setitem(DETECTORS, name, kind)
     for language, text, line in examples(page):
         assert language in LANGUAGES, f"{page.name}:{line}: an example in {language or 'no language'} is not executed"
         named = re.match(r"# file: (\S+)\n", text)
@@ -65,12 +63,14 @@ def test_every_example_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: p
                 assert said.exit_code == 0, f"{page.name}:{line}: {command}\n{said.output}\n{said.exception}"
         elif language == "python" and named is None:
             exec(compile(text, f"{page.name}:{line}", "exec"), {"__name__": "example"})  # noqa: S102 - our own pages
+        elif language == "toml":
+            tomllib.loads(text)
         elif language == "yaml":
             load(str(tmp_path / named[1]) if named is not None else text)
 
 
 def test_the_guide_is_there_and_has_examples() -> None:
-    assert [p.stem for p in GUIDE] == ["README", "detector", "link_model", "policy", "scenario"]
+    assert [p.stem for p in GUIDE] == ["README", "detector", "link_model", "policy", "power_model", "scenario"]
     assert sum(len(examples(p)) for p in GUIDE) >= 12
 
 
