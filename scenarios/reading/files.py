@@ -27,7 +27,8 @@ MODELS = {
     "fleet.airframe.power_model": "power",
     "policy.name": "policy",
 }
-"""The kind of model that a field names. Makes name policies and power models too, and changes of policy name policies."""
+"""The kind of model that a field names. Makes name policies and power models too, changes of policy name
+policies, and events of kind `own` name events."""
 
 
 def builtin(field: str) -> tuple[str, ...]:
@@ -96,6 +97,8 @@ def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
         yield from (("power", *at) for at in _given(make, ("airframe.power_model",)))
     for change in sections.get("policy", {}).get("changes", ()):
         yield "policy", change, "name"
+    for event in sections.get("events", ()):
+        yield from (("event", *at) for at in _given(event, ("model",)))
 
 
 def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[dict[str, Any], str]]:

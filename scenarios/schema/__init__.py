@@ -20,6 +20,7 @@ from sortie.scenarios.schema.events import (
     Jam,
     Lie,
     LinkDrop,
+    Own,
     Spoof,
 )
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
@@ -73,6 +74,7 @@ __all__ = [
     "Lie",
     "Limits",
     "LinkDrop",
+    "Own",
     "MIN_TILE_BYTES",
     "Mission",
     "Motion",

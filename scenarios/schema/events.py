@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sortie.scenarios.schema.base import DroneId, Section
+from sortie.scenarios.schema.base import DroneId, ModelName, Params, Section
 
 
 class BaseEvent(Section):
@@ -95,6 +95,13 @@ class Lie(BaseEvent):
     )
 
 
+class Own(BaseEvent):
+    kind: Literal["own"]
+    model: Annotated[str, ModelName("event")] = Field(description="The event's class (docs/guide/event.md).")
+    params: Params = Field({}, description="Its keyword arguments.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+
+
 Event = Annotated[
     LinkDrop
     | Jam
@@ -107,6 +114,7 @@ Event = Annotated[
     | ClockDrift
     | GnssLoss
     | Spoof
-    | Lie,
+    | Lie
+    | Own,
     Field(discriminator="kind"),
 ]

@@ -15,7 +15,7 @@ from sortie.scenarios.reading.load import campaigns, library, load
 from sortie.scenarios.schema import json_schema
 from sortie.sim.cli.console import out
 
-WHAT = "policies, scenarios, campaigns, detectors, fusions, path_loss, link, power"
+WHAT = "policies, scenarios, campaigns, detectors, fusions, path_loss, link, power, event"
 
 
 def list_(
@@ -44,8 +44,8 @@ def list_(
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
         _installed("detector")
-    elif what in MODELS.values():
-        for name in next(builtin(field) for field, kind in MODELS.items() if kind == what):
+    elif what in (*MODELS.values(), "event"):
+        for name in next((builtin(field) for field, kind in MODELS.items() if kind == what), ()):
             out.print(f"[bold]{name}[/bold]", soft_wrap=True)
         _installed(what)
     elif what == "fusions":

@@ -25,11 +25,13 @@ from sortie.scenarios.schema import (
     Jam,
     Lie,
     LinkDrop,
+    Own,
     Scenario,
     Spoof,
 )
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.membership import Membership
+from sortie.sim.engine.own_events import OwnEvents
 from sortie.sim.engine.own_state import whom
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import World, at, with_frame
@@ -43,21 +45,28 @@ def group_key(seed: int) -> bytes:
 
 
 def schedule(
-    scenario: Scenario, world: World, transport: Transport, membership: Membership, *, seed: int, replication: int
+    scenario: Scenario,
+    world: World,
+    transport: Transport,
+    membership: Membership,
+    own: OwnEvents,
+    *,
+    seed: int,
+    replication: int,
 ) -> None:
     """Put every event of the scenario on the clock; call once, before anything else is scheduled.
 
     Events and their ends come before the frame that begins at the same instant.
     """
     begins = [
-        _Begin(scenario, world, transport, membership, e, index, seed, replication)
+        _Begin(scenario, world, transport, membership, own, e, index, seed, replication)
         for index, e in enumerate(scenario.events)
     ]
     for begin in begins:
         at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
     for begin in begins:
         event = begin.event
-        if isinstance(event, LinkDrop | Jam | Lie | GnssLoss) and event.until_s is not None:
+        if isinstance(event, LinkDrop | Jam | Lie | GnssLoss | Own) and event.until_s is not None:
             at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
 
 
@@ -70,13 +79,14 @@ class _Begin:
         world: World,
         transport: Transport,
         membership: Membership,
+        own: OwnEvents,
         event: Event,
         index: int,
         seed: int,
         replication: int,
     ) -> None:
         self.scenario, self.world, self.transport, self.event = scenario, world, transport, event
-        self.membership = membership
+        self.membership, self.own = membership, own
         self.index, self.seed, self.replication = index, seed, replication
 
     def __call__(self) -> None:
@@ -117,6 +127,8 @@ class _Begin:
                     world.note(drone, *world.own[drone].begin(event, self.index, env.now))
                 if not isinstance(event, Lie):
                     world.read_clocks()
+            case Own():
+                self.own.begin(self.index, event.model)
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
@@ -132,6 +144,8 @@ class _Begin:
             case Jam():
                 del world.jammers[self.index]
                 world.note(-1, "jam_over", "the jammer is off")
+            case Own():
+                self.own.end(self.index, event.model)
             case GnssLoss() | Lie():
                 for drone in whom(event, self.scenario.fleet.drones):
                     world.note(drone, *world.own[drone].end(event, self.index, env.now))

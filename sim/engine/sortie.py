@@ -40,6 +40,7 @@ from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
+from sortie.sim.engine.own_events import OwnEvents
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
@@ -140,6 +141,7 @@ class Parts:
     world: World
     transport: Transport
     membership: Membership
+    own_events: OwnEvents
     choreography: Choreography | None
     """None where no policy chooses viewpoints."""
     pilots: Sequence[Pilot]
@@ -243,10 +245,11 @@ def build(
     if detector is not None:
         scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people)
     membership = Membership(scenario, world)
-    schedule(scenario, world, transport, membership, seed=seed, replication=replication)
+    own_events = OwnEvents(scenario, world, seed, replication)
+    schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
-        scenario, env, recorder, scene, batteries, air, world, transport, membership, choreography, pilots, agents, detector, scorer,
+        scenario, env, recorder, scene, batteries, air, world, transport, membership, own_events, choreography, pilots, agents, detector, scorer,
         audit, notes, journal,
     )  # fmt: skip
 
@@ -266,7 +269,7 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
     moves = [] if parts.choreography is None else [parts.choreography.renew]
-    world.start(each_second, [parts.membership.renew, *moves])
+    world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

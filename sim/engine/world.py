@@ -115,6 +115,8 @@ class World:
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
         """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
+        self.own_losses_db: dict[int, np.ndarray] = {}
+        """The same of events from outside, by their place in the scenario."""
         self.own, self.people = own, people
         self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
         self._scenario, self._recorder = scenario, recorder
@@ -168,7 +170,7 @@ class World:
             self.now = self.plan.at(env.now)
             for prepare in before_frame:
                 prepare(frame)
-            self.air.advance(self.extra_loss_db, list(self.jammers.values()))
+            self.air.advance(self._loss_db(), list(self.jammers.values()))
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
@@ -262,6 +264,10 @@ class World:
         loss[drone, others] += loss_db
         loss[others, drone] += loss_db
         self.extra_loss_db = loss if loss.any() else None
+
+    def _loss_db(self) -> np.ndarray | None:
+        given = [loss for loss in (self.extra_loss_db, *self.own_losses_db.values()) if loss is not None]
+        return np.sum(given, axis=0) if len(given) > 1 else given[0] if given else None
 
     def note(self, drone: int, kind: str, text: str) -> None:
         """Write an event down; drone −1 is the whole fleet."""

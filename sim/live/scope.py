@@ -15,6 +15,7 @@ from sortie.scenarios.schema import (
     Event,
     Jam,
     LinkDrop,
+    Own,
     Scenario,
     Spoof,
 )
@@ -73,5 +74,7 @@ def _why_not(event: Event, vehicles: Collection[int]) -> Iterator[str]:
             yield "spoof: no attacker joins the bus"
         case LinkDrop() | Jam():
             yield f"{event.kind}: it changes the replayed goodput alone, the bus loses nothing"
+        case Own():
+            yield "own: it acts on the simulated flight that is replayed, not on the bus"
         case DroneJoins() | DroneLeaves() | DroneLost() | BatteryFault() | CellFailure() if event.drone in vehicles:
             yield f"{event.kind}: drone {event.drone} does as its vehicle does"

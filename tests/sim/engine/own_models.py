@@ -81,3 +81,36 @@ class Omniscient(Half):
 class Short(Omniscient):
     def detect(self, jobs):
         return []
+
+
+class Storm:
+    """Weakens every link, jams, empties the battery of drone 1, and loses drone 2, as its parameters say."""
+
+    def __init__(self, rng, *, loss_db=20.0, jams=False, drains=0.0, loses=-1, wrong=""):
+        self.loss_db, self.jams, self.drains, self.loses, self.wrong = loss_db, jams, drains, loses, wrong
+        self.steps = []
+
+    def begin(self, fleet):
+        fleet.note("a storm")
+        if self.drains:
+            fleet.drain(1, self.drains)
+        if self.loses >= 0:
+            fleet.lose(self.loses, "hit by lightning")
+        if self.wrong == "loss":
+            fleet.set_loss_db(-1.0)
+        if self.wrong == "drone":
+            fleet.lose(99)
+
+    def step(self, fleet):
+        self.steps.append(fleet.t_s)
+        fleet.set_loss_db(self.loss_db)
+        if self.jams:
+            fleet.jam(fleet.positions_m.mean(axis=0), 20.0)
+
+    def end(self, fleet):
+        fleet.note(f"{len(self.steps)} frames from {self.steps[0]:g} s to {self.steps[-1]:g} s")
+
+
+class Calm(Storm):
+    def step(self, fleet):
+        self.steps.append(fleet.t_s)

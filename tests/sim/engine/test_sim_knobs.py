@@ -62,7 +62,8 @@ FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
 BURSTS = "radio.bursts.good_to_bad=0.3"
 LINKS = str(Path(__file__).parent / "links.csv")
 OWN = Path(__file__).parent / "own_models.py"
-WALL, NOISY, POWER, ALL_SEEN = (f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient"))
+WALL, NOISY, POWER, ALL_SEEN, STORM = (f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient", "Storm"))
+STORMS = f"events=[{{kind: own, at_s: 1, until_s: 4, model: '{STORM}'}}]"
 
 AT_2 = "policy.changes=[{at_s: 2, name: worst-2}]"
 IN_TRACK = "policy.changes=[{phase: track, name: worst-2}]"
@@ -302,6 +303,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "events.lost_fraction": ("0.2", (FAULT,)),
     "events.skew_s": ("-2", (SKEW,)),
     "events.drift_ppm": ("50000", (DRIFT,)),
+    "events.model": (f"{OWN}:Calm", (STORMS,)),
+    "events.params": ("{loss_db: 3}", (STORMS,)),
     "events.about": ("battery", (LIE,)),
     "events.claim": ("little", (LIE,)),
     "events.attack": ("oversized", (SPOOF,)),
@@ -402,7 +405,7 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     assert after.fingerprint != before.fingerprint
 
 
-@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW])
+@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW, STORMS])
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
     assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
 

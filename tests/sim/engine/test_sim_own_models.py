@@ -90,3 +90,55 @@ def test_a_link_model_that_hangs_ends_by_the_limit_of_a_call(models: str) -> Non
         match=r"^link Hangs.snr_db: TookTooLongError: no answer within 0.2 s \(limits.decision_s\) \(mine.py, line \d+\)$",
     ):
         fly(f"radio.link={models}:Hangs", "limits.decision_s=0.2")
+
+
+def storm(params: str = "{}", until: str = "until_s: 2") -> str:
+    return f"events=[{{kind: own, at_s: 1, {until}, model: 'mine.py:Storm', params: {params}}}]"
+
+
+def snr_db(*overrides: str) -> list[tuple[float, float]]:
+    busy = ("policy.name=all-4", "policy.params={}")
+    rows = run_sortie(example("duration_s=3", *busy, *overrides)).tables["transmissions"].to_pylist()
+    return [(row["t_sent_s"], row["snr_db"]) for row in rows]
+
+
+def mean_between(rows: list[tuple[float, float]], begin_s: float, end_s: float) -> float:
+    inside = [snr for t_s, snr in rows if begin_s <= t_s < end_s]
+    return sum(inside) / len(inside)
+
+
+def test_an_event_of_ones_own_acts_while_it_lasts(models: str) -> None:
+    plain, stormy = snr_db(), snr_db(storm())
+    for begin_s, end_s, loss_db in ((0.0, 0.8, 0.0), (1.2, 1.8, 20.0), (2.2, 3.0, 0.0)):
+        lost_db = mean_between(plain, begin_s, end_s) - mean_between(stormy, begin_s, end_s)
+        assert lost_db == pytest.approx(loss_db, abs=1.0), (begin_s, end_s)
+
+
+def test_its_jammer_goes_when_it_ends(models: str) -> None:
+    plain, jammed = snr_db(), snr_db(storm("{loss_db: 0, jams: true}"))
+    assert mean_between(plain, 1.2, 2.0) - mean_between(jammed, 1.2, 2.0) > 10.0
+    assert mean_between(plain, 2.2, 3.0) == pytest.approx(mean_between(jammed, 2.2, 3.0), abs=1.0)
+
+
+def test_it_is_called_once_a_frame_and_may_write_events(models: str) -> None:
+    texts = [event["text"] for event in fly(storm())["events"]]
+    assert texts == ["mine.py:Storm begins", "a storm", "10 frames from 1 s to 1.9 s", "mine.py:Storm ends"]
+
+
+def test_it_may_lose_a_drone_and_take_energy(models: str) -> None:
+    plain, hit = fly(), fly(storm("{loss_db: 0, drains: 0.5, loses: 2}"))
+    assert [hit["drones"][d]["airborne"] for d in ("0", "1", "2")] == [True, True, False]
+    assert hit["drones"]["1"]["soc"] < 0.6 * plain["drones"]["1"]["soc"]
+    assert "hit by lightning" in [event["text"] for event in hit["events"]]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("loss", r"^event mine.py:Storm: a loss of -1 dB, must be finite and ≥ 0$"),
+        ("drone", r"^event mine.py:Storm: drone 99, must be 0 … \d$"),
+    ],
+)
+def test_what_an_event_may_not_do_is_refused(wrong: str, message: str, models: str) -> None:
+    with pytest.raises(SortieError, match=message):
+        fly(storm(f"{{wrong: {wrong}}}"))

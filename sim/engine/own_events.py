@@ -1,0 +1,136 @@
+"""Events from outside: a user's class acts on the fleet from one moment to another, frame by frame."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, resolve
+from sortie.scenarios.schema import Own, Scenario
+from sortie.scenarios.streams import stream
+from sortie.sim.engine.world import World
+
+
+class OwnEvent(Protocol):
+    """An event of one's own. It is made with a numpy random generator; keyword-only arguments are its parameters.
+
+    It may also have `begin(fleet)` and `end(fleet)`, which are called once.
+    """
+
+    def step(self, fleet: FleetHandle) -> None:
+        """Called at the begin of each frame from `at_s` on and before `until_s`."""
+
+
+class FleetHandle:
+    """What an event of one's own sees of the fleet, and what it may do to it.
+
+    Attributes:
+        t_s: now.
+        frame_s: time between two frames.
+    """
+
+    def __init__(self, world: World, scenario: Scenario, event: Own, index: int) -> None:
+        self._world, self._event, self._index = world, event, index
+        self.frame_s = scenario.frame_s
+
+    @property
+    def t_s(self) -> float:
+        return float(self._world.env.now)
+
+    @property
+    def positions_m(self) -> NDArray[np.float64]:
+        """[N, 3], ENU: where the drones are."""
+        frame = min(int(self.t_s / self.frame_s + 1e-6), len(self._world.motion.position_m) - 1)
+        return np.array(self._world.motion.position_m[frame], dtype=float)
+
+    @property
+    def airborne(self) -> NDArray[np.bool_]:
+        """[N]: who flies."""
+        return np.array([drone.airborne for drone in self._world.drones])
+
+    def set_loss_db(self, loss_db: ArrayLike) -> None:
+        """Weaken links by this event, until the next call or its end: [N, N] dB, sender by receiver, or one number."""
+        n = len(self._world.drones)
+        given = np.broadcast_to(np.asarray(loss_db, dtype=float), (n, n)).copy()
+        np.fill_diagonal(given, 0.0)
+        if not np.isfinite(given).all() or (given < 0.0).any():
+            raise PluginError(f"event {self._event.model}: a loss of {given.min():g} dB, must be finite and ≥ 0")
+        self._world.own_losses_db[self._index] = given
+
+    def jam(self, position_m: tuple[float, float, float] | None, power_dbm: float = 20.0) -> None:
+        """Put this event's jammer somewhere, ENU, or turn it off (None)."""
+        if position_m is None:
+            self._world.jammers.pop(self._index, None)
+            return
+        x_m, y_m, z_m = map(float, position_m)
+        if not np.isfinite([x_m, y_m, z_m, power_dbm]).all():
+            raise PluginError(f"event {self._event.model}: a jammer of {power_dbm} dBm at {position_m}, must be finite")
+        self._world.jammers[self._index] = ((x_m, y_m, z_m), float(power_dbm))
+
+    def drain(self, drone: int, lost_fraction: float) -> None:
+        """Take a fraction of the energy that a drone's battery has left."""
+        self._check(drone)
+        if not 0.0 < lost_fraction <= 1.0:
+            raise PluginError(f"event {self._event.model}: lost_fraction is {lost_fraction}, must be > 0 and ≤ 1")
+        self._world.drain()
+        if self._world.drones[drone].airborne:
+            self._world.batteries.fault(drone, lost_fraction)
+            self._world.ground_landed()
+
+    def lose(self, drone: int, text: str = "fell silent") -> None:
+        """Take a drone out of the air."""
+        self._check(drone)
+        self._world.drain()
+        if self._world.drones[drone].airborne:
+            self._world.remove(drone, "drone_lost", text)
+
+    def note(self, text: str, drone: int = -1) -> None:
+        """Write a line among the sortie's events; drone −1 is the whole fleet."""
+        self._world.note(drone, "own", text)
+
+    def _check(self, drone: int) -> None:
+        n = len(self._world.drones)
+        if not 0 <= drone < n:
+            raise PluginError(f"event {self._event.model}: drone {drone}, must be 0 … {n - 1}")
+
+
+class OwnEvents:
+    """The events from outside of one sortie."""
+
+    def __init__(self, scenario: Scenario, world: World, seed: int, replication: int) -> None:
+        """Raises:
+        PluginError: an event that is not there, does not load, or has no such parameter.
+        """
+        self._events: dict[int, tuple[Any, FleetHandle]] = {}
+        for index, event in enumerate(scenario.events):
+            if isinstance(event, Own):
+                rng = stream(seed, replication, index, "own event")
+                made = checked_call("event", resolve("event", event.model, event.params), rng)
+                self._events[index] = Guard("event", made, ("step",)), FleetHandle(world, scenario, event, index)
+        self._world, self._going = world, list[int]()
+
+    def begin(self, index: int, text: str) -> None:
+        """An event's time has come."""
+        event, fleet = self._events[index]
+        self._world.note(-1, "own", f"{text} begins")
+        self._going.append(index)
+        if hasattr(event, "begin"):
+            event.begin(fleet)
+
+    def end(self, index: int, text: str) -> None:
+        """It is over: its losses and its jammer are gone."""
+        event, fleet = self._events[index]
+        self._going.remove(index)
+        if hasattr(event, "end"):
+            event.end(fleet)
+        self._world.own_losses_db.pop(index, None)
+        self._world.jammers.pop(index, None)
+        self._world.note(-1, "own", f"{text} ends")
+
+    def step(self, frame: int) -> None:
+        """A frame begins."""
+        for index in self._going:
+            event, fleet = self._events[index]
+            event.step(fleet)
