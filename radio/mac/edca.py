@@ -27,8 +27,8 @@ CCA = 4_000
 EIFS_EXTRA = SIFS + 44_000
 """After a frame that could not be read: SIFS and an ack at 6 Mb/s, before the AIFS."""
 FAR = 1 << 62
-ACK, BLOCK_ACK, BLOCK_ACK_LONG, CONTROL = 28_000, 32_000, 40_000, 28_000
-"""At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request, RTS and CTS (24, 20 and 14 B)."""
+ACK, BLOCK_ACK, BLOCK_ACK_LONG, REQUEST_NS, CONTROL = 28_000, 32_000, 40_000, 32_000, 28_000
+"""At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request (24 B); RTS and CTS (20 and 14 B)."""
 GROUP_CURVE, CONTROL_CURVE = 12, 13
 """Packet error rates: of HE MCS 0 … 11, of group frames, of control frames at 24 Mb/s."""
 CONTROL_BYTES = 32.0
@@ -47,9 +47,9 @@ NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
     RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
     LOCK, LOCK_LINK, LOCK_AT, CANDIDATE, CANDIDATE_LINK, CANDIDATE_AT, SEGMENTS,
     IS_BUSY, SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
-    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB,
-) = range(50)  # fmt: skip
-STATION_COLUMNS = 50
+    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, DEAF,
+) = range(51)  # fmt: skip
+STATION_COLUMNS = 51
 
 # columns of a job
 (
@@ -71,8 +71,8 @@ FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 # totals
 G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS = range(5)
 
-F_SENSED, F_PREAMBLE, F_LEGACY_NOISE = range(3)
-"""Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz."""
+F_SENSED, F_PREAMBLE, F_LEGACY_NOISE, F_ENERGY = range(4)
+"""Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz; weakest energy."""
 
 # why a receiver did not hear a group frame, and that it did
 UNKNOWN, COLLISION_CONTEXT, COLLISION_DATA, HIDDEN, WEAK, HALF_DUPLEX, HEARD = range(7)
@@ -167,9 +167,10 @@ def plan_access(s, S, C):
 
 @part
 def sense(s, S, P, F):
+    """Whether the medium is busy; what began while a station itself was sending it notices by its energy alone."""
     if S[s, TX_END] != FAR:
         return True
-    return S[s, LOCK] >= 0 or P[s] >= F[F_SENSED]
+    return S[s, LOCK] >= 0 or P[s] >= F[F_ENERGY if S[s, DEAF] == 1 else F_SENSED]
 
 
 @part
@@ -331,6 +332,7 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
             if S[j, TX_END] != FAR:
                 WHY[k] = HALF_DUPLEX
                 continue
+            S[j, DEAF] = 0
             if S[j, LOCK] >= 0 and t - S[j, LOCK_AT] > CCA:
                 add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
                 if group:
@@ -488,9 +490,9 @@ def access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
     flow = J[job, FLOW]
     to = LI[flow, FLOW_TO]
     if S[s, REQUEST] == 1:
-        transmit(s, t, BLOCK_REQUEST, to, CONTROL, S, G)
+        transmit(s, t, BLOCK_REQUEST, to, REQUEST_NS, S, G)
         S[s, TX_NAV] = SIFS + answer_ns(s, S, C)
-        J[job, AIR_NS] += CONTROL + S[s, TX_NAV]
+        J[job, AIR_NS] += REQUEST_NS + S[s, TX_NAV]
         S[s, AWAITS] = BLOCK_REQUEST
         return True
     S[s, TX_MCS] = choose_mcs(flow, LI, ORDER, C)
@@ -724,6 +726,7 @@ def finish(
         TOUCH[touched] = j
         touched += 1
     S[s, TX_END] = FAR
+    S[s, DEAF] = 1
     account(t, G)
     G[G_GROUPS if kind == GROUP else G_OTHERS] -= 1
     for x in range(touched):
@@ -1121,7 +1124,7 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
     LIMITS = carray(pointer(at[44]), (mcs,), np.int64)
     ORDER = carray(pointer(at[45]), (flows, mcs), np.int64)
     C = carray(pointer(at[46]), (17,), np.int64)
-    F = carray(pointer(at[47]), (3,), np.float64)
+    F = carray(pointer(at[47]), (4,), np.float64)
     curves = carray(pointer(at[48]), (14, 3), np.float64)
     run(
         since,

@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 
 PREAMBLE_SINR_DB = 4.0
 """Below this ratio of signal to interference and noise, a preamble is not detected."""
+ENERGY_OVER_PREAMBLE_DB = 20.0
+"""A frame of which a station has missed the begin is sensed by its energy, if it is so much above the weakest preamble."""
 _NS = 1e-9
 _AHEAD_NS = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
@@ -568,7 +570,8 @@ def _tables(
         ints[column] = value
     legacy_noise = 20.0 / settings.bandwidth_mhz
     over_noise = 10.0 ** ((settings.preamble_detection_dbm - noise_dbm) / 10.0)
-    floats = np.array([over_noise, 10.0 ** (PREAMBLE_SINR_DB / 10.0), legacy_noise])
+    energy = over_noise * 10.0 ** (ENERGY_OVER_PREAMBLE_DB / 10.0)
+    floats = np.array([over_noise, 10.0 ** (PREAMBLE_SINR_DB / 10.0), legacy_noise, energy])
     tables = ints, floats, np.array(rates) * 1e-3, np.array(limits, np.int64)
     return tables, (used.index(names.index(settings.context_class)), used.index(names.index(settings.payload_class)))
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from sortie.radio.mac import edca
-from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frame_bytes, frames_exchanges, ppdu_s
+from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frame_bytes, frames_exchanges, legacy_ppdu_s, ppdu_s
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, saturation_mbps
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 from sortie.radio.mac.medium import Link, Medium
@@ -254,6 +254,35 @@ def test_hidden_senders_lose_and_rts_brings_most_of_it_back() -> None:
     assert cleared == pytest.approx(121.8, rel=0.05)  # ns-3 3.44
 
 
+@pytest.mark.parametrize(("power_dbm", "waits"), [(-61.0, True), (-63.0, False)])
+def test_after_its_own_frame_a_station_senses_by_energy_what_began_before(power_dbm: float, waits: bool) -> None:
+    """Its first frame begins with another's long one, whose preamble it misses; -62 dBm is 20 dB above the weakest preamble."""
+    power = np.full((4, 4), -50.0)
+    power[0, 2] = power_dbm
+    b = Bench(power, mcs=3)
+    b.run(0.5)
+    b.submit(0, 64, to=1)
+    b.announce(2)
+    b.announce(2)
+    b.run(1.0)
+    end_s = 0.5 + exchange_s(64, 3)
+    (first, _, _), (second, _, _) = b.heard
+    assert first < 0.5 + 2 * GROUP_S
+    assert (second > end_s) == waits
+
+
+def test_what_begins_later_is_sensed_by_its_preamble_again() -> None:
+    power = np.full((4, 4), -63.0)
+    b = Bench(power, mcs=3)
+    b.announce(0)
+    b.run(0.5)
+    b.submit(1, 64, to=3)
+    b.run(0.5 + GROUP_S)
+    b.announce(0)
+    b.run(1.0)
+    assert b.heard[1][0] > 0.5 + exchange_s(64, 3)
+
+
 def test_far_fleets_do_not_wait_for_each_other() -> None:
     power = np.full((4, 4), -50.0)
     power[:2, 2:] = power[2:, :2] = -95.0
@@ -265,6 +294,15 @@ def test_far_fleets_do_not_wait_for_each_other() -> None:
         b.run(3.0)
     done = [sum(b.medium.in_service(i).arrived_frames for i in (0, 2)) + b.arrived.sum() for b in (apart, together)]  # type: ignore[union-attr]
     assert done[0] > 1.9 * done[1]
+
+
+def test_control_frames_take_as_long_as_their_bytes_at_24_mbps() -> None:
+    durations = {
+        14: (edca.ACK, edca.CONTROL), 20: (edca.CONTROL,), 24: (edca.REQUEST_NS,), 32: (edca.BLOCK_ACK,),
+        56: (edca.BLOCK_ACK_LONG,),
+    }  # fmt: skip
+    for length, found in durations.items():
+        assert set(found) == {round(legacy_ppdu_s(length, 24.0) * 1e9)}
 
 
 # --- the queue -----------------------------------------------------------------------------------------

@@ -46,6 +46,33 @@ def test_a_run_that_takes_too_long_is_ended(capfd: pytest.CaptureFixture[str]) -
     assert "ns-3 with seed 1 took longer" in capfd.readouterr().err
 
 
+@needs_ns3
+def test_the_driver_lists_every_frame_on_the_air() -> None:
+    """One payload of 20 fragments over an idle medium, and a descriptor: their frames and answers, in order."""
+    plan = Plan(line(2), descriptors=[(0.2, 1, 208)], payloads=[(0.1, 0, 1, 20 * 1344)])
+    found = run_ns3(plan, 0.0, 0.4, rate="HeMcs7", exact=1, meet=1, frames=1)["frames"]
+    found = found[found["t_ns"] >= 0]
+    assert found["kind"].tolist() == ["QOSDATA", "CTL_BACKRESP", "QOSDATA"]
+    assert found["station"].tolist() == [0, 1, 1]
+    assert found["to"].tolist() == [1, 0, -1]
+    assert found["mpdus"].tolist() == [20, 1, 1]
+    assert found["ns"].tolist()[1:] == [32_000, 472_000]
+
+
+@needs_ns3
+@pytest.mark.slow
+def test_an_exact_receiver_does_not_forget_the_weaker_frame_that_came_first() -> None:
+    """Two far senders begin at once, time and again; the second frame at 1 is stronger by less than MCS 7 needs."""
+    at = line(4, 20.0)
+    payloads = [(0.05 + 0.01 * k + 1e-9, s, r, 13_440) for k in range(60) for s, r in ((0, 1), (3, 2))]
+    delivered = [
+        run_ns3(Plan(at, payloads=payloads), 0.0, 0.8, rate="HeMcs7", exact=exact, meet=1, frames=1)["frames"]
+        for exact in (0, 1)
+    ]
+    asked = [(frames["kind"] == "CTL_BACKREQ").sum() for frames in delivered]
+    assert asked[1] > asked[0]
+
+
 def _crashes_until(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """In place of the driver: a program that crashes with any other seed."""
     program = tmp_path / "driver"

@@ -92,7 +92,8 @@ def run_ns3(
         options: of the driver, such as `rate="HeMcs7"` or `rts=1`.
 
     Returns:
-        `data` (a row a payload), `descriptors` (a row a receiver), and the driver's totals.
+        `data` (a row a payload), `descriptors` (a row a receiver), and the driver's totals; with `frames=1` also
+        `frames`, a row a frame on the air.
 
     Raises:
         RuntimeError: every try crashed or took too long.
@@ -123,6 +124,8 @@ def run_ns3(
             raise RuntimeError(f"ns-3 failed {TRIES} times, the last one {why}")
         found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
         data, heard = pd.read_csv(at / "r.data.csv"), pd.read_csv(at / "r.bcast.csv")
+        if options.get("frames"):
+            found["frames"] = pd.read_csv(at / "r.frames.csv")
     data["delay"] = data["last"] - data["t"]
     data["ok"] = (data["got"] == data["fragments"]) & (data["delay"] <= FRAME_S + 1e-6)
     heard["ok"] = heard["delay"] >= 0.0
