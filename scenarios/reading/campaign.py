@@ -12,7 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.reading.files import found_beside
-from sortie.scenarios.reading.load import campaigns, condition_sets, library, load, read, tree, validated
+from sortie.scenarios.reading.load import (
+    Overrides,
+    campaigns,
+    condition_sets,
+    library,
+    load,
+    load_conditions,
+    read,
+    tree,
+    validated,
+)
 from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.reading.strict_yaml import read_scalar
 from sortie.scenarios.schema import Scenario
@@ -90,6 +100,22 @@ def load_campaign(path_or_name: str | Path) -> Study:
             made = validated(_put(resolved, name, as_node(value, at.source, at.line)), Scenario)
             drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
     return Study(campaign, base, columns, here, root, drones, phases)
+
+
+def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> None:
+    """Read a scenario, a campaign or a set of conditions, whichever the file is, to see whether it can be read.
+
+    Raises:
+        ScenarioError: with everything that is wrong in `issues`.
+    """
+    text, source = read(path_or_name)
+    root = tree(text, source)
+    if child(root, "campaign") is not None:
+        load_campaign(path_or_name)
+    elif child(root, "conditions") is not None and child(root, "name") is None:
+        load_conditions(path_or_name)
+    else:
+        load(path_or_name, overrides)
 
 
 def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

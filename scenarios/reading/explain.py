@@ -64,7 +64,10 @@ def _say(detail: ErrorDetails, node: Node, path: Path, root: Node, top: type[Bas
         return f"{context['value']}, must be {context['bound']}"
     if kind == "extra_forbidden":
         return f"unknown key, {_known(path, root, top)}"
-    if kind in ("missing", "union_tag_not_found"):
+    if kind == "union_tag_not_found":
+        kinds = [get_args(member.model_fields["kind"].annotation)[0] for member in candidates_at(path[:-1], root, top)]
+        return f"missing, must be {one_of(kinds)}"
+    if kind == "missing":
         return "missing, must be given"
     if kind == "literal_error":
         return f"{node.shown()}, must be {context['expected'].replace(chr(39), '')}{_meant(node, context['expected'])}"
@@ -185,22 +188,27 @@ def sections_of(annotation: Any) -> tuple[type[BaseModel], ...]:
 
 def section_at(path: Path, root: Node, top: type[BaseModel] = Scenario) -> type[BaseModel] | None:
     """The section of the schema that a mapping at `path` is held against."""
-    section: type[BaseModel] | None = top
+    node: Node | None = root
+    for part in path:
+        node = child(node, part) if node else None
+    return _of_kind(candidates_at(path, root, top), node)
+
+
+def candidates_at(path: Path, root: Node, top: type[BaseModel] = Scenario) -> tuple[type[BaseModel], ...]:
+    """The sections of the schema that a mapping at `path` may be held against, one for each kind."""
     node: Node | None = root
     candidates: tuple[type[BaseModel], ...] = (top,)
     keyed = False  # the next part is a key that the file chooses, as below `vary`
     for part in path:
+        section = None if keyed and isinstance(part, str) else _of_kind(candidates, node)
         node = child(node, part) if node else None
         if isinstance(part, str) and not keyed:
             field = section.model_fields.get(part) if section else None
             candidates = sections_of(field.annotation) if field else ()
             keyed = field is not None and get_origin(field.annotation) is dict
-            if keyed:
-                section = None
-                continue
-        keyed = False
-        section = _of_kind(candidates, node)
-    return section
+        else:
+            keyed = False
+    return candidates
 
 
 def _of_kind(candidates: Sequence[type[BaseModel]], node: Node | None) -> type[BaseModel] | None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +23,7 @@ from sortie.scenarios.reading.nodes import (
     as_node,
     assign,
     child,
+    dotted,
     nearest,
     plain,
     problems,
@@ -32,6 +36,9 @@ __all__ = ["Overrides", "ScenarioError", "build", "dump", "library", "load", "lo
 
 Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 1_000_000
+INSTANTS = (("events",), ("policy", "changes"), ("policy", "commands"), ("policy", "replays"))
+"""Lists of what is done at an instant, which must lie before the end."""
+_LOG = logging.getLogger("sortie")
 _LIBRARY = Path(__file__).parents[1] / "library"
 
 
@@ -76,13 +83,43 @@ def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
     for key, what, command in _OTHERS:
         if child(root, key) is not None and child(root, "name") is None:
             raise ScenarioError(f"{source}: is {what}, not a scenario; its command is: {command} {source}")
+    written = root
     if isinstance(overrides, Mapping):
         for key, value in overrides.items():
             root = _assigned(root, key, as_node(value, "overrides"), "overrides")
     else:
         for override in overrides:
             root = _override(root, override)
-    return validated(root, Scenario)
+    return validated(_shortened(root, written), Scenario)
+
+
+def _shortened(root: Node, written: Node) -> Node:
+    """Where an override sets `duration_s`, the tree without what the file does at instants after the end; a line says so."""
+    duration = child(root, "duration_s")
+    if duration is None or duration is child(written, "duration_s") or not isinstance(duration.value, int | float):
+        return root
+    for path in INSTANTS:
+        whole = functools.reduce(lambda node, part: node and child(node, part), path, root)
+        before = functools.reduce(lambda node, part: node and child(node, part), path, written)
+        if (
+            whole is None
+            or whole is not before
+            or not isinstance(whole.value, Sequence)
+            or isinstance(whole.value, str)
+        ):
+            continue
+        kept = [node for node in whole.value if not _begins_at(node) >= duration.value]
+        left = len(whole.value) - len(kept)
+        if left:
+            text = "%s: %d of %d begin at duration_s = %g or later, and are left out"
+            _LOG.warning(text, dotted(path), left, len(whole.value), duration.value)
+            root = assign(root, path, replace(whole, value=kept))
+    return root
+
+
+def _begins_at(node: Node) -> float:
+    at = child(node, "at_s")
+    return at.value if at is not None and isinstance(at.value, int | float) else -math.inf
 
 
 def read(path_or_name: str | Path, wanted: Mapping[str, Path] | None = None) -> tuple[str, str]:
@@ -223,9 +260,11 @@ def _without_presets(root: Node) -> Node:
 
 def _first(issues: Sequence[Issue]) -> ScenarioError:
     """The first issue in the file's order, `--set` last, and how many more there are."""
-    first = min(issues, key=lambda issue: (issue.node.line == 0, issue.node.line))  # min keeps the order of equals
-    more = f" (and {len(issues) - 1} more)" if len(issues) > 1 else ""
-    return ScenarioError(f"{first}{more}")
+    first, *others = sorted(
+        issues, key=lambda issue: (issue.node.line == 0, issue.node.line)
+    )  # keeps the order of equals
+    more = f" (and {len(others)} more)" if others else ""
+    return ScenarioError(f"{first}{more}", [first, *others])
 
 
 def _nearby(path: Path, wanted: Mapping[str, Path] | None) -> str:

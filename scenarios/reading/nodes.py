@@ -17,9 +17,23 @@ Path = tuple[str | int, ...]
 class ScenarioError(SortieError):
     """What is wrong with a scenario, in one line: `FILE:LINE: field.path: what, the value, the bound`."""
 
-    def __init__(self, line: str) -> None:
-        # one line whatever a broken file holds: control characters and odd spaces are escaped
-        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line))
+    def __init__(self, line: str, issues: Iterable[object] = ()) -> None:
+        """Args:
+        line: the message.
+        issues: all that is wrong; none says that the message is all.
+        """
+        super().__init__(_printable(line))
+        self._all = [*issues]
+
+    @property
+    def issues(self) -> tuple[str, ...]:
+        """Everything that is wrong, as far as it was found, a line each."""
+        return tuple(_printable(str(issue)) for issue in self._all) or (str(self),)
+
+
+def _printable(line: str) -> str:
+    """One line whatever a broken file holds: control characters and odd spaces are escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from sortie.sim.cli import (
     import_log,
     listing,
     live,
+    new,
     paper,
     recording,
     replay,
@@ -60,7 +61,7 @@ app.add_typer(recording.app, name="recording")
 app.add_typer(campaign.app, name="campaign")
 app.add_typer(study.study, name="study")
 COMMANDS: dict[str, Callable[..., None]] = {
-    "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_,
+    "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_, "new": new.new,
     "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,
     "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
     "replay": replay.replay, "import": import_log.import_log, "live": live.live,

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 import sortie
-from sortie.scenarios.reading.load import library
+from sortie.scenarios.reading.campaign import read_any
+from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
 from sortie.sim.cli import tables
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import SetOption
@@ -16,6 +17,13 @@ from sortie.sim.cli.options import SetOption
 def check(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario files, names or folders; all: the whole library.")],
     set_: SetOption = None,
+    syntax: Annotated[
+        bool,
+        typer.Option(
+            "--syntax",
+            help="Fly nothing: print everything that is wrong with the files of scenarios, campaigns and condition sets.",
+        ),
+    ] = False,
     update: Annotated[
         bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing with it.")
     ] = False,
@@ -23,6 +31,9 @@ def check(
     """Fly scenarios and compare their outcomes with their own expectations. Exit code 1 if one fails."""
     from sortie.sim.check.checking import flights
     from sortie.sim.check.discovery import scenario_files
+
+    if syntax:
+        return _check_syntax([*library(), *campaigns(), *condition_sets()] if scenarios == ["all"] else scenarios, set_)
 
     names = list(library()) if scenarios == ["all"] else [file for name in scenarios for file in scenario_files(name)]
     loaded = [(name, sortie.load(name, set_ or [])) for name in names]  # all of them, before the first one flies
@@ -40,3 +51,19 @@ def check(
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
         raise typer.Exit(1)
+
+
+def _check_syntax(files: list[str], overrides: list[str] | None) -> None:
+    """Print everything that is wrong with files, a line each. Exit code 1 if anything is."""
+    issues: list[str] = []
+    for file in files:
+        try:
+            read_any(file, overrides or ())
+        except ScenarioError as error:
+            issues += error.issues
+    for issue in issues:
+        out.print(issue, soft_wrap=True, markup=False, highlight=False)
+    if issues:
+        err.print(f"[red]{len(issues)} thing{'s are' if len(issues) > 1 else ' is'} wrong[/red]")
+        raise typer.Exit(1)
+    out.print(f"{len(files)} file{'s' if len(files) > 1 else ''} read, nothing is wrong")

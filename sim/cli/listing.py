@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from pydantic import BaseModel
 from rich.markup import escape
 
 from sortie.perception.detectors import DETECTORS
@@ -12,16 +13,27 @@ from sortie.policies.registry import POLICIES, missing_parts, parameters
 from sortie.scenarios.plugins.reference import installed
 from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load
-from sortie.scenarios.schema import json_schema
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.campaign import Campaign
+from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import out
 
 WHAT = "policies, scenarios, campaigns, detectors, fusions, path_loss, link, power, event"
 
 
+SCHEMAS: dict[str, type[BaseModel]] = {
+    "schema": Scenario,
+    "campaign_schema": Campaign,
+    "conditions_schema": ConditionSet,
+}
+"""For editors: `sortie list schema > sortie.schema.json`, and `# yaml-language-server: $schema=sortie.schema.json` as the
+first line of a file."""
+
+
 def list_(
     what: Annotated[
         str,
-        typer.Argument(help=f"What to list: {WHAT} or schema (JSON Schema)."),
+        typer.Argument(help=f"What to list: {WHAT}, or a JSON Schema: {', '.join(SCHEMAS)}."),
     ],
 ) -> None:
     """List policies, scenarios and other names that commands take."""
@@ -53,10 +65,10 @@ def list_(
 
         for name, fusion in FUSIONS.items():
             out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)
-    elif what == "schema":
-        out.print_json(data=json_schema())
+    elif what in SCHEMAS:
+        out.print_json(data=SCHEMAS[what].model_json_schema())
     else:
-        raise typer.BadParameter(f"{what!r}, must be {WHAT} or schema")
+        raise typer.BadParameter(f"{what!r}, must be {WHAT}, {', '.join(SCHEMAS)}")
 
 
 def _installed(kind: str) -> None:
