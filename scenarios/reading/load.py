@@ -99,8 +99,7 @@ def _shortened(root: Node, written: Node) -> Node:
     if duration is None or duration is child(written, "duration_s") or not isinstance(duration.value, int | float):
         return root
     for path in INSTANTS:
-        whole = functools.reduce(lambda node, part: node and child(node, part), path, root)
-        before = functools.reduce(lambda node, part: node and child(node, part), path, written)
+        whole, before = _at(root, path), _at(written, path)
         if (
             whole is None
             or whole is not before
@@ -115,6 +114,12 @@ def _shortened(root: Node, written: Node) -> Node:
             _LOG.warning(text, dotted(path), left, len(whole.value), duration.value)
             root = assign(root, path, replace(whole, value=kept))
     return root
+
+
+def _at(node: Node | None, path: Sequence[str]) -> Node | None:
+    for part in path:
+        node = None if node is None else child(node, part)
+    return node
 
 
 def _begins_at(node: Node) -> float:
