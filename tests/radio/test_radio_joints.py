@@ -254,11 +254,8 @@ def test_a_payload_has_no_more_hops_left_than_it_has_not_flown() -> None:
 def test_a_relayed_sample_takes_at_most_the_hops_that_a_route_may_have(tmp_path: Path) -> None:
     """Links that change while it is under way: each relay has only what is left, and then goes straight to the target."""
     n = 5
-    rows = []
-    for i in range(n):
-        for j in range(n):
-            if i != j:
-                rows.append(f"0,{i},{j},,,{ {1: 60.0, 2: 6.0, 3: 3.0, 4: 2.0}[abs(i - j)] }")
+    mbps = {1: 60.0, 2: 6.0, 3: 3.0, 4: 2.0}
+    rows = [f"0,{i},{j},,,{mbps[abs(i - j)]}" for i in range(n) for j in range(n) if i != j]
     flight = Hover(
         AirSettings(trace=trace(tmp_path, *rows), relay_max_hops=2), np.array([[20.0 * i, 0, 60] for i in range(n)])
     )

@@ -1,0 +1,609 @@
+"""The fleet's joints: which argument goes where, two options together, drones that are stale or gone, independent draws.
+
+Joints, each with a test below:
+
+1. A drone's own value and the fleet's: an override replaces its make's, a make's replaces the fleet's; none adds to another.
+2. Resistance, polarisation, cold, age and lost cells of a pack: each acts on each.
+3. A pack that a trace drives, and faults.
+4. Payload and airframe of each drone, in level flight and in climb.
+5. Where a drone is and where it believes it is: its coverage, its claims and its region of cells go by its belief.
+6. A drone's own cameras: footprint, view and capture.
+7. Two clocks that are off: ages of descriptors and payloads, whoever is ahead; a clock told anew goes on as it went.
+8. An older payload that comes after a newer one; one of a peer with another compute delay.
+9. A peer's slot in a list of all but oneself.
+10. Staleness and every field of a directive: representation, rate, weight, duty.
+11. Two links that differ in one field: each gets its own payload.
+12. A drone that leaves between its look and its sending, one that is on the ground, and one that comes back.
+13. What a drone believes: doubted peers count for nothing in coverage and views; the fleet's fall leaves out who is judged.
+
+Draws that must be independent: gusts, offsets, errors of position and heading, and clocks, of each drone and of each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+import simpy
+from fleet_examples import DESCRIPTOR
+from scipy.spatial.transform import Rotation
+
+from sortie.fleet.agent import Agent, Platform, Task
+from sortie.fleet.clock import WINDOW, Clock, oscillators
+from sortie.fleet.computer import Work, headrooms
+from sortie.fleet.coverage import Poses, View, cameras_of, footprint_radius_m, views
+from sortie.fleet.energy.battery import RECORDED, FleetBatteries
+from sortie.fleet.energy.cell import energy_fraction, open_circuit_cell_v, resistance_factor
+from sortie.fleet.energy.recorded import BatteryTrace
+from sortie.fleet.flight.motion import fly
+from sortie.fleet.flight.rotor import climb_power_w, fleet_power_w, momentum_power_w, rotor_power_w
+from sortie.fleet.gate import Gate, Payload
+from sortie.fleet.memory import PeerMemory, Received
+from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, equipment_of
+from sortie.fleet.probes import Probes
+from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
+from sortie.fleet.trust import judge
+from sortie.perception.geometry import USUAL
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Boxes, Capture
+from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, TaskPhase
+from sortie.scenarios.link_state import heard_share
+from sortie.scenarios.reading.load import loads
+from sortie.scenarios.schema import (
+    Airframe,
+    Battery,
+    Clocks,
+    Computer,
+    DroneOverride,
+    Fleet,
+    Polarisation,
+    Scenario,
+    Scene,
+)
+
+PLAIN = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, (-100.0, -100.0, 100.0, 100.0))
+
+
+def scenario(text: str) -> Scenario:
+    return loads(f"name: joints\nduration_s: 4\n{text}")
+
+
+# --- one value in place of another -------------------------------------------------------------------
+
+
+def test_an_override_stands_in_place_of_the_value_of_its_make_and_of_the_fleet() -> None:
+    """Of every field; drones that it does not name keep theirs, and so do other fields."""
+    fleet = scenario(
+        """
+fleet:
+  airframe: {payload_kg: 0.3}
+  battery: {initial_soc: 0.9, capacity_wh: 100, cell_resistance_mohm: 20, cycles: 50}
+  makes: [{name: heavy, drones: [1, 2], airframe: {payload_kg: 0.7, mass_kg: 3}, battery: {initial_soc: 0.8, capacity_wh: 200}}]
+  overrides:
+    - {drone: 0, payload_kg: 0.1, initial_soc: 0.5}
+    - {drone: 1, payload_kg: 0.0, capacity_wh: 60, cell_resistance_mohm: 5}
+    - {drone: 3, cycles: 100}
+"""
+    ).fleet
+    assert [a.payload_kg for a in fleet.airframes] == [0.1, 0.0, 0.7, 0.3, 0.3]
+    assert [a.mass_kg for a in fleet.airframes] == [2.04, 3, 3, 2.04, 2.04]
+    packs = FleetBatteries(fleet.batteries, fleet.overrides, 5)
+    assert packs.soc == [0.5, 0.8, 0.8, 0.9, 0.9]
+    aged = [1 - 0.2 * cycles / 300 for cycles in (50, 0, 0, 100, 50)]
+    full_wh = [100 * aged[0], 60, 200, 100 * aged[3], 100 * aged[4]]
+    for drone, (wh, soc) in enumerate(zip(full_wh, packs.soc, strict=True)):
+        assert packs.energy_left_j[drone] == pytest.approx(wh * 3600 * float(energy_fraction(soc)))
+
+
+def test_zero_is_a_value_of_a_make_and_not_a_missing_one() -> None:
+    made = scenario(
+        """
+fleet:
+  makes: [{name: quick, drones: [1], compute_delay_s: 0, tx_power_dbm: 0, altitude_offset_m: 0, feature_space: "", policy_params: {}}]
+perception: {detector: none, compute_delay_s: 0.04}
+"""
+    )
+    assert made.compute_delays_s == (0.04, 0.0, 0.04, 0.04, 0.04)
+    assert [e.compute_delay_s for e in equipment_of(made).values()] == [0.04, 0.0, 0.04, 0.04, 0.04]
+
+
+# --- packs ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("cold", "cycles", "polarised"), list(product([None, -10.0], [0.0, 150.0], [0.0, 4.0])))
+def test_cold_and_age_act_on_both_parts_of_the_resistance(cold: float | None, cycles: float, polarised: float) -> None:
+    """Voltage of a loaded pack once polarisation has settled: both resistances times the factors of cold and of age."""
+    pack = Battery(
+        cell_resistance_mohm=6, ambient_c=cold, cycles=cycles, capacity_wh=5000,
+        polarisation=Polarisation(resistance_mohm=polarised, time_s=0.05),
+    )  # fmt: skip
+    packs = FleetBatteries(pack, (), 1)
+    for _ in range(12):
+        packs.step(0.1, [170.0], [0.0], [0.0])
+    worn = 1 + cycles / 300
+    factor = resistance_factor(packs.temperature_c[0] if cold is not None else 25.0)
+    open_v = 4 * float(open_circuit_cell_v(packs.soc[0]))
+    drop_v = packs.current_a[0] * 4 * (6 + polarised) / 1000 * worn * factor
+    assert packs.voltage_v[0] == pytest.approx(open_v - drop_v, abs=2e-3)
+    assert drop_v > 0.3
+
+
+def test_a_lost_cell_takes_its_voltage_energy_and_both_resistances() -> None:
+    """A pack of four that loses one is a pack of three in the same state."""
+    of = Battery(cell_resistance_mohm=15, capacity_wh=120, polarisation=Polarisation(resistance_mohm=5, time_s=1))
+    four = FleetBatteries(of, (), 1)
+    four.drop_cell(0)
+    three = FleetBatteries(of.model_copy(update={"cells": 3, "capacity_wh": 90.0}), (), 1)
+    for _ in range(50):
+        for packs in (four, three):
+            packs.step(0.1, [120.0], [0.5], [0.1])
+        assert four.voltage_v[0] == pytest.approx(three.voltage_v[0], rel=1e-9)
+        assert four.current_a[0] == pytest.approx(three.current_a[0], rel=1e-9)
+        assert four.soc[0] == pytest.approx(three.soc[0], rel=1e-9)
+    assert four.energy_left_j[0] == pytest.approx(three.energy_left_j[0])
+
+
+def test_a_fault_of_a_traced_pack_stays() -> None:
+    """Half is gone at once; from then on the trace's fall is of the half that is left."""
+    soc = [0.9, 0.8]
+    energy = [float(energy_fraction(s)) for s in soc]
+    trace = BatteryTrace([0.0, 10.0], soc, energy, [], [], [], [])
+    packs = FleetBatteries(Battery(capacity_wh=100), (), 1, {0: trace})
+    packs.step(5.0, [0.0], [0.0], [0.0])
+    half = packs.energy_left_j[0] / 2
+    packs.fault(0, 0.5)
+    assert packs.energy_left_j[0] == pytest.approx(half)
+    packs.step(5.0, [0.0], [0.0], [0.0])
+    assert packs.energy_left_j[0] == pytest.approx(360_000 * energy[1] / 2)
+    assert packs.energy_j["fault"][0] == pytest.approx(half)
+    assert packs.spent_j[0] == pytest.approx(360_000 * (energy[0] - energy[1] / 2))
+    assert packs.energy_j[RECORDED][0] == pytest.approx(packs.spent_j[0] - half)
+
+
+def test_who_is_on_the_ground_draws_nothing_and_takes_off_with_what_is_left() -> None:
+    packs = FleetBatteries(Battery(), (), 2)
+    packs.step(1.0, [170.0] * 2, [1.0] * 2, [1.0] * 2)
+    packs.land(0, "told to")
+    left, spent = packs.energy_left_j[0], packs.spent_j[0]
+    packs.step(1.0, [170.0] * 2, [1.0] * 2, [1.0] * 2)
+    assert (packs.energy_left_j[0], packs.spent_j[0], packs.current_a[0]) == (left, spent, 0.0)
+    assert packs.voltage_v[0] == pytest.approx(4 * float(open_circuit_cell_v(packs.soc[0])), abs=1e-3)
+    packs.take_off(0)
+    packs.step(1.0, [170.0] * 2, [1.0] * 2, [1.0] * 2)
+    assert packs.energy_left_j[0] < left
+
+
+@pytest.mark.parametrize("model", ["level", "momentum"])
+def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb(model: Any) -> None:
+    frame = Airframe(power_model=model)
+    fleet = Fleet(
+        airframe=frame, drones=4, overrides=tuple(DroneOverride(drone=i, payload_kg=0.4 * i) for i in range(4))
+    )
+    motion = fly(fleet, 6.0, 0.1, 1)
+    power_w = fleet_power_w(fleet, motion)
+    assert (motion.velocity_mps[..., 2] > 0.05).any()
+    for drone in range(4):
+        own = frame.model_copy(update={"payload_kg": 0.4 * drone})
+        if model == "momentum":
+            wanted = momentum_power_w(
+                motion.velocity_mps[:, drone] - motion.wind_mps[:, drone], motion.acceleration_mps2[:, drone], own
+            )
+        else:
+            wanted = rotor_power_w(motion.air_speed_mps[:, drone], own)
+            wanted = wanted + climb_power_w(motion.velocity_mps[:, drone, 2], own)
+        np.testing.assert_allclose(power_w[:, drone], wanted, rtol=1e-9)
+
+
+def test_headrooms_count_looks_maps_decisions_and_bytes() -> None:
+    """By hand: each alone, and together."""
+    computer = Computer(cpu_cores=4, decision_s=0.01, payload_mbps=100.0, driving_cores=2.0, fusion_s=0.02)
+    before = Work(5, 5, 5, 5)
+    cases = [
+        (Work(15, 5, 5, 5), 1 - 2 * 10 * 0.03 / 8, 1 - 0.3 / 2),  # ten looks of 30 ms in 2 s, four cores
+        (Work(5, 15, 5, 5), 1 - 2 * 10 * 0.02 / 8, 1 - 0.2 / 2),  # ten maps
+        (Work(5, 5, 15, 5), 1 - 10 * 0.01 / 8, 1.0),
+        (Work(5, 5, 5, 5_000_005), 1 - 40.0 / 100.0 / 8, 1.0),  # 40 Mb
+        (Work(15, 15, 15, 5_000_005), 1 - (2 * 0.5 + 0.1 + 0.4) / 8, 1 - 0.5 / 2),
+    ]
+    for after, cpu, gpu in cases:
+        assert headrooms(computer, 0.03, before, after, 2.0) == pytest.approx((cpu, gpu))
+
+
+# --- where a drone believes it is -------------------------------------------------------------------------
+
+
+def test_coverage_follows_from_where_a_drone_believes_it_is() -> None:
+    """On a plain, where it truly is does not matter; where it believes it is moves the cells with it."""
+    level = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (1, 1, 4))
+    believed, heading = np.array([[[31.0, -17.0, 60.0]]]), np.zeros((1, 1))
+
+    def view(true_m: Sequence[float], est_m: np.ndarray) -> View:
+        at = np.array([[[*true_m, 60.0]]])
+        ((seen,),) = views(Poses(at, level, heading, est_m, heading), PLAIN.height_field)
+        return seen
+
+    here = view((31.0, -17.0), believed)
+    assert view((34.0, -14.0), believed) == here
+    assert view((25.0, -19.0), believed) == here
+    east = view((31.0, -17.0), believed + np.array([12.8, 0.0, 0.0]))
+    assert (east.row, east.column, east.grid) == (here.row, here.column + 1, here.grid)
+    north = view((31.0, -17.0), believed + np.array([0.0, 2 * 12.8, 0.0]))
+    assert (north.row, north.column, north.grid) == (here.row + 2, here.column, here.grid)
+
+
+def test_a_heading_error_turns_what_a_drone_believes_it_sees() -> None:
+    """A drone that truly flies east and believes to fly north claims what one that flies north sees."""
+    at, est = np.array([[[3.0, 4.0, 60.0]]]), np.array([[[3.0, 4.0, 60.0]]])
+
+    def view(true_rad: float, est_rad: float) -> View:
+        q = Rotation.from_euler("z", true_rad).as_quat()[None, None]
+        ((seen,),) = views(
+            Poses(at, q, np.array([[true_rad]]), est, np.array([[est_rad]])), PLAIN.height_field
+        )  # fmt: skip
+        return seen
+
+    assert view(0.0, 1.0) == view(1.0, 1.0) != view(0.0, 0.0)
+
+
+def test_every_drone_senses_with_its_own_cameras() -> None:
+    fleet = scenario(
+        "fleet: {drones: 3, makes: [{name: wide, drones: [1], camera: {field_of_view_deg: 100}, altitude_offset_m: 20}]}"
+    ).fleet
+    motion = fly(fleet, 4.0, 0.1, 1)
+    cameras = cameras_of(fleet)
+    assert cameras[1].field_of_view_deg == 100
+    assert cameras[0] == cameras[2] == USUAL
+    senses = FlightSenses(motion, 0.1, PLAIN.height_field, cameras)
+    for frame in (0, 5, 35):
+        for drone, sensed in enumerate(senses.at(frame)):
+            z_m = motion.est_position_m[frame, drone, 2]
+            assert sensed.capture.cameras == cameras[drone]
+            assert sensed.footprint_radius_m == pytest.approx(footprint_radius_m(z_m, cameras[drone]))
+            assert sensed.capture.position_m == tuple(motion.position_m[frame, drone])
+            assert sensed.capture.est_position_m == tuple(motion.est_position_m[frame, drone])
+            assert sensed.capture.est_yaw_rad == motion.est_yaw_rad[frame, drone]
+            assert sensed.velocity_mps == tuple(motion.velocity_mps[frame, drone])
+            assert sensed.capture.t_s == pytest.approx(0.1 * frame)
+    tan = math.tan(math.radians(50)) / math.tan(math.radians(35))
+    assert senses.at(0)[1].footprint_radius_m == pytest.approx(
+        80 / 60 * tan * senses.at(0)[0].footprint_radius_m, rel=0.05
+    )
+
+
+# --- clocks -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rate", "growth"), [(0.0, 0.0), (40.0, 0.0), (-30.0, 900.0)])
+def test_a_clock_told_anew_goes_on_as_it_went(rate: float, growth: float) -> None:
+    clock = Clock(0.2, 3.0, rate, growth)
+    for t_s in (3.0, 50.0, 400.0):
+        for later_s in (t_s, t_s + 1.0, t_s + 500.0):
+            assert clock.at(t_s).error_s(later_s) == pytest.approx(clock.error_s(later_s), abs=1e-12)
+            assert clock.at(t_s).at(t_s + 7).error_s(later_s + 9) == pytest.approx(
+                clock.error_s(later_s + 9), abs=1e-12
+            )
+
+
+RULES = PlaneRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04, trust=True)
+
+
+def memory(drone: int = 0, **changes: Any) -> PeerMemory:
+    rules = PlaneRules(**{f: getattr(RULES, f) for f in RULES.__dataclass_fields__} | changes)
+    return PeerMemory(drone, rules, DroneStatus())
+
+
+def descriptor(agent_id: int, t_s: float = 0.0, **changes: Any) -> Descriptor:
+    return DESCRIPTOR._replace(agent_id=agent_id, stamp_ns=round(t_s * 1e9), **changes)
+
+
+def capture(drone: int, t_s: float) -> Capture:
+    return Capture(drone, t_s, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 60.0), 0.0)
+
+
+def payload(size: int = 20_000, rung: Representation = Representation.FEATURES) -> Payload:
+    return Payload(rung, 0.1, None, 1.0, 100, 0, 0, size)
+
+
+@pytest.mark.parametrize("mine_s", [0.0, 3.0, -2.0])
+@pytest.mark.parametrize("theirs_s", [0.0, 5.0, -4.0])
+def test_ages_are_true_whoever_s_clock_is_off(mine_s: float, theirs_s: float) -> None:
+    """Once the peer's clock is known: within half a frame, of descriptors and payloads, and never below the time since they came."""
+    mine = memory()
+    mine.status.clock_skew_s = mine_s
+    for k in range(WINDOW + 2):
+        t_s = 0.1 * k
+        d = descriptor(1, t_s + theirs_s)
+        mine.clocks.heard(1, t_s + 0.03 + mine_s - d.stamp_ns * 1e-9)
+        mine.hold(d, t_s + 0.03)
+    last_s = 0.1 * (WINDOW + 1)
+    now_s = last_s + 0.4
+    assert mine.ages_s(now_s)[1] == pytest.approx(0.4, abs=0.051)
+    assert mine.ages_s(now_s)[1] >= 0.37 - 1e-9
+    assert mine.ages_s(last_s + 0.03)[1] >= 0.0
+    assert mine.in_own_time(1, last_s + theirs_s) == pytest.approx(last_s, abs=0.051)
+    came = Received(capture(1, last_s), payload(), last_s + 0.06, last_s + theirs_s)
+    assert mine.payload_age_s(came, now_s) == pytest.approx(0.4, abs=0.051)
+    assert mine.payload_age_s(came, now_s) >= 0.34 - 1e-9
+    late = Received(capture(1, last_s), payload(), now_s, last_s + 100.0)  # a stamp of the future
+    assert mine.payload_age_s(late, now_s + 0.2) == pytest.approx(0.2)
+
+
+def test_a_stamp_of_the_future_makes_no_descriptor_younger_than_it_is() -> None:
+    """Also where offsets of other peers are known."""
+    mine = memory()
+    for k in range(WINDOW):
+        mine.clocks.heard(2, 0.1 * k + 0.5 - 0.1 * k)
+    assert 2 in mine.clocks.offset_s
+    mine.hold(descriptor(2, 0.0), 0.0)
+    mine.hold(descriptor(1, 50.0), 1.0)
+    assert mine.ages_s(1.7)[1] == pytest.approx(0.7)
+
+
+# --- payloads and peers ---------------------------------------------------------------------------------------
+
+
+def test_the_newest_capture_is_held_whenever_it_came() -> None:
+    mine = memory()
+    new, old = (Received(capture(1, t), payload(), done, t) for t, done in ((0.5, 0.6), (0.4, 0.7)))
+    mine.receive(new)
+    mine.receive(old)
+    assert mine.held[1] is new
+    same = Received(capture(1, 0.5), payload(rung=Representation.DETECTIONS), 0.8, 0.5)
+    mine.receive(same)
+    assert mine.held[1] is same  # another payload of the same look
+    assert mine.status.work.payload_bytes == 60_000
+    assert mine.status.work.maps == 2
+    mine.status.airborne = False
+    mine.receive(Received(capture(1, 0.9), payload(), 1.0, 0.9))
+    assert mine.held[1] is same
+
+
+def test_how_long_a_payload_took_leaves_out_its_sender_s_compute_delay() -> None:
+    """Its own, not the receiver's."""
+    mine = memory(makes={0: Equipment(0.3), 1: Equipment(0.08), 2: Equipment(0.0)})
+    for peer in (1, 2):
+        mine.receive(Received(capture(peer, 1.0), payload(), 1.1, 1.0))
+    took = {peer: mine._arrivals[peer][0].took_s for peer in (1, 2)}
+    assert took == pytest.approx({1: 0.02, 2: 0.1})
+
+
+@pytest.mark.parametrize("me", [0, 1, 2, 3])
+def test_a_slot_is_of_the_peer_that_it_is_of(me: int) -> None:
+    """Whoever one is: heard peers are probed, measured ones stay, and the rest is unknown."""
+    for heard in set(range(4)) - {me}:
+        probes = Probes(0.1, 10)
+        for k in range(10):
+            probes.heard(heard, 0.1 * k)
+        peers = [i for i in range(4) if i != me]
+        measured = [0.0, 0.0, 0.0]
+        other = next(i for i in peers if i != heard)
+        measured[peers.index(other)] = 55.0
+        filled = dict(zip(peers, probes.fill(me, measured, 0.9), strict=True))
+        assert heard_share(filled[heard]) == 1.0
+        assert filled[other] == 55.0
+        assert [v for i, v in filled.items() if i not in (heard, other)] == [0.0]
+
+
+@pytest.mark.parametrize("duty", [100, 30, 0])
+@pytest.mark.parametrize("link", [LinkHealth.DEGRADED, LinkHealth.DETACHED])
+def test_staleness_leaves_duty_weight_deadline_and_region_as_they_were_asked(link: LinkHealth, duty: int) -> None:
+    """It reduces what a link carries and how often; a link that carries nothing still says how often its drone is to look."""
+    for rung, rate_hz in product(Representation, (0.5, DEGRADED_RATE_HZ, 10.0)):
+        asked = Directive(2, 5, rung, 0.4, Disc(1, 2, 3), rate_hz, 0.7, 0.25, duty, "asked")
+        capped = cap_by_age(asked, link, 0.6)
+        assert (capped.source, capped.destination, capped.duty_percent) == (2, 5, duty)
+        if link == LinkHealth.DETACHED:
+            assert capped.representation == Representation.NONE
+            continue
+        assert capped.representation == min(rung, Representation.DETECTIONS)
+        assert capped.rate_hz == min(rate_hz, DEGRADED_RATE_HZ)
+        assert (capped.roi, capped.deadline_s, capped.fusion_weight) == (asked.roi, 0.7, 0.25)
+        assert capped.rho == (0.0 if rung > Representation.DETECTIONS else 0.4)
+
+
+def test_who_is_judged_is_no_part_of_the_fall_that_it_is_held_against() -> None:
+    """Of two drones, one falls and one claims not to: the median of both would be half the fall."""
+    standings: dict[int, Any] = {}
+    for second in range(40):
+        known = {
+            i: descriptor(i, second, battery_soc=0.9 - (0.0011 * second if i == 0 else 0.00008 * second), coverage_grid=bytes(64))
+            for i in (0, 1)
+        }  # fmt: skip
+        standings = judge(standings, 0, known, {})
+    assert standings[1].trust < 1.0
+    assert "battery" in standings[1].reason
+
+
+def test_doubted_peers_are_left_out_of_what_is_believed_and_read_without_their_claims() -> None:
+    mine = memory()
+    for i in range(3):
+        mine.hold(descriptor(i), 0.0)
+    mine._doubted = frozenset({2})
+    assert [d.agent_id for d in mine.believed()] == [1]
+    view = mine.view(0.0)
+    assert view.descriptors[2].battery_soc == 0.0
+    assert view.descriptors[1].battery_soc == DESCRIPTOR.battery_soc
+    assert mine.peers == [1, 2]
+
+
+# --- one agent ------------------------------------------------------------------------------------------------
+
+
+class Rig:
+    """One agent with made-up senses and air; `sent` and `published` are what it put on the air."""
+
+    def __init__(self, policy: Callable[[FleetView], Sequence[Directive]], *, handshake: int = 0, **rules: Any) -> None:
+        self.env = simpy.Environment()
+        self.memory = memory(0, **rules)
+        self.sent: list[tuple[float, int, Payload, Capture]] = []
+        self.shaken: list[tuple[float, int]] = []
+        self.published: list[tuple[float, bytes]] = []
+        self.gate = Gate()
+        self.agent = Agent(
+            self.env, self.memory, rules=self.memory._rules, policy=policy, senses=self, modem=self, gate=self.gate,
+            log=self, sealer=None, phase_s=0.01, handshake_bytes=lambda: handshake,
+        )  # fmt: skip
+        self.agent.start()
+
+    # senses
+    def sense(self, frame: int) -> Sensed:
+        return Sensed(capture(0, frame * 0.1), (0.0, 0.0, 0.0), 42.0, View(0, 0, bytes(64)))
+
+    def platform(self) -> Platform:
+        return Platform(0.9, 1.0, 1.0)
+
+    def task(self) -> Task:
+        return Task(TaskPhase.SEARCH, None)
+
+    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
+        return 3
+
+    def perceived(self, capture: Capture) -> None: ...
+
+    def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
+        return None
+
+    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
+        return Boxes.empty()
+
+    # modem
+    def broadcast(self, datagram: bytes) -> None:
+        self.published.append((self.env.now, datagram))
+
+    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
+        self.sent.append((self.env.now, peer, payload, capture))
+
+    def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
+        self.shaken.append((self.env.now, peer))
+
+    def goodput_mbps(self) -> tuple[float, ...]:
+        return (50.0,) * 4
+
+    def __getattr__(self, name: str) -> Any:  # the log
+        if name in ("descriptor", "directive", "trust", "decision", "event", "alert"):
+            return lambda *what: None
+        raise AttributeError(name)
+
+    def hear(self, *peers: int) -> None:
+        for peer in peers:
+            self.memory.hold(descriptor(peer, self.env.now, coverage_grid=bytes(64)), self.env.now)
+
+
+FULL = Directive(0, 1, Representation.FEATURES, 0.5, None, 10.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fusion_weight": 0.25},
+        {"rho": 0.1},
+        {"roi": Disc(0, 0, 20)},
+        {"representation": Representation.DETECTIONS},
+        {"representation": Representation.RAW},
+    ],
+)
+def test_links_that_differ_in_one_field_get_payloads_of_their_own(changes: dict[str, Any]) -> None:
+    asked = [FULL, FULL._replace(destination=2, **changes), FULL._replace(destination=3)]
+    rig = Rig(lambda view: [d for d in asked if d.destination in view.peers], dwell_s=0.0)
+    rig.hear(1, 2, 3)
+    rig.env.run(until=0.09)
+    by_peer = {peer: p for _, peer, p, _ in rig.sent}
+    assert set(by_peer) == {1, 2, 3}
+    for peer, d in zip((1, 2, 3), asked, strict=True):
+        p = by_peer[peer]
+        assert (p.representation, p.rho, p.roi, p.fusion_weight) == (
+            d.representation, pytest.approx(d.rho), d.roi, pytest.approx(d.fusion_weight),
+        )  # fmt: skip
+    assert by_peer[1] is by_peer[3]
+    assert by_peer[1] is not by_peer[2]
+
+
+@pytest.mark.parametrize("leaves_s", [0.0, 0.045, 0.3, 0.33])
+def test_a_drone_that_left_sends_and_publishes_nothing_more(leaves_s: float) -> None:
+    """Also what it looked at before and was about to send."""
+    rig = Rig(
+        lambda view: [FULL._replace(destination=p) for p in view.peers],
+        dwell_s=0.0,
+        handshake=100,
+        compute_delay_s=0.04,
+    )
+    rig.hear(1, 2)
+    rig.env.run(until=leaves_s + 1e-6)
+    before = len(rig.sent), len(rig.shaken), len(rig.published)
+    rig.memory.status.leave()
+    rig.env.run(until=1.0)
+    assert (len(rig.sent), len(rig.shaken), len(rig.published)) == before
+    rig.memory.status.airborne = True
+    rig.hear(1, 2)
+    rig.env.run(until=1.2)
+    assert len(rig.sent) > before[0]
+    assert all(c.t_s >= 1.0 - 1e-9 for t_s, _, _, c in rig.sent if t_s > 1.0)
+
+
+def test_a_handshake_goes_to_peers_that_are_attached() -> None:
+    rig = Rig(lambda view: [], handshake=64, dwell_s=0.0)
+    rig.hear(1, 2)
+    for k in range(30):
+        rig.env.run(until=0.1 * (k + 1) - 0.001)
+        rig.hear(2)
+    last_1, last_2 = (max(t for t, peer in rig.shaken if peer == p) for p in (1, 2))
+    assert last_1 == pytest.approx(1.0, abs=0.15)  # ten periods
+    assert last_2 > 2.8
+
+
+# --- draws that must be independent -----------------------------------------------------------------------------
+
+
+def test_drones_and_purposes_share_no_draws() -> None:
+    """Gusts, offsets, errors of position and heading of every drone and axis, and those of another seed and replication."""
+    fleet = Fleet.model_validate(
+        {
+            "drones": 3,
+            "motion": {
+                "gust_time_s": 0.02, "pose_jitter_time_s": 2.0, "gust_sigma_mps": 1.0, "pose_error_m": 1.0,
+                "heading_error_deg": 1.0,
+            },
+        }
+    )  # fmt: skip
+    each: dict[str, np.ndarray] = {}
+    for seed, replication in ((1, 0), (2, 0), (1, 1)):
+        m = fly(fleet, 400.0, 0.1, seed, replication)
+        for drone in range(3):
+            key = f"{drone} {seed} {replication}"
+            for axis in range(3):
+                each[f"gust {axis} {key}"] = m.wind_mps[:, drone, axis]
+            for axis in range(2):
+                error = m.est_position_m[:, drone, axis] - m.position_m[:, drone, axis]
+                each[f"error {axis} {key}"] = np.diff(error)  # nearly white
+            heading = np.unwrap(m.est_yaw_rad[:, drone]) - np.unwrap(m.yaw_rad[:, drone])
+            each[f"heading {key}"] = np.diff(heading)
+    names = list(each)
+    values = np.array([v[: len(m.time_s) - 1] for v in each.values()])
+    correlation = np.corrcoef(values)
+    np.fill_diagonal(correlation, 0.0)
+    worst = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    assert np.abs(correlation).max() < 0.09, [names[k] for k in worst]
+
+
+def test_offsets_from_slots_are_of_each_drone_and_axis() -> None:
+    fleet = Fleet.model_validate({"drones": 4, "motion": {"pose_jitter_time_s": 1.5, "gust_sigma_mps": 0}})
+    m = fly(fleet, 3000.0, 0.5, 1)
+    off = (m.position_m - m.position_m.mean(axis=0)).reshape(len(m.time_s), -1)
+    correlation = np.corrcoef(off.T)
+    np.fill_diagonal(correlation, 0.0)
+    assert np.abs(correlation).max() < 0.1
+
+
+def test_clocks_draw_offset_rate_and_growth_each_for_every_drone() -> None:
+    config = Clocks(offset_s=1.0, drift_ppm=1.0, drift_growth_ppm_per_min=1.0)
+    drawn = np.array([oscillators(config, 400, seed, 0) for seed in (1, 2)])
+    assert len(np.unique(drawn)) == drawn.size
+    correlation = np.corrcoef(drawn.transpose(0, 2, 1).reshape(6, -1))
+    np.fill_diagonal(correlation, 0.0)
+    assert np.abs(correlation).max() < 0.2
+    assert len(np.unique([oscillators(config, 3, 1, r) for r in range(3)])) == 27
