@@ -1,0 +1,425 @@
+"""Perception's joints: which argument goes where, two options together, shares that are late or empty, independent draws.
+
+Joints, each with a test below:
+
+1. The time at which truth is taken, and the pose about which: of the scoring, and of the capture.
+2. A drone's true pose and the one that it believes: images and truth go by the one, boxes and squares by the other, also
+   where maps are fused.
+3. Weight: of a map, of boxes; 0 is as if the share had not come, in every detector and under every rule.
+4. Age: of the ego's own look, of the freshest one at hand, where there is no look of its own.
+5. Region, budget and missing cells together.
+6. Boxes that were cut: after the cut nothing shows that there were more.
+7. Bytes of an index at every number of cells.
+8. Errors of a drone's place: in what its thermal camera found, and in its false alarms.
+9. Scores that are equal.
+10. Sections of a scenario and what each detector takes of them.
+
+Draws that must be independent of each other:
+
+- the surrogate's: every column for a look, of drones, moments, seeds and replications; false positives, shared ones too;
+- the thermal camera's: of drones, frames, people, and false alarms;
+- camera noise: of drones, moments, seeds and replications.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from perception_examples import capture, cross
+from scipy.special import ndtr
+
+from sortie.perception import budget
+from sortie.perception.ground_truth import ground_truth
+from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
+from sortie.perception.lateness import map_weight, own_age_s, weighed
+from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.render import Renderer
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.surrogate.detector import SurrogateDetector
+from sortie.perception.surrogate.draws import Drawn, DrawSource
+from sortie.perception.surrogate.features import CaptureColumns, Eyes
+from sortie.perception.thermal import NOBODY, look
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
+from sortie.scenarios.schema import Perception, Scene, Target, Thermal
+
+BOUNDS = (-50.0, -50.0, 50.0, 50.0)
+
+
+@cache
+def town() -> SceneModel:
+    return SceneModel(Scene(moving_cars_per_km=30), Target(waypoints_m=((0, 0), (100, 0))), BOUNDS)
+
+
+@cache
+def surrogate(**config: Any) -> SurrogateDetector:
+    return SurrogateDetector(town(), Perception(**config), 3)
+
+
+@cache
+def torch_detector() -> TorchDetector:
+    return TorchDetector(town(), Perception(), 1)
+
+
+DETECTORS: tuple[Callable[[], Any], ...] = (surrogate, torch_detector)
+
+
+def same(a: Boxes, b: Boxes) -> bool:
+    return len(a) == len(b) and all(np.array_equal(getattr(a, f), getattr(b, f)) for f in Boxes.__slots__)
+
+
+def boxes_at(*rows: tuple[float, float, float]) -> Boxes:
+    table = np.array([(x, y, 4.5, 1.9, 0.0, score) for x, y, score in rows]).reshape(-1, 6)
+    return Boxes.placed(table, (0.0, 0.0, 0.0))
+
+
+# --- truth ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize("late_s", [0.0, 0.095, 1.5])
+def test_truth_is_of_the_time_that_is_asked_for_about_the_true_pose(detector: Any, late_s: float) -> None:
+    """Cars move between capture and scoring; the square stays where the drone truly was."""
+    ego = capture(10.0, 20.0, yaw=0.4, t_s=5.0, est=(14.0, 15.0, 60.0, 0.9))
+    cars = town().cars_at(5.0 + late_s)
+    wanted = ground_truth(cars.table(), (10.0, 20.0, 0.4), identity=cars.ids).single()
+    found = detector().truth(5.0 + late_s, ego)
+    order, wanted_order = np.argsort(found.car), np.argsort(wanted.car)
+    np.testing.assert_array_equal(found.car[order], wanted.car[wanted_order])
+    np.testing.assert_allclose(found.xy_m[order], wanted.xy_m[wanted_order], atol=1e-4)
+    if late_s:
+        before = detector().truth(5.0, ego)
+        both = np.intersect1d(found.car, before.car)
+        moved = found.xy_m[np.isin(found.car, both)][np.argsort(found.car[np.isin(found.car, both)])]
+        was = before.xy_m[np.isin(before.car, both)][np.argsort(before.car[np.isin(before.car, both)])]
+        assert np.abs(moved - was).max() > 5.0 * late_s
+    if hasattr(detector(), "truth_many"):
+        (many,) = detector().truth_many([5.0 + late_s], [ego])
+        assert same(many, found)
+
+
+# --- true and believed poses ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize("shares", [(), ("features",), ("raw",), ("detections",)])
+def test_boxes_lie_where_the_drone_believes_it_is(detector: Any, shares: tuple[str, ...]) -> None:
+    """Everybody's belief is off by the same: all boxes are, and nothing else changes."""
+    off = np.array([7.0, -4.0])
+
+    def found(dx: float, dy: float) -> Boxes:
+        fleet = [
+            c._replace(est_position_m=(c.position_m[0] + dx, c.position_m[1] + dy, 60.0))
+            for c in cross(10.0, 20.0, 0.3)[:3]
+        ]
+        jobs = [(fleet[0], [Share(c, kind, 0.2, None, 1.0) for kind in shares for c in fleet[1:]])]
+        (boxes,) = detector().detect(jobs)
+        return boxes
+
+    here, there = found(0.0, 0.0), found(*off.tolist())
+    assert len(here) > 3
+    assert len(there) == len(here)
+    np.testing.assert_allclose(there.xy_m - here.xy_m, np.broadcast_to(off, here.xy_m.shape), atol=2e-2)
+    np.testing.assert_allclose(there.score, here.score, atol=2e-3)
+
+
+# --- weight -----------------------------------------------------------------------------------------------------
+
+
+EVERY_KIND = ("features", "raw", "detections", "tracks")
+
+
+@pytest.mark.parametrize(
+    ("made", "kind", "join"),
+    [
+        *product([surrogate], EVERY_KIND, ["nms", "average"]),
+        *product([torch_detector], ["features", "detections", "tracks"], ["nms"]),
+    ],
+)
+def test_a_share_of_no_weight_is_as_if_it_had_not_come(made: Any, kind: str, join: Any) -> None:
+    """Beside others, and alone."""
+    detector = made() if made is torch_detector else made(join=join)
+    ego, a, b = cross(10.0, 20.0, 0.3)[:3]
+    own = detector.detect([(ego, [])])[0]
+    assert same(detector.detect([(ego, [Share(a, kind, 0.2, None, 0.0)])])[0], own)
+    with_b = detector.detect([(ego, [Share(b, "detections", 0.0, None, 1.0)])])[0]
+    both = detector.detect([(ego, [Share(a, kind, 0.2, None, 0.0), Share(b, "detections", 0.0, None, 1.0)])])[0]
+    assert same(both, with_b)
+
+
+def test_the_weight_of_a_map_matters_to_the_surrogate_and_to_the_network() -> None:
+    """Between nothing and one there is more than two."""
+    ego, a = cross(10.0, 20.0, 0.3)[:2]
+    for detector in (surrogate(), torch_detector()):
+        found = [detector.detect([(ego, [Share(a, "features", 0.3, None, w)])])[0] for w in (0.0, 0.3, 1.0)]
+        assert not same(found[0], found[1])
+        assert not same(found[1], found[2])
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_a_source_of_no_weight_and_one_that_nobody_sent_leave_equal_boxes(rule: Any) -> None:
+    own = boxes_at((0, 0, 0.5), (30, 5, 0.4))
+    peer = SourceBoxes(boxes_at((0.2, 0, 0.9), (60, 0, 0.8)), 0.5, (0.0, 0.0, 0.0))
+    empty = dataclasses.replace(peer, weight=0.0, age_s=-5.0)
+    with_it, without = (
+        joined_many([EgoSources((0.0, 0.0, 0.0), own, False, others, 0.3)], rule)[0]
+        for others in ([peer, empty], [peer])
+    )
+    assert same(with_it, without)
+
+
+# --- age ------------------------------------------------------------------------------------------------------------
+
+
+def test_ages_are_compared_with_the_freshest_look_at_hand() -> None:
+    """The ego's own where it has looked, else the freshest that came; only what is older loses."""
+    ego, a, b, c = cross(0.0, 0.0, 0.0, t_s=5.0)[:4]
+
+    def late(who: Capture, age_s: float, now_s: float = 5.1) -> Share:
+        return Share(who._replace(t_s=now_s - age_s), "features", 0.2, None, 0.8, (), age_s)
+
+    shares = [late(a, 0.1), late(b, 0.4), late(c, 0.7)]
+    assert own_age_s(ego, shares) == pytest.approx(0.1)
+    weights = [s.weight for s in weighed(ego, shares)]
+    assert weights == pytest.approx([0.8, 0.8 * map_weight(0.4, 0.1), 0.8 * map_weight(0.7, 0.1)])
+    blind = ego._replace(looked=False)
+    rest = shares[1:]
+    assert [s.weight for s in weighed(blind, rest)] == pytest.approx([0.8, 0.8 * map_weight(0.7, 0.4)])
+    # a receiver may hold an age to be longer than it is: the moment is that of the one that it knows best
+    assert own_age_s(ego, [*shares, late(b, 0.2)._replace(age_s=0.9)]) == pytest.approx(0.1)
+    boxes = late(b, 0.4)._replace(representation="detections")
+    assert weighed(ego, [boxes]) == [boxes]
+    assert 0.0 < map_weight(0.7, 0.1) < map_weight(0.4, 0.1) < map_weight(0.1, 0.1) == 1.0
+
+
+# --- cells -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rho", "missing"), [(0.02, ()), (0.02, (0, 3)), (0.001, (1,)), (1.0, ()), (1.0, (5,))])
+@pytest.mark.parametrize("roi", [None, Disc(20.0, 10.0, 25.0), Disc(0.0, 0.0, 8.0)])
+def test_of_a_region_the_best_cells_arrive_less_those_that_went_missing(
+    rho: float, missing: tuple[int, ...], roi: Disc | None
+) -> None:
+    """Against a plain list: cells in the region, best first, cut to the budget, some of them lost."""
+    rank = np.random.default_rng(1).permutation(4096).reshape(64, 64).astype(float)
+    pose = (3.0, -2.0, 0.4)
+    allowed = budget.roi_mask(roi, *pose).ravel()
+    inside = [int(k) for k in np.argsort(-rank.ravel()) if allowed[k]]
+    sent = inside[: math.floor(rho * 4096 + 1e-9)]
+    arrived = {cell for place, cell in enumerate(sent) if place not in missing}
+    got = budget.select(rank, rho, roi, *pose, missing)
+    assert set(np.flatnonzero(got.ravel()).tolist()) == arrived
+    assert budget.cells_sent(rho, roi, *pose) == len(sent)
+    assert budget.must_choose(rho, roi, *pose) == (math.floor(rho * 4096 + 1e-9) < len(inside))
+
+
+def test_an_index_is_a_list_or_a_bitmap_whichever_is_smaller() -> None:
+    for cells in (1, 2, 81, 340, 341, 342, 1000, 4095, 4096):
+        wanted = 0 if cells == 4096 else min(512, math.ceil(cells * 12 / 8))
+        assert budget.index_bytes(cells) == wanted
+        assert budget.content_bytes("features", cells=cells) == cells * 160 + wanted
+
+
+@pytest.mark.parametrize(("boxes", "kind"), list(product((3, 12, 13, 40), ("tracks", "detections"))))
+def test_only_boxes_that_were_cut_leave_places_open(boxes: int, kind: str) -> None:
+    """More than twelve as tracks: the best come, and a missing one says nothing. Detections are never cut."""
+    alone = boxes_at(*[(6.0 * k, 0.0, 0.9 - 0.01 * k) for k in range(boxes)])
+    share = Share(capture(), kind, 0.0, None, 0.5)
+    source = source_of(share, alone)
+    assert source.truncated == (kind == "tracks" and boxes > budget.MAX_TRACKS)
+    assert len(source.boxes) == (min(boxes, 12) if kind == "tracks" else boxes)
+    assert source.boxes.score[0] == alone.score[0]
+    near = source_of(share._replace(roi=Disc(0.0, 0.0, 20.0)), alone)
+    assert not near.truncated  # few are inside, however many there are
+
+
+# --- scores ----------------------------------------------------------------------------------------------------------------
+
+
+def test_boxes_of_one_score_make_one_step_of_the_curve() -> None:
+    """Whatever their order is: hit and miss at one score have a precision of one half together."""
+    for hit in ([True, False], [False, True]):
+        frame = Matched(np.array([0.5, 0.5]), np.array(hit), 1)
+        assert average_precision([frame]) == pytest.approx(0.5)
+    first = Matched(np.array([0.9, 0.5]), np.array([True, False]), 2)
+    second = Matched(np.array([0.5]), np.array([True]), 0)
+    assert average_precision([first, second]) == average_precision([second, first])
+    assert average_precision([first, second]) == pytest.approx(0.5 * 1.0 + 0.5 * 2 / 3)
+
+
+# --- thermal cameras -----------------------------------------------------------------------------------------------------------
+
+PEOPLE_M = np.array([[x, y] for x in (30.0, 40.0, 50.0) for y in (30.0, 40.0, 50.0)])
+BARE = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, (0.0, 0.0, 80.0, 80.0))
+
+
+def sightings(
+    frames: int, drone: int = 0, off: tuple[float, float] = (0.0, 0.0), key: tuple[int, int] = (1, 0), **camera: Any
+) -> list[list[Any]]:
+    at = capture(40.0, 40.0, 95.0, drone=drone, est=(40.0 + off[0], 40.0 + off[1], 95.0, 0.0))
+    thermal = Thermal(**{"near_probability": 1.0, "half_range_m": 97.0, "range_width_m": 4.0, **camera})
+    return [look(thermal, PEOPLE_M, BARE.height_field, at, k, 0.1, key) for k in range(frames)]
+
+
+def test_whatever_a_thermal_camera_reports_is_off_by_as_much_as_its_drone() -> None:
+    """People and false alarms alike."""
+    plain = sightings(60, false_alarms_per_min=300, position_error_m=1.0)
+    moved = sightings(60, off=(25.0, -40.0), false_alarms_per_min=300, position_error_m=1.0)
+    kinds = set()
+    for one, other in zip(plain, moved, strict=True):
+        assert [s.person for s in one] == [s.person for s in other]
+        for a, b in zip(one, other, strict=True):
+            kinds.add(a.person == NOBODY)
+            assert (b.x_m - a.x_m, b.y_m - a.y_m) == pytest.approx((25.0, -40.0))
+            assert a.score == b.score
+    assert kinds == {True, False}
+
+
+def test_thermal_draws_are_of_each_drone_frame_person_seed_and_replication() -> None:
+    def found(**how: Any) -> np.ndarray:
+        rows = sightings(300, false_alarms_per_min=0, **how)
+        return np.array([[any(s.person == p for s in frame) for p in range(9)] for frame in rows])
+
+    every = [found(), found(drone=1), found(key=(2, 0)), found(key=(1, 1))]
+    columns = np.concatenate(every, axis=1).T.astype(float)
+    assert 0.2 < columns.mean() < 0.8
+    correlation = np.corrcoef(columns)
+    np.fill_diagonal(correlation, 0.0)
+    assert np.abs(correlation).max() < 0.28
+    shifted = [np.corrcoef(c[:-1], c[1:])[0, 1] for c in columns]  # one frame and the next
+    assert np.abs(shifted).max() < 0.28
+    alarms = [
+        np.array([any(s.person == NOBODY for s in f) for f in sightings(400, false_alarms_per_min=400, **how)], float)
+        for how in ({}, {"drone": 1}, {"key": (2, 0)}, {"key": (1, 1)})
+    ]
+    between = np.corrcoef(alarms)
+    np.fill_diagonal(between, 0.0)
+    assert np.abs(between).max() < 0.25
+
+
+# --- the surrogate's draws -----------------------------------------------------------------------------------------------------------
+
+
+def drawn(drone: int = 0, t_s: float = 5.0, seed: int = 3, replication: int = 0) -> Drawn:
+    """The draws of one look at each of many cars, none of which are the same for all drones."""
+    eyes = Eyes(town())
+    source = DrawSource(seed, replication, 7, eyes.traffic.count, np.zeros(4, np.float32))
+    at = [capture(0.0, 0.0, drone=drone, t_s=t_s)]
+    return source.of(at, eyes.look(CaptureColumns.of(at)))
+
+
+def columns(d: Drawn, label: str) -> dict[str, np.ndarray]:
+    """All numbers of looks as uniform ones."""
+    return {
+        f"look {label}": d.look, f"rank {label}": ndtr(d.rank), f"find 0 {label}": d.find[:, 0],
+        f"find 1 {label}": d.find[:, 1], f"residual {label}": d.residual,
+    }  # fmt: skip
+
+
+def test_no_two_of_the_surrogate_s_draws_share_a_number() -> None:
+    """Of every purpose, drone, moment, seed and replication, car by car."""
+    each: dict[str, np.ndarray] = {}
+    for label, how in {
+        "": {}, "drone": {"drone": 1}, "moment": {"t_s": 5.1}, "seed": {"seed": 4}, "replication": {"replication": 1},
+    }.items():  # fmt: skip
+        each |= columns(drawn(**how), label)
+    fixed = drawn().offset_draw
+    each["offset"] = fixed[:, 0]
+    n = min(map(len, each.values()))
+    assert n > 60
+    values = {name: v[:n] for name, v in each.items()}
+    for name, v in values.items():
+        assert 0.3 < v.mean() < 0.7, name
+    correlation = np.corrcoef(list(values.values()))
+    np.fill_diagonal(correlation, 0.0)
+    worst = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    assert np.abs(correlation).max() < 0.6, [list(values)[k] for k in worst]
+    alike = [len(np.intersect1d(a, b)) for a, b in product(values.values(), repeat=2) if a is not b]
+    assert max(alike) == 0
+
+
+def test_false_positives_are_drawn_for_each_drone_and_moment() -> None:
+    a, b = drawn(), drawn(drone=1)
+    for first, second in ((a, b), (a, drawn(t_s=5.1)), (a, drawn(seed=4)), (a, drawn(replication=1))):
+        for name in ("alarm_at", "alarm_which"):
+            one, other = getattr(first, name).ravel(), getattr(second, name).ravel()
+            assert len(np.intersect1d(one, other)) == 0
+        assert first.moment[0] != second.moment[0]
+    bands = a.alarm_which[0]
+    assert len(np.unique(bands)) == bands.size
+    assert abs(np.corrcoef(a.alarm_at[0, :, 0], a.alarm_which[0, :, 0])[0, 1]) < 0.9
+
+
+def test_each_drone_has_a_shared_false_positive_by_a_draw_of_its_own() -> None:
+    """Drones in one place at one moment see the same things, and not all the same of them, nor at the next look."""
+    detector = SurrogateDetector(
+        SceneModel(Scene(parked_density=0, moving_cars_per_km=0), None, BOUNDS), Perception(), 3
+    )
+    detector.parameters = dataclasses.replace(
+        detector.parameters, shared_false_positives=np.array([1.0, 0.5, 0.0, 0.0], np.float32)
+    )
+
+    def things(drone: int, t_s: float) -> set[tuple[int, int]]:
+        (boxes,) = detector.detect([(capture(0.0, 0.0, drone=drone, t_s=t_s), [])])
+        return {tuple(np.round(xy).astype(int).tolist()) for xy in boxes.xy_m}
+
+    looks = {(drone, k): things(drone, 5.0 + 0.5 * k) for drone in range(3) for k in range(12)}
+    every = set().union(*looks.values())
+    assert len(every) >= 4
+    known = sorted(every)
+    table = np.array([[thing in looks[drone, k] for thing in known] for drone in range(3) for k in range(12)], float)
+    assert 0.1 < table.mean() < 0.9
+    by_drone = table.reshape(3, -1)
+    assert not any(np.array_equal(by_drone[i], by_drone[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    per_look = table.reshape(3, 12, -1)
+    assert (per_look[:, 1:] != per_look[:, :-1]).any(axis=(1, 2)).all()
+
+
+# --- camera noise -----------------------------------------------------------------------------------------------------------------------
+
+
+def test_camera_noise_is_of_each_drone_moment_seed_and_replication() -> None:
+    """In the network's pictures as in the renderer's own."""
+    here = capture(0.0, 0.0, t_s=5.0)
+
+    def grey(renderer: Renderer, c: Capture) -> np.ndarray:
+        return renderer.render([c])[0].astype(int)
+
+    usual = grey(Renderer(town(), 1), here)
+    noise = {
+        "drone": grey(Renderer(town(), 1), here._replace(drone=1)) - usual,
+        "seed": grey(Renderer(town(), 2), here) - usual,
+        "replication": grey(Renderer(town(), 1, 1), here) - usual,
+    }
+    for name, off in noise.items():
+        assert (off != 0).mean() > 0.8, name
+        assert np.abs(off).max() <= 40
+    assert np.array_equal(grey(Renderer(town(), 1), here), usual)
+    pair = [noise[a].ravel() for a in ("drone", "seed")]
+    assert not np.array_equal(*pair)
+    torch_views = [
+        TorchDetector(town(), Perception(), seed, replication=replication).camera_views(here)
+        for seed, replication in ((1, 0), (2, 0), (1, 1))
+    ]
+    np.testing.assert_array_equal(torch_views[0], usual)
+    assert (torch_views[1] != torch_views[0]).mean() > 0.8
+    assert (torch_views[2] != torch_views[0]).mean() > 0.8
+    assert (torch_views[2] != torch_views[1]).mean() > 0.8
+
+
+def test_the_surrogate_draws_by_seed_and_replication() -> None:
+    ego = capture(0.0, 0.0)
+    found = [
+        SurrogateDetector(town(), Perception(), seed, replication=replication).detect([(ego, [])])[0]
+        for seed, replication in ((1, 0), (2, 0), (1, 1), (1, 0))
+    ]
+    assert same(found[0], found[3])
+    assert not any(same(found[0], other) for other in found[1:3])
