@@ -1,0 +1,258 @@
+"""The outcome of a record of a few rows, every figure worked out by hand.
+
+Two drones fly four frames of a second each: `search` for two seconds, then `track` about the origin. Drone 1 is gone from
+3 s on. A comment beside each group of rows says what follows from it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from sortie.scenarios.reading.load import loads
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import TABLES, SortieRecord
+
+SCENARIO = """
+name: by_hand
+duration_s: 4
+fleet: {drones: 2}
+context: {rate_hz: 1}
+mission:
+  phases:
+    - {at_s: 0, phase: search}
+    - {at_s: 2, phase: track, region: {centre_m: [0, 0], radius_m: 10}}
+perception: {detector: surrogate, sample_rate_hz: 1}
+"""
+NAN = math.nan
+CAR = {"length_m": 4.5, "width_m": 1.9, "yaw_rad": 0.3}
+LEVEL = {"z_m": 60.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
+FAR_M = 5000.0
+
+
+def rows() -> dict[str, list[dict[str, Any]]]:
+    return {
+        # drone 0 stands over the region, and is far off in the last frame; drone 1 is far off throughout
+        "states": [
+            {
+                "t_s": float(k), "drone": d, **LEVEL, "x_m": FAR_M if d or k == 3 else 0.0, "y_m": 0.0, "looks": k,
+                "airborne": not (d == 1 and k == 3), "soc": 0.9 - 0.1 * d - 0.01 * k, "voltage_v": 16.0 - k,
+            }
+            for k in range(4)
+            for d in range(2)
+        ],
+        "mission": [
+            {
+                "t_s": float(k), "group": 0, "phase": "search" if k < 2 else "track", "target": -1, "target_x_m": NAN,
+                "target_y_m": NAN, "region_x_m": NAN if k < 2 else 0.0, "region_y_m": NAN if k < 2 else 0.0,
+                "region_radius_m": NAN if k < 2 else 10.0,
+            }
+            for k in range(4)
+        ],
+        "energy": [
+            {"drone": d, "cause": cause, "energy_j": j}
+            for d, cause, j in ((0, "rotor", 100.0), (1, "rotor", 50.0), (0, "radio", 5.0), (1, "fault", 20.0))
+        ],
+        # captured, sent, what, bytes, fate: by capture the first three belong to the search, though the third was sent later
+        "transmissions": [
+            {
+                "captured_s": captured, "t_sent_s": sent, "drone": 0, "peer": 1, "representation": what,
+                "payload_bytes": size, "status": status, "reason": reason, "arrived_bytes": arrived,
+            }
+            for captured, sent, what, size, status, reason, arrived in (
+                (0.0, 0.1, "features", 1000, "delivered", "", 1000),
+                (0.1, 0.2, "features", 3000, "lost", "fragment_lost", 0),
+                (1.95, 2.05, "detections", 500, "expired", "deadline_queued", 0),
+                (2.2, 2.3, "features", 2000, "partial", "deadline_in_service", 1200),
+                (2.5, 2.6, "handshake", 100, "delivered", "", 100),
+                (3.8, 3.9, "features", 4000, "in_flight", "", 0),
+            )
+        ],
+        "receptions": [
+            {"t_s": 0.0, "heard": 3, "collision_context": 1},
+            {"t_s": 1.0, "heard": 2, "weak_signal": 2},
+            {"t_s": 2.0, "heard": 1, "hidden": 1},
+            {"t_s": 3.0, "heard": 0, "half_duplex": 1},
+        ],
+        "ages": [{"t_s": 1.0, "drone": 0, "age_s": age_s} for age_s in (0.4, 0.1, 0.3, 0.2)],
+        "fusions": [
+            {
+                "t_s": t_s, "drone": d, "peers": [1 - d] * len(ages), "representations": ["features"] * len(ages),
+                "ages_s": ages, "weights": [1.0] * len(ages), "detections": found, "truths": there,
+            }
+            for t_s, d, ages, found, there in (
+                (0.5, 0, [0.1], 2, 2),
+                (2.5, 0, [0.2, 0.4], 1, 2),
+                (2.5, 1, [], 0, 1),
+                (3.5, 0, [0.3], 1, 1),
+            )
+        ],
+        "truths": [
+            {"t_s": t_s, "drone": d, "x_m": x_m, "y_m": 0.0, **CAR, "car": car}
+            for t_s, d, x_m, car in (
+                (0.5, 0, 0.0, 0), (0.5, 0, 30.0, 1),
+                (2.5, 0, 2.0, 0), (2.5, 0, 40.0, 1),
+                (2.5, 1, 2.0, 0),
+                (3.5, 0, 3.0, 0),
+                (3.5, 1, 3.0, 0),  # of the drone that is gone: no fusion
+            )
+        ],
+        "detections": [
+            {"t_s": t_s, "drone": 0, "x_m": x_m, "y_m": 0.0, **CAR, "score": score}
+            for t_s, x_m, score in ((0.5, 0.0, 0.9), (0.5, 60.0, 0.8), (2.5, 2.0, 0.7), (3.5, 3.0, 0.6))
+        ],
+        # the second differs from the first by the place of its disc alone
+        "directives": [
+            {
+                "t_s": t_s, "drone": 0, "peer": 1, "representation": what, "rho": rho, "roi_x_m": x_m, "roi_y_m": 0.0,
+                "roi_radius_m": 10.0, "rate_hz": rate, "reason": reason,
+            }
+            for t_s, what, rho, x_m, rate, reason in (
+                (0.5, "features", 0.25, 0.0, 10.0, "a"),
+                (1.5, "features", 0.25, 5.0, 10.0, "b"),
+                (2.5, "detections", 0.0, 5.0, 2.0, "c"),
+            )
+        ],
+        "trust": [
+            {"t_s": 1.0, "drone": 0, "peer": 1, "trust": 0.5, "reason": "x"},
+            {"t_s": 2.0, "drone": 0, "peer": 1, "trust": 1.0, "reason": "x"},
+            {"t_s": 2.0, "drone": 1, "peer": 0, "trust": 1.0, "reason": ""},
+        ],
+        "drops": [{"t_s": 1.0, "receiver": 0, "reason": r} for r in ("replay", "replay", "bad_tag")],
+    }  # fmt: skip
+
+
+def record(**changes: Any) -> SortieRecord:
+    """The rows as a record; cells that no row names are zeros."""
+    given = rows()
+    zero = {pa.string(): "", pa.bool_(): False, pa.binary(): b""}
+    tables = {}
+    for name, columns in TABLES.items():
+        values = given.get(name, [])
+        tables[name] = pa.table(
+            {c: pa.array([r.get(c, zero.get(t, 0)) for r in values], t) for c, t in columns.items()}
+        )
+    totals = {
+        "context_descriptor_bytes": 700, "context_directive_bytes": 108, "medium_busy_fraction": 0.125,
+        "policy_changes": 0, "shield_interventions": 0, "invariant_violations": 0, "violated_ticks": 0,
+        "decisions_of worked": 8,
+        **{f"violations_of {c}": 0 for c in ("policy", "staleness", "damping", "no peer")},
+    }  # fmt: skip
+    made = SortieRecord(loads(SCENARIO), "worked", 1, 0, "0", "surrogate", tables, totals, wall={"wall_s": 2.0})
+    return replace(made, **changes)
+
+
+@pytest.fixture(scope="module")
+def result() -> dict[str, Any]:
+    return outcome(record())
+
+
+def test_bytes_go_to_their_fates_and_a_cut_payload_to_two(result: dict[str, Any]) -> None:
+    """10,600 B in all; of the 2,000 B that were cut short 1,200 B came, and 800 B missed their deadline."""
+    assert result["bytes"] == {
+        "context_sent": 808, "context_descriptors": 700, "context_directives": 108, "data_sent": 10_600,
+        "handshakes_sent": 100, "data_delivered": 2300, "data_lost": 3000, "data_expired": 1300, "data_in_flight": 4000,
+    }  # fmt: skip
+    assert result["context_share"] == pytest.approx(808 / 11_408)
+    assert result["data_rate_mbps"] == pytest.approx(10_600 * 8e-6 / 4)
+    assert result["deadline_miss_rate"] == pytest.approx(2 / 5)  # what is in flight has no fate yet
+    assert result["payload_fates"] == {
+        "delivered": 2, "expired/deadline_queued": 1, "in_flight": 1, "lost/fragment_lost": 1,
+        "partial/deadline_in_service": 1,
+    }  # fmt: skip
+
+
+def test_percentiles_lie_between_the_values(result: dict[str, Any]) -> None:
+    """Of 0.1, 0.2, 0.3 and 0.4 the median lies half-way between the middle two, p99 at 2.97 of 3 steps."""
+    assert result["age_s"] == pytest.approx({"p50": 0.25, "p99": 0.397})
+    assert result["data_age_s"] == pytest.approx({"p50": 0.25, "p99": 0.397})
+    assert result["data_age_mean_s"] == pytest.approx(0.25)
+
+
+def test_energy_is_added_up_by_cause_by_drone_and_in_all(result: dict[str, Any]) -> None:
+    assert result["energy_j"] == {"rotor": 150.0, "radio": 5.0, "fault": 20.0, "total": 175.0}
+    assert {d: v["energy_j"] for d, v in result["drones"].items()} == {"0": 105.0, "1": 70.0}
+    assert result["drones"]["0"] | {"energy_j": 0.0} == {
+        "soc": pytest.approx(0.87), "voltage_v": 13.0, "airborne": True, "energy_j": 0.0,
+    }  # fmt: skip
+    assert result["drones"]["1"]["airborne"] is False
+    assert result["battery"] == pytest.approx({"0": 0.87, "1": 0.77})
+
+
+def test_average_precision_of_four_fusions(result: dict[str, Any]) -> None:
+    """Six cars; by score: hit, miss, hit, hit. Precision 1, then 3/4 from the second hit on: (1 + 3/4 + 3/4) / 6.
+
+    In the disc, from 2 s on: three cars, two hits and nothing false. The drone that is gone misses one more car.
+    """
+    ap = result["ap50"]
+    assert (ap["full_scene"], ap["mission"]) == pytest.approx((2.5 / 6, 2 / 3))
+    assert ap["grounded_blind"] == pytest.approx({"full_scene": 2.5 / 7, "mission": 2 / 4})
+    assert ap["scored_fusions"] == 4
+
+
+def test_phases_take_what_was_captured_in_them(result: dict[str, Any]) -> None:
+    search, track = result["phases"]
+    assert (search["phase"], search["begin_s"], search["end_s"]) == ("search", 0.0, 2.0)
+    assert (track["phase"], track["begin_s"], track["end_s"]) == ("track", 2.0, 4.0)
+    assert search["ap50"] == {"full_scene": pytest.approx(0.5), "mission": None}
+    assert track["ap50"] == pytest.approx({"full_scene": 0.5, "mission": 2 / 3})
+    assert search["data_rate_mbps"] == pytest.approx(4500 * 8e-6 / 2)
+    assert track["data_rate_mbps"] == pytest.approx(6100 * 8e-6 / 2)
+    assert (search["deadline_miss_rate"], track["deadline_miss_rate"]) == pytest.approx((1 / 3, 1 / 2))
+    assert (search["feature_payload_bytes"], track["feature_payload_bytes"]) == (2000.0, 3000.0)
+    assert (search["context"]["lost"], track["context"]["lost"]) == pytest.approx((3 / 8, 2 / 3))
+
+
+def test_receptions_are_shares_of_all_that_could_have_heard(result: dict[str, Any]) -> None:
+    assert result["context"]["lost"] == pytest.approx(5 / 11)
+    assert result["context"]["lost_to"] == pytest.approx(
+        {"collision_context": 1 / 11, "collision_data": 0, "hidden": 1 / 11, "weak_signal": 2 / 11, "half_duplex": 1 / 11}
+    )  # fmt: skip
+
+
+def test_a_disc_that_moves_is_no_switch(result: dict[str, Any]) -> None:
+    """Two changes on two links in a fifteenth of a minute."""
+    assert result["switches"] == pytest.approx(2 / (2 * 4 / 60))
+    features, boxes = "features ρ=0.25 at 10 Hz in 10 m", "detections at 2 Hz in 10 m"
+    assert result["transitions"] == [
+        {"t_s": 0.5, "drone": 0, "from": "nothing", "to": features, "reason": "a", "peers": [1]},
+        {"t_s": 2.5, "drone": 0, "from": features, "to": boxes, "reason": "c", "peers": [1]},
+    ]
+
+
+def test_the_mission_is_observed_while_somebody_flies_over_it_and_looks(result: dict[str, Any]) -> None:
+    """Seven of eight drone seconds are flown. The region is in view for one of its two seconds. There is no target."""
+    mission = result["mission"]
+    assert mission["flown_share"] == pytest.approx(7 / 8)
+    assert mission["region_observed_share"] == pytest.approx(1 / 2)
+    assert mission["target_in_view_share"] is None
+    assert mission["target_detected_share"] is None
+
+
+def test_counts_and_ratios(result: dict[str, Any]) -> None:
+    assert result["distrusted_by"] == {"1": 1}
+    assert result["descriptor_drops"] == {"replay": 2, "bad_tag": 1}
+    assert result["policies"]["decisions"] == {"worked": 8}
+    assert result["realtime_factor"] == pytest.approx(2.0)
+    assert result["medium_busy_fraction"] == 0.125
+
+
+def test_nothing_has_no_ratios() -> None:
+    """Of a record without traffic and fusions every ratio is null, and every amount 0."""
+    full = record()
+    empty = {
+        name: table.slice(0, 0) if name in ("transmissions", "receptions", "ages", "fusions", "truths", "detections") else table
+        for name, table in full.tables.items()
+    }  # fmt: skip
+    result = outcome(replace(full, tables=empty))
+    assert result["bytes"]["data_sent"] == 0
+    assert result["data_rate_mbps"] == 0.0
+    for name in ("deadline_miss_rate", "data_age_mean_s"):
+        assert result[name] is None
+    assert result["context"]["lost"] is None
+    assert result["age_s"] == result["data_age_s"] == {"p50": None, "p99": None}
+    assert (result["ap50"]["full_scene"], result["ap50"]["mission"]) == (None, None)
