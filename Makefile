@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 
 
-.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 clean scenarios notebooks
+.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -61,6 +61,10 @@ validate-ns3: ns3 ## run the same plans through ns-3 and through the radio, and 
 
 ns3: $(STAMP) ## install ns-3's wheel (Linux on x86-64; 450 MB)
 	$(BIN)/python -m pip install --quiet --retries 1 -c constraints.txt -e '.[ns3]'
+
+mutate: $(STAMP) ## change the code that decides figures in small ways, and count what no test notices (hours; MUTATE="--room fleet --sample 5")
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[mutate]'
+	$(BIN)/python tests/validation/mutate.py $(MUTATE)
 
 clean: ## remove runs and caches, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info

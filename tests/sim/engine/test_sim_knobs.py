@@ -1,17 +1,20 @@
-"""Every documented knob of a scenario acts: changing it changes the record.
+"""Every documented knob of a scenario acts: changing it changes the record, in the direction that physics or its definition says.
 
-The table below names, for every leaf field of the schema, another value and whatever else has to be set for the
-field to matter; a test holds the table to the schema, so that a new field cannot come without its effect.
+`TRAFFIC` and `SEEN` name, for every leaf field of the schema, another value and whatever else has to be set for the
+field to matter. `knob_moves` names a figure of the record that must rise, fall or grow by a factor, or says why none
+must. Tests hold both to the schema, so that a new field cannot come without its effect.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import types
 import typing
 from pathlib import Path
 
 import pytest
+from knob_moves import MOVES, UNSIGNED, figure
 from pydantic import BaseModel
 from recording_examples import record_flight
 from sim_examples import example
@@ -21,6 +24,7 @@ from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.record import SortieRecord
 
 NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record", "limits")
 """Words for people, what is asserted about the outcome, what is kept beside the record, and wall-clock time."""
@@ -370,6 +374,30 @@ def test_the_table_names_every_field_of_the_schema() -> None:
     assert knobs == set(TRAFFIC) | set(SEEN)
 
 
+def test_every_knob_has_a_direction_or_a_reason_for_none() -> None:
+    assert MOVES.keys() | UNSIGNED.keys() == {f for f in (*TRAFFIC, *SEEN) if f != "events.kind"}
+    assert not MOVES.keys() & UNSIGNED.keys()
+
+
+@functools.cache
+def flown(*settings: str) -> SortieRecord:
+    """Many knobs are changed from one and the same sortie."""
+    return run_sortie(example(*settings))
+
+
+def assert_moved(field: str, before: SortieRecord, after: SortieRecord) -> None:
+    """The figure that the knob acts on has moved as it must."""
+    if field in MOVES:
+        name, way = MOVES[field]
+        a, b = figure(name, before), figure(name, after)
+        if isinstance(way, str):
+            assert (b > a) if way == ">" else (b < a), f"{name}: {a:.6g} before, {b:.6g} after, must be {way}"
+        else:
+            assert b == pytest.approx(way * a, rel=0.02), (
+                f"{name}: {a:.6g} before, {b:.6g} after, must be {way:g} times it"
+            )
+
+
 def place(field: str, shared: tuple[str, ...]) -> str:
     """Where `--set` finds the field: lists are addressed by the item that the settings put there."""
     last_phase = 0 if FIXED in shared else 1
@@ -400,14 +428,14 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     if "policy.name=CROSSING" in shared:
         Path(tmp_path / "crossing.py").write_text(CROSSING)
         shared = (*shared, f"policy.name={tmp_path / 'crossing.py'}:decide", "policy.params={}")
-    before = run_sortie(example(*shared))
-    after = run_sortie(example(*shared, *change))
+    before, after = flown(*shared), run_sortie(example(*shared, *change))
     assert after.fingerprint != before.fingerprint
+    assert_moved(field, before, after)
 
 
 @pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW, STORMS])
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
-    assert run_sortie(example(event)).fingerprint != run_sortie(example()).fingerprint
+    assert flown(event).fingerprint != flown().fingerprint
 
 
 SHORT = (
@@ -418,23 +446,18 @@ SHORT = (
 )
 
 
-@pytest.fixture(scope="module")
-def seen() -> str:
-    return run_sortie(example(*SHORT)).fingerprint
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("field", SEEN)
-def test_a_knob_of_perception_changes_the_record(
-    field: str, seen: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_knob_of_perception_changes_the_record(field: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     value, shared = SEEN[field]
     value, *shared = recorded(tmp_path_factory.mktemp("recorded"), value, *shared)
-    before = run_sortie(example(*SHORT, *shared)).fingerprint if shared else seen
+    before = flown(*SHORT, *shared)
     if value == "WEIGHTS":
         value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
     change = f"{place(field, tuple(shared))}={value}"
-    assert run_sortie(example(*SHORT, *shared, change)).fingerprint != before
+    after = run_sortie(example(*SHORT, *shared, change))
+    assert after.fingerprint != before.fingerprint
+    assert_moved(field, before, after)
 
 
 def recorded(folder: Path, *texts: str) -> list[str]:
