@@ -369,7 +369,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "events.drift_ppm": ("error of stamps", "<"),
     "events.rate_hz": ("drops", ">"),
     "perception.weights": ("detections", "<"),
-    "perception.sample_rate_hz": ("fusions", 1 / 2),
+    "perception.sample_rate_hz": ("fusions", ">"),
     "perception.fusion_delay_s": ("age at fusion", ">"),
     "perception.max_age_s": ("peers fused", "<"),
     "perception.score_threshold": ("detections", "<"),
