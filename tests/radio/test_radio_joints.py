@@ -37,6 +37,7 @@ from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.bursts import PairStates
 from sortie.radio.channel.draws import StreamShadowing
 from sortie.radio.channel.pathloss import path_loss_db
+from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.channel.snr import SQUARE, Channel
 from sortie.radio.channel.traces import read_links
 from sortie.radio.goodput import RISE, Goodput
@@ -142,6 +143,25 @@ def test_shadowing_goes_on_from_one_block_of_frames_to_the_next(n: int, distance
     assert by_frame.max() < few * usual
     late = np.nanmean(steps[:, -7:], axis=1)  # pairs of the last drones
     assert late.max() < 6.0 * usual
+
+
+@pytest.mark.parametrize("n", [3, SQUARE + 8])
+def test_a_field_of_shadows_has_the_time_of_the_flight_in_every_block(n: int) -> None:
+    """Also after the fleet has taken another way."""
+    frames = 2200 if n <= SQUARE else 200
+    at = np.zeros((frames, n, 3))
+    at[:, :, 0], at[:, :, 2] = np.arange(n) * 20.0, 60.0
+    channel, field = Channel(AirSettings(shadowing_distance_m=60.0), at, 2, 0, 0.1), ShadowField(3.5, 60.0, 4.5, 2, 0)
+    other = at.copy()
+    other[frames // 2 + 1 :, :, 1] = np.arange(n) * 5.0
+    for frame in range(frames):
+        if frame == frames // 2 + 1 and n <= SQUARE:
+            channel.reroute(other)
+            at = other
+        channel.advance()
+        if frame % 16 in (0, 15):
+            wanted = field.between(at[frame], 0.1 * frame)
+            np.testing.assert_allclose(np.nan_to_num(channel.shadow_db), wanted, atol=1e-3)
 
 
 def test_a_sender_knows_the_frame_before_whatever_has_changed_since() -> None:
