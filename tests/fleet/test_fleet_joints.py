@@ -112,6 +112,15 @@ perception: {detector: none, compute_delay_s: 0.04}
     assert [e.compute_delay_s for e in equipment_of(made).values()] == [0.04, 0.0, 0.04, 0.04, 0.04]
 
 
+def test_a_make_may_fly_lower_than_the_fleet() -> None:
+    fleet = scenario(
+        "fleet: {drones: 3, formation: {altitude_m: 50}, makes: [{name: low, drones: [1], altitude_offset_m: -20}, "
+        "{name: high, drones: [2], altitude_offset_m: 15}]}"
+    ).fleet
+    assert fleet.altitudes_m == (50.0, 30.0, 65.0)
+    assert fly(fleet, 1.0, 0.1, 1).position_m[0, :, 2] == pytest.approx([50.0, 30.0, 65.0], abs=2.5)
+
+
 # --- packs ----------------------------------------------------------------------------------------------
 
 

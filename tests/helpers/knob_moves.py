@@ -270,6 +270,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "fleet.airframe.tip_speed_mps": ("rotor", ">"),
     "fleet.airframe.drag_area_m2": ("rotor", ">"),
     "fleet.airframe.air_density_kgpm3": ("rotor", ">"),
+    "fleet.airframe.power_params": ("rotor", 1 / 2),
     "fleet.trace": ("charge of 1", "<"),
     "fleet.makes.drones": ("snr from 1", ">"),  # drone 1 is no longer the weak sender
     "fleet.makes.battery": ("charge of 1", "<"),
@@ -310,6 +311,9 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "radio.noise_figure_db": ("snr", "<"),
     "radio.antenna": ("snr", "<"),
     "radio.path_loss": ("snr", ">"),
+    "radio.path_loss_params": ("snr", ">"),
+    "radio.link": ("snr's spread", ">"),
+    "radio.link_params": ("snr's spread", "<"),
     "radio.path_loss_exponent": ("snr", "<"),
     "radio.shadowing_sigma_db": ("snr's spread", ">"),
     "radio.rician_k_db": ("airtime", ">"),
@@ -338,6 +342,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "context.roster": ("descriptor's bytes", ">"),
     "context.trust": ("doubts", "<"),
     "perception.detector": ("detections", ">"),
+    "perception.detector_params": ("detections", "<"),
     "perception.compute_delay_s": ("time from look to sending", ">"),
     "perception.people.waypoints_m": ("people's east", ">"),
     "perception.people.speed_mps": ("people's north", ">"),
@@ -364,6 +369,8 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "events.loss_db": ("descriptors heard", ">"),  # over a dead link no payload is sent
     "events.position_m": ("snr", ">"),
     "events.power_dbm": ("snr", "<"),
+    "events.model": ("snr", ">"),  # a calm weakens no link
+    "events.params": ("snr", ">"),
     "events.lost_fraction": ("charge of 1", ">"),
     "events.skew_s": ("error of stamps", ">"),
     "events.drift_ppm": ("error of stamps", "<"),
