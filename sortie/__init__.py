@@ -15,7 +15,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sortie._api import CampaignResult, Comparison, campaign, check, compare, env, fly, load, open_run, replay
+    from sortie._api import (
+        CampaignResult,
+        Comparison,
+        campaign,
+        check,
+        compare,
+        env,
+        fly,
+        load,
+        open_campaign,
+        open_run,
+        replay,
+    )
     from sortie._run import Run
     from sortie.policies.contract import (
         Descriptor,
@@ -40,7 +52,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run",
+    "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "open_campaign",
     "Run", "Comparison", "Replay", "CampaignResult", "Scenario",
     "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
     "Reposition", "looks_from", "boxes_across_networks", "SortieError", "ScenarioError", "PolicyError", "RunError",
@@ -49,7 +61,8 @@ __all__ = [
 
 _HOMES = {
     "sortie._api": (
-        "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "Comparison", "CampaignResult",
+        "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "open_campaign", "Comparison",
+        "CampaignResult",
     ),
     "sortie._run": ("Run",),
     "sortie.policies.contract": (

@@ -1,27 +1,30 @@
-"""The `sortie` command as it starts: Ctrl-C is one line also while what the commands need is still being imported."""
+"""The `sortie` command as it starts: Ctrl-C and SIGTERM are one line while what the commands need is still being imported."""
 
 from __future__ import annotations
 
 import os
 import signal
+from typing import Any
 
 
 def main() -> None:
     """Entry point of the `sortie` command."""
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # where it is ignored, it stays so
-        signal.signal(signal.SIGINT, _leave)
+    usual: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    ours = [number for number, handler in usual.items() if signal.getsignal(number) == handler]  # ignored ones stay so
+    for number in ours:
+        signal.signal(number, _leave)
     from sortie.sim.cli.app import main as command  # here: it takes a second
 
-    if before is signal.default_int_handler:
-        signal.signal(signal.SIGINT, before)
+    for number in ours:
+        signal.signal(number, usual[number])
     command()
 
 
-def _leave(*_: object) -> None:
+def _leave(number: int, *_: object) -> None:
     """Ends at once: libraries that are being imported take an exception for an optional part that is missing, and go on."""
-    os.write(2, b"interrupted; nothing was written\n")
-    os._exit(130)
+    what = b"interrupted" if number == signal.SIGINT else b"ended by SIGTERM"
+    os.write(2, what + b"; nothing was written\n")
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
-"""The public functions: load, fly, compare, replay, campaign, check, env, open_run."""
+"""The public functions: load, fly, compare, replay, campaign, check, env, open_run, open_campaign."""
 
 from __future__ import annotations
 
 import inspect
+import math
 import operator
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -284,7 +287,7 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
 
 @dataclass(frozen=True, eq=False)
 class CampaignResult:
-    """What is finished of a campaign; made by `sortie.campaign`."""
+    """What is finished of a campaign; made by `sortie.campaign` and `sortie.open_campaign`."""
 
     path: Path
     """Its folder."""
@@ -299,10 +302,14 @@ class CampaignResult:
 
     @cached_property
     def rows(self) -> pa.Table:
-        """A row a run: its varied fields, policy, seed, status and the campaign's metrics."""
-        from sortie.sim.campaign.rows import read_rows
+        """A row a run: its varied fields, policy, seed, status and the campaign's metrics. Each row is checked against its hash.
 
-        return read_rows(self.path).all
+        Raises:
+            RunError: nothing is finished, a row is broken, or the Parquet table or its manifest was changed.
+        """
+        from sortie.sim.campaign.rows import read_checked
+
+        return read_checked(self.path).all
 
     def report(self) -> Path:
         """Write `report.md` with its figures into the folder, and return its path.
@@ -322,21 +329,31 @@ def campaign(
     out: str | Path | None = None,
     workers: int | None = 0,
     scheduler: str | None = None,
+    security: tuple[str | Path, str | Path, str | Path] | None = None,
+    worker_memory_gb: float | None = None,
+    wait_for_workers_s: float = 300.0,
     resume: bool = False,
     retry_failed: bool = False,
     progress: Callable[[Any], None] | None = None,
+    notice: Callable[[str], None] | None = None,
 ) -> CampaignResult:
     """Fly a campaign: many sorties over what its file varies. Interrupted at any moment, the same call goes on.
 
     Args:
         campaign: a campaign file, or a library campaign's name.
         out: its folder; None takes `runs/campaign-NAME`.
-        workers: worker processes; 0 flies in this process, or in one other for policies in files of one's own. None takes one a core. A script that asks for workers keeps
-            its calls under `if __name__ == "__main__":`, since each worker imports the script.
+        workers: worker processes; 0 flies in one process beside this one, without dask. None takes one a core. A script
+            that asks for workers keeps its calls under `if __name__ == "__main__":`, since each worker imports the script.
         scheduler: the address of a dask cluster that is running, `tcp://host:8786`.
+        security: PEM files for TLS with the cluster: the authority's certificate, one's own, its key.
+        worker_memory_gb: what a worker may take; a run that needs more is a failed run. None divides the machine's memory
+            among the workers, and leaves it to the workers of a cluster that is joined.
+        wait_for_workers_s: how long to wait while a cluster has no workers.
         resume: only go on; an error if there is nothing to go on with.
         retry_failed: fly runs that failed once more.
         progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
+        notice: called with a line where a cluster has no workers, and for each thing that somebody else changed in the
+            folder; None warns.
 
     Raises:
         ScenarioError, PolicyError: what is wrong with the campaign, before anything flies.
@@ -356,17 +373,59 @@ def campaign(
         raise RunError("workers and scheduler: name one of them")
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 0):
         raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
+    if worker_memory_gb is not None and not 0 < worker_memory_gb < math.inf:
+        raise RunError(f"worker_memory_gb: {worker_memory_gb!r}, must be above 0, or None")
     _ensure_callable("progress", progress)
+    _ensure_callable("notice", notice)
+    tell = _warn if notice is None else notice
+    files = None if security is None else _certificates(security)
     study = load_campaign(as_path("campaign", campaign))
     folder = campaign_folder(study.campaign.campaign) if out is None else as_path("out", out)
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     with user_errors():
         plan = make_plan(study)
         ensure_usable(folder, plan)
-        with open_engine(count, scheduler, plan.user_code) as engine:
+        with open_engine(
+            count, scheduler, security=files, wait_s=wait_for_workers_s, notice=tell,
+            memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
+        ) as engine:  # fmt: skip
             watch = (lambda p: None) if progress is None else progress
-            done = run_campaign(plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch)
+            done = run_campaign(
+                plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch, notice=tell
+            )
     return CampaignResult(folder, done.finished, done.failed, done.flown, done.seconds)
+
+
+def open_campaign(folder: str | Path) -> CampaignResult:
+    """A campaign's folder, to read what is finished of it.
+
+    Raises:
+        RunError: no campaign there, a row of it is broken, or its Parquet table or manifest was changed.
+
+    Example:
+        >>> sortie.open_campaign("runs/campaign-link_battery").rows    # doctest: +SKIP
+    """
+    from sortie.sim.campaign.store import CampaignTable
+    from sortie.sim.campaign.table import foreign_line
+
+    path = as_path("folder", folder)
+    with user_errors(), closing(CampaignTable(path)) as store:
+        finished, failed = store.count()
+        store.ensure_table()
+    if foreign := foreign_line(path):
+        _warn(foreign)
+    return CampaignResult(path, finished, failed, 0, 0.0)
+
+
+def _certificates(security: Sequence[str | Path]) -> tuple[Path, Path, Path]:
+    if isinstance(security, str) or len(security) != 3:
+        raise RunError(f"security: {security!r}, must be three paths: CA, certificate, key")
+    ca, cert, key = (as_path("security", file) for file in security)
+    return ca, cert, key
+
+
+def _warn(line: str) -> None:
+    warnings.warn(line, stacklevel=3)
 
 
 def campaign_folder(name: str) -> Path:

@@ -32,8 +32,8 @@ HOMES = {
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/mavlink.py",),
     "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
-    "distributed": ("sim/campaign/engine.py",),
-    "dask": ("sim/campaign/engine.py",),
+    "distributed": ("sim/campaign/cluster.py",),
+    "dask": ("sim/campaign/cluster.py",),
     "SALib": ("sim/campaign/*",),
     "cyclonedds": ("sim/live/*",),
 }

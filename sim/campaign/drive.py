@@ -50,6 +50,7 @@ def run_campaign(
     resume_only: bool = False,
     retry_failed: bool = False,
     progress: Callable[[Progress], None] = lambda p: None,
+    notice: Callable[[str], None] = lambda line: None,
 ) -> Progress:
     """Fly what is missing of a campaign into its folder.
 
@@ -57,12 +58,15 @@ def run_campaign(
 
     Args:
         retry_failed: runs that failed count as missing.
+        notice: called with a line for each thing that was found changed in the folder, and is put right.
 
     Raises:
         RunError: a folder that cannot be used, a cluster that is not there, a disk that is full.
     """
     store = CampaignStore(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
+        for line in store.complaints():
+            notice(line)
         done = _drive(plan, store, engine, progress)
         store.export()
         return done

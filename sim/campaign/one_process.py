@@ -1,7 +1,7 @@
-"""Runs with policies of a user's own fly in a process beside the driver's, or beside the worker's on a cluster.
+"""A process beside the driver's, or beside the worker's on a cluster where policies of a user's own fly.
 
 What ends the process, or cannot be interrupted, is one failed run, and the next one flies in a new process. `OneProcess` is
-also an engine: the one that flies such a campaign with `--workers 0`, without dask.
+also an engine: the one that flies a campaign with `--workers 0`, without dask.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from multiprocessing.connection import Connection
 
 from sortie.scenarios.plugins.user_calls import STUCK
@@ -33,9 +33,11 @@ class OneProcess:
 
     workers = 1
 
-    def __init__(self, undisturbed: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
-        """Args: `undisturbed` keeps Ctrl-C from a process that is started within it."""
-        self._undisturbed = undisturbed
+    def __init__(
+        self, undisturbed: Callable[[], AbstractContextManager[None]] = nullcontext, memory_b: int | None = None
+    ) -> None:
+        """Args: `undisturbed` keeps Ctrl-C from a process that is started within it; `memory_b` is what it may take."""
+        self._undisturbed, self.memory_b = undisturbed, memory_b
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
 
@@ -71,7 +73,7 @@ class OneProcess:
         assert self._process is not None  # noqa: S101 - it was started just now
         assert self._pipe is not None  # noqa: S101
         try:
-            self._pipe.send((code, task))
+            self._pipe.send((code, task, self.memory_b))
             answer: RunResult | Exception = self._pipe.recv()
             return answer
         except (EOFError, OSError):
@@ -89,13 +91,14 @@ class OneProcess:
         self._pipe = ours
 
 
-def fly_apart(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
+def fly_apart(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> tuple[list[RunResult], float]:
     """`fly_in_worker` for a worker of a cluster: runs with a user's code fly in a process beside it."""
     if not any(flies_user_code(task) for task in tasks):
-        return fly_in_worker(code, tasks)
+        return fly_in_worker(code, tasks, memory_b)
     begin_s = time.perf_counter()
     if not hasattr(_OF_THREAD, "one"):
         _OF_THREAD.one = OneProcess()
+    _OF_THREAD.one.memory_b = memory_b
     return [_OF_THREAD.one.fly(code, task) for task in tasks], time.perf_counter() - begin_s
 
 
@@ -108,14 +111,15 @@ def serve(file: int) -> None:
     threading.Thread(target=_end_with, args=(driver,), daemon=True).start()
     while True:
         try:
-            code, task = pipe.recv()
-        except EOFError:
+            code, task, memory_b = pipe.recv()
+        except (EOFError, OSError):  # the driver was killed
             return
         try:
-            answer: RunResult | Exception = fly_in_worker(code, [task])[0][0]
+            answer: RunResult | Exception = fly_in_worker(code, [task], memory_b)[0][0]
         except Exception as error:
             answer = error
-        pipe.send(answer)
+        with suppress(OSError):
+            pipe.send(answer)
 
 
 def _end_with(driver: int) -> None:

@@ -36,7 +36,7 @@ from sortie.sim.identity import code_version, file_digest
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.outcome_fields import check_number, open_keys
 
-FORMAT = 1
+FORMAT = 2
 
 
 class PlannedRun(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, 
 from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
 from sortie.sim.campaign.sensitivity import COLUMNS, MEANING, sensitivity
 from sortie.sim.campaign.store import CampaignTable
+from sortie.sim.campaign.table import TABLE
 from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.results.outcome_fields import possible
@@ -25,8 +26,12 @@ REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
 MAX_FAILED = 20
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, notice: Callable[[str], None] = lambda line: None) -> Path:
     """Write report.md, figures and the Parquet table into a campaign's folder; returns the report's path.
+
+    Args:
+        folder: the campaign's folder.
+        notice: called with a line for each thing that somebody else changed in the folder, and that is put right.
 
     Raises:
         RunError: no campaign there, nothing finished, or the disk refuses.
@@ -34,6 +39,8 @@ def write_report(folder: Path) -> Path:
     """
     rows = read_rows(folder)
     with closing(CampaignTable(folder)) as store:
+        for line in store.complaints():
+            notice(line)
         store.export()
     try:
         pictures = {VARIED: False, PARETO: False}
@@ -77,9 +84,10 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
     yield from _failed(rows, folder)
     yield "\n## The rows\n"
     yield f"""```python
-polars.read_parquet("{folder}/runs/*.parquet")
-pandas.read_parquet("{folder}/runs")
-duckdb.sql("from '{folder}/runs/*.parquet'")
+sortie.open_campaign("{folder}").rows  # checked against their hashes
+polars.read_parquet("{folder}/{TABLE}")
+pandas.read_parquet("{folder}/{TABLE}")
+duckdb.sql("from '{folder}/{TABLE}'")
 ```"""
 
 

@@ -1,36 +1,33 @@
 """A campaign's folder: one SQLite file with the plan and a row per finished run, and the Parquet table made of it.
 
     campaign.sqlite     the plan, and the rows; a row is committed before progress counts it
-    runs/table.parquet  the rows of finished parts, in the order of runs; written at the end and with every report
+    runs/table.parquet  the rows of finished parts; written at the end and with every report
+    manifest.json       what the table must be
 
-A part is a fixed stretch of runs. The table is a function of the rows alone, so an interruption leaves no trace in it.
+Each row is stored with a SHA-256 over the plan, the run's number and the values. A part is a fixed stretch of runs. The table is a function of the rows alone, so an interruption leaves no trace in it.
 """
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import sqlite3
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from sortie.scenarios.schema.campaign import Choice, Column, Grid
 from sortie.sim.campaign.plan import FORMAT, CampaignPlan
+from sortie.sim.campaign.table import columns, foreign_line, row_of, row_type, table_fault, write_table
 from sortie.sim.campaign.work import RunResult
-from sortie.sim.folders import RunError, ensure_folder, writing_durably
+from sortie.sim.folders import RunError, ensure_folder
 
-FILE, TABLE, LOCK = "campaign.sqlite", "runs/table.parquet", ".lock"
-FIXED: dict[str, pa.DataType] = {
-    "run": pa.int64(), "unit": pa.int64(), "cell": pa.int64(), "replication": pa.int64(), "policy": pa.string(),
-    "seed": pa.int64(), "status": pa.string(), "error": pa.string(), "fingerprint": pa.string(), "key": pa.string(),
-}  # fmt: skip
-"""Columns of every table. Each varied field (its value) and each metric (float, null without one) adds a column."""
+FILE, LOCK = "campaign.sqlite", ".lock"
+MAX_NAMED = 5
+"""Broken rows that one line names."""
 TIMEOUT_S = 60
 """How long a driver waits for a report that reads, and a report for a driver that writes."""
 _DISK = {
@@ -57,9 +54,9 @@ class CampaignTable:
         try:
             with _errors(folder):
                 plan = _plan(self._db, folder)
-            if plan is None:
-                raise RunError(f"{folder}: no campaign there ({FILE} is empty)")
-            self._use(plan)
+                if plan is None:
+                    raise RunError(f"{folder}: no campaign there ({FILE} is empty)")
+                self._use(plan)
         except BaseException:
             self._db.close()
             raise
@@ -67,6 +64,7 @@ class CampaignTable:
     def _use(self, plan: CampaignPlan) -> None:
         self.plan = plan
         self._schema = pa.schema(list(columns(plan).items()), {"sortie.campaign": plan.digest})
+        self._type = row_type(plan)
         self.parts = -(-plan.runs // plan.shard)
 
     def runs_of(self, part: int) -> range:
@@ -92,23 +90,35 @@ class CampaignTable:
         with _errors(self.folder):
             return self._db.execute("SELECT run FROM rows LIMIT 1").fetchone() is None
 
+    def count(self) -> tuple[int, int]:
+        """How many runs have a row, and how many of these failed. Raises RunError where a row is broken."""
+        rows = [row["status"] for row in self._rows(0, self.plan.runs)]
+        return len(rows), rows.count("failed")
+
+    def complaints(self) -> Iterator[str]:
+        """What somebody else did to the folder and `export` puts right or passes over, a line for each."""
+        if fault := table_fault(self.folder, self.plan):
+            yield f"{fault}; it is written anew from {FILE}"
+        if foreign := foreign_line(self.folder):
+            yield foreign
+
+    def ensure_table(self) -> None:
+        """Refuse a table that is not as it was written.
+
+        Raises:
+            RunError: it, or its manifest, was changed.
+        """
+        if fault := table_fault(self.folder, self.plan):
+            raise RunError(f"{fault}; `sortie campaign report {self.folder}` writes both anew")
+
     def export(self) -> None:
-        """Write the finished parts as a Parquet table.
+        """Write the finished parts as a Parquet table, with its manifest.
 
         Raises:
             RunError: the disk refuses, or a row is broken.
         """
-        path = self.folder / TABLE
         with _errors(self.folder):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with (self.folder / ".table.lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)  # a report and a driver may write at the same time
-                with (
-                    writing_durably(path) as file,
-                    pq.ParquetWriter(file, self._schema, compression="zstd", write_page_checksum=True) as writer,
-                ):
-                    for table in filter(None, map(self.part, range(self.parts))):
-                        writer.write_table(table)
+            write_table(self.folder, self.plan, filter(None, map(self.part, range(self.parts))))
 
     def close(self) -> None:
         """Close the file."""
@@ -123,20 +133,23 @@ class CampaignTable:
             yield row
 
     def _read(self, start: int, stop: int) -> Iterator[tuple[int, dict[str, Any] | None]]:
-        """Runs and their rows, in order; None for a row whose checksum is wrong."""
-        ask = "SELECT run, row, checksum FROM rows WHERE run >= ? AND run < ? ORDER BY run"
+        """Runs and their rows, in order; None for one whose hash or shape is wrong."""
+        ask = "SELECT run, row, sha256 FROM rows WHERE run >= ? AND run < ? ORDER BY run"
         with _errors(self.folder):
-            for run, text, checksum in self._db.execute(ask, (start, stop)):
-                yield (
-                    run,
-                    dict(zip(self._schema.names, json.loads(text), strict=True))
-                    if checksum == self._checksum(run, text)
-                    else None,
-                )
+            for run, text, sha256 in self._db.execute(ask, (start, stop)):
+                yield run, self._row(run, text) if sha256 == self._sha256(run, text) else None
 
-    def _checksum(self, run: int, text: Any) -> int:
-        """Of a row of this campaign: a row that was copied from another has another checksum."""
-        return zlib.crc32(f"{self.plan.digest} {run} {text}".encode(errors="replace"))
+    def _row(self, run: int, text: str) -> dict[str, Any] | None:
+        """A row's values by column; None where they are not what the campaign's columns are."""
+        try:
+            row = dict(zip(self._schema.names, self._type.validate_json(text, strict=True), strict=True))
+        except ValueError:
+            return None
+        return row if row["run"] == run else None
+
+    def _sha256(self, run: int, text: Any) -> str:
+        """Of a row of this campaign: a row that was copied from another has another one."""
+        return hashlib.sha256(f"{self.plan.digest} {run} {text}".encode(errors="replace")).hexdigest()
 
 
 class CampaignStore(CampaignTable):
@@ -175,18 +188,29 @@ class CampaignStore(CampaignTable):
                 with self._db:
                     self._db.execute("BEGIN")
                     self._db.execute("CREATE TABLE plan (digest TEXT, spec TEXT)")
-                    self._db.execute("CREATE TABLE rows (run INTEGER PRIMARY KEY, row TEXT, checksum INTEGER)")
+                    self._db.execute("CREATE TABLE rows (run INTEGER PRIMARY KEY, row TEXT, sha256 TEXT)")
                     self._db.execute("INSERT INTO plan VALUES (?, ?)", (self.plan.digest, json.dumps(self.plan.spec)))
         self._done = bytearray(self.plan.runs)
         self.failed = 0
         """Runs on disk that failed."""
+        self.broken: list[int] = []
+        """Runs whose rows are broken; they are flown again."""
         for run, row in self._read(0, self.plan.runs):
+            if row is None:
+                self.broken.append(run)
             failed = row is not None and row["status"] == "failed"
             if row is not None and not (failed and retry_failed):
                 self._done[run] = 1
                 self.failed += failed
         self.finished = sum(self._done)
         """Runs whose rows are on disk."""
+
+    def complaints(self) -> Iterator[str]:
+        """As of `CampaignTable`; rows that are broken, too."""
+        if self.broken:
+            runs = ", ".join(map(str, self.broken[:MAX_NAMED])) + (", …" if len(self.broken) > MAX_NAMED else "")
+            yield f"{self.folder / FILE}: {len(self.broken)} broken rows are flown again: runs {runs}"
+        yield from super().complaints()
 
     def is_done(self, part: int) -> bool:
         """Whether all rows of a part are on disk."""
@@ -207,7 +231,7 @@ class CampaignStore(CampaignTable):
         with _errors(self.folder), self._db:
             for run, result in new.items():
                 text = json.dumps(list(row_of(self.plan, self._schema, result).values()))
-                self._db.execute("REPLACE INTO rows VALUES (?, ?, ?)", (run, text, self._checksum(run, text)))
+                self._db.execute("REPLACE INTO rows VALUES (?, ?, ?)", (run, text, self._sha256(run, text)))
         for run, result in new.items():
             self._done[run] = 1
             self.failed += result.status == "failed"
@@ -224,44 +248,6 @@ class CampaignStore(CampaignTable):
         """Release the folder."""
         super().close()
         self._lock.close()
-
-
-def columns(plan: CampaignPlan) -> dict[str, pa.DataType]:
-    """The table's columns and their types."""
-    types = dict(FIXED)
-    for name, spread in plan.campaign.vary.items():
-        values: Sequence[Any] = ()
-        if isinstance(spread, Choice | Grid):
-            values = spread.values
-        elif isinstance(spread, Column):
-            values = plan.spec["columns"][name]
-        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-        types[name] = pa.float64() if numbers else pa.string()
-    for name in plan.campaign.metrics:
-        if name in types:
-            raise RunError(f"metrics: {name}, is the name of another column")
-        types[name] = pa.float64()
-    return types
-
-
-def row_of(plan: CampaignPlan, schema: pa.Schema, result: RunResult) -> dict[str, Any]:
-    """A result's row of the table, its columns in the schema's order."""
-    at = plan.at(result.run)
-    varied = {
-        name: json.dumps(value) if schema.field(name).type == pa.string() and not isinstance(value, str) else value
-        for name, value in plan.varied(at.cell).items()
-    }
-    return {
-        **at._asdict(),
-        "policy": plan.policies[at.policy],
-        "seed": plan.seed(at.cell),
-        "status": result.status,
-        "error": result.error,
-        "fingerprint": result.fingerprint,
-        "key": result.key,
-        **varied,
-        **dict(zip(plan.campaign.metrics, result.values, strict=True)),
-    }
 
 
 def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
@@ -284,7 +270,7 @@ def _check_same(db: sqlite3.Connection, folder: Path, plan: CampaignPlan) -> boo
         return old is None
     if {**old.spec, "code": 0} == {**spec, "code": 0}:
         raise RunError(f"{folder}: holds results of Sortie {old.code}, this is {plan.code}; name another folder")
-    differs = next(key for key in spec if old.spec.get(key) != spec[key])
+    differs = next(key for key in {**spec, **old.spec} if old.spec.get(key) != spec.get(key))
     raise RunError(
         f"{folder}: holds results of another campaign, its {_name(old.spec, spec, differs)} differs; name another folder"
     )
@@ -292,7 +278,7 @@ def _check_same(db: sqlite3.Connection, folder: Path, plan: CampaignPlan) -> boo
 
 def _name(old: Mapping[str, Any], new: Mapping[str, Any], key: str) -> str:
     """A specification's field that differs, named to its second level."""
-    a, b = old.get(key), new[key]
+    a, b = old.get(key), new.get(key)
     if isinstance(a, dict) and isinstance(b, dict):
         return f"{key}.{next(k for k in {**b, **a} if a.get(k) != b.get(k))}"
     return key
@@ -325,8 +311,9 @@ def _errors(folder: Path) -> Iterator[None]:
         raise _refused(folder, error.strerror or str(error)) from error
     except RunError:
         raise
-    except (ValueError, TypeError, KeyError) as error:
-        raise RunError(f"{folder / FILE}: is broken ({error}); remove it to fly the campaign again") from error
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise RunError(f"{folder / FILE}: is broken ({what}); remove it to fly the campaign again") from error
 
 
 def _refused(folder: Path, reason: str) -> RunError:

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from sortie.perception.network.memory import keep_freed
 from sortie.scenarios.schema import Scenario
+from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -54,8 +55,8 @@ def task_key(task: str, code: str) -> str:
     return hashlib.sha256(f"{code}\n{task}".encode()).hexdigest()[:32]
 
 
-def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
-    """Fly some runs one after the other; a run that fails gives a row that says so.
+def fly_batch(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> tuple[list[RunResult], float]:
+    """Fly some runs one after the other; a run that fails, or needs more than `memory_b`, gives a row that says so.
 
     Returns:
         The results, and the seconds that they took.
@@ -68,15 +69,16 @@ def fly_batch(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]
         raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1):  # sums in one order: a matrix product on two threads may round differently than on one
-        return [_fly(run, task, code) for run, task in tasks], time.perf_counter() - begin_s
+    # sums in one order: a matrix product on two threads may round differently than on one
+    with threadpool_limits(1), limited(memory_b):
+        return [_fly(run, task, code, memory_b) for run, task in tasks], time.perf_counter() - begin_s
 
 
-def fly_in_worker(code: str, tasks: Sequence[Task]) -> tuple[list[RunResult], float]:
+def fly_in_worker(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> tuple[list[RunResult], float]:
     """`fly_batch`, in a process that is the campaign's alone."""
     own_process()
     keep_freed()  # dask's nanny has its workers give back every 64 KiB, which costs a third of a run
-    return fly_batch(code, tasks)
+    return fly_batch(code, tasks, memory_b)
 
 
 def fly_task(task: str) -> SortieRecord:
@@ -100,7 +102,7 @@ def unpack(task: str) -> tuple[Scenario, int, int]:
     return scenario, fields["seed"], fields["replication"]
 
 
-def _fly(run: int, task: str, code: str) -> RunResult:
+def _fly(run: int, task: str, code: str, memory_b: int | None) -> RunResult:
     fields, key = json.loads(task), task_key(task, code)
     for path, digest in fields["files"].items():
         _check_file(path, digest)
@@ -109,7 +111,10 @@ def _fly(run: int, task: str, code: str) -> RunResult:
         result = outcome(record)
         values = tuple(number(result, name) for name in fields["metrics"])
     except Exception as error:  # whatever it is, the other runs go on
-        return RunResult(run, key, "failed", _in_one_line(error), "", (None,) * len(fields["metrics"]))
+        what = _in_one_line(error)
+        if memory_b is not None and isinstance(error, MemoryError):
+            what = f"MemoryError: more than {memory_b / 1e9:.3g} GB (--worker-memory)"
+        return RunResult(run, key, "failed", what, "", (None,) * len(fields["metrics"]))
     return RunResult(run, key, "done", "", record.fingerprint[:16], values)
 
 

@@ -14,6 +14,7 @@ from rich.progress import Progress as Bar
 from typer.core import TyperGroup
 
 import sortie
+from sortie.sim.campaign.signals import EndedError, ended_by_sigterm
 from sortie.sim.cli.console import err, out
 from sortie.sim.user_errors import user_errors
 
@@ -44,11 +45,30 @@ def run(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Number of worker processes; 0 flies in this process, or in one other for your own policies; default: one per core.",
+            help="Number of worker processes; 0 flies in one process, without dask; default: one per core.",
             min=0,
         ),
     ] = None,
     scheduler: Annotated[str | None, typer.Option(help="Use a running dask cluster: tcp://host:8786.")] = None,
+    security: Annotated[
+        tuple[Path, Path, Path] | None,
+        typer.Option(
+            metavar="CA CERT KEY",
+            help="TLS between driver, scheduler and workers: PEM files of the authority's certificate, your certificate, its key.",
+        ),
+    ] = None,
+    worker_memory: Annotated[
+        float | None,
+        typer.Option(
+            metavar="GB",
+            help="Memory that a worker may take; a run that needs more is a failed run. Default: this machine's memory divided "
+            "by the workers; on a cluster that is joined, what its workers were started with.",
+        ),
+    ] = None,
+    wait_for_workers: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="How long to wait while a cluster has no workers.", min=0),
+    ] = 300.0,
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="The campaign's folder; default: runs/campaign-NAME.")
     ] = None,
@@ -69,15 +89,17 @@ def run(
             raise RunError("--workers and --scheduler: name one of them")
         name = load_campaign(campaign).campaign.campaign
         folder = out_dir or campaign_folder(name)
-        with _bar(name) as show:
+        with ended_by_sigterm(), _bar(name) as show:
             done = sortie.campaign(
-                campaign, out=folder, workers=workers, scheduler=scheduler, resume=resume, retry_failed=retry_failed,
-                progress=show,
+                campaign, out=folder, workers=workers, scheduler=scheduler, security=security,
+                worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, resume=resume,
+                retry_failed=retry_failed, progress=show, notice=_notice,
             )  # fmt: skip
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as end:
         where = "" if folder is None else f" in {folder}"
-        err.print(f"interrupted; what is finished is kept{where}, the same command goes on", soft_wrap=True)
-        raise typer.Exit(130) from None
+        what, code = ("ended by SIGTERM", 143) if isinstance(end, EndedError) else ("interrupted", 130)
+        err.print(f"{what}; what is finished is kept{where}, the same command goes on", soft_wrap=True)
+        raise typer.Exit(code) from None
     out.print(_in_words(done), soft_wrap=True)
     if report_:
         report(folder)
@@ -92,9 +114,10 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
     """Write report.md and its figures from the finished runs."""
     with user_errors():
         from sortie.sim.campaign.report import write_report
+        from sortie.sim.campaign.table import TABLE
 
-        path = write_report(folder)
-    out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder}/runs/*.parquet[/bold]")
+        path = write_report(folder, _notice)
+    out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder / TABLE}[/bold]")
 
 
 def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
@@ -122,6 +145,10 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     with user_errors():
         scenario, seed, replication = unpack(plan.task(run))
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
+
+
+def _notice(line: str) -> None:
+    err.print(line, style="yellow", soft_wrap=True, markup=False)
 
 
 def _in_words(done: sortie.CampaignResult) -> str:

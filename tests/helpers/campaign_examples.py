@@ -16,7 +16,7 @@ from sortie.scenarios.reading.campaign import load_campaign
 from sortie.sim.campaign.plan import CampaignPlan, make_plan
 from sortie.sim.campaign.rows import CampaignRows
 from sortie.sim.campaign.store import FILE
-from sortie.sim.campaign.work import RunResult, Task, task_key
+from sortie.sim.campaign.work import RunResult, Task, fly_batch, task_key
 
 CLUSTER = pytest.mark.filterwarnings(
     "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
@@ -89,6 +89,16 @@ class Pretended:
             yield [pretend(run, task, code)]
 
 
+class InProcess:
+    """An engine that flies one run after the other in the test's own process."""
+
+    workers = 1
+
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+        for task in tasks:
+            yield fly_batch(code, [task])[0]
+
+
 def pretend(run: int, task: str, code: str) -> RunResult:
     """A row made of the task."""
     asked, key = json.loads(task), task_key(task, code)
@@ -97,7 +107,7 @@ def pretend(run: int, task: str, code: str) -> RunResult:
     return RunResult(run, key, "done", "", key[:16], (value, float(asked["replication"])))
 
 
-__all__ = ["BASE", "CAMPAIGN", "Pretended", "plan", "pretend", "rows_on_disk", "table_bytes", "write"]
+__all__ = ["BASE", "CAMPAIGN", "InProcess", "Pretended", "plan", "pretend", "rows_on_disk", "table_bytes", "write"]
 
 
 def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> CampaignRows:

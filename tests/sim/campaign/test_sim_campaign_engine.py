@@ -10,12 +10,13 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, CLUSTER, Pretended, plan, table_bytes, write
+from campaign_examples import CAMPAIGN, CLUSTER, InProcess, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
-from sortie.sim.campaign import engine as engines
+from sortie.sim.campaign import cluster
+from sortie.sim.campaign.cluster import Dask
 from sortie.sim.campaign.drive import Progress, run_campaign
-from sortie.sim.campaign.engine import Dask, InProcess, open_engine
+from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import CampaignStore
@@ -98,64 +99,55 @@ class _Future:
     def exception(self) -> BaseException | None:
         return self.error
 
+    def add_done_callback(self, call: Any) -> None:
+        call(self)
+
 
 class _Client:
     """A cluster whose workers die of one run, and lose the results of some; it counts what is in flight."""
 
-    loop = None
+    status = "running"
 
     def __init__(self, deadly: int = -1, lost: frozenset[int] = frozenset()) -> None:
-        self.deadly, self.lost, self.batches, self.most = deadly, lost, list[int](), 0
+        self.deadly, self.lost, self.batches, self.most, self.flying = deadly, lost, list[int](), 0, 0
 
     def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
         return {"workers": {"a": {"nthreads": 1}, "b": {"nthreads": 1}}}
 
-    def submit(self, function: Any, code: str, batch: list[Task], **_: Any) -> _Future:
+    def submit(self, function: Any, code: str, batch: list[Task], memory_b: int | None, **_: Any) -> _Future:
         from distributed import KilledWorker
 
         self.batches.append(len(batch))
         dies = any(run == self.deadly for run, _ in batch)
         lost = any(run in self.lost for run, _ in batch)
-        return _Future(lambda: function(code, batch), KilledWorker("x", "y", 4) if dies else None, lost=lost)
+        self.flying += 1
+        self.most = max(self.most, self.flying)
 
+        def call() -> Any:
+            self.flying -= 1
+            return function(code, batch, memory_b)
 
-class _AsCompleted:
-    def __init__(self, client: _Client) -> None:
-        self.client, self.queue = client, list[_Future]()
-
-    def add(self, future: _Future) -> None:
-        self.queue.append(future)
-        self.client.most = max(self.client.most, len(self.queue))
-
-    def __iter__(self) -> Iterator[_Future]:
-        while self.queue:
-            yield self.queue.pop(0)
+        return _Future(call, KilledWorker("x", "y", 4) if dies else None, lost=lost)
 
 
 def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import distributed
-
     p, client = plan(tmp_path), _Client(deadly=17)
-    monkeypatch.setattr(distributed, "as_completed", lambda loop: _AsCompleted(client))
-    monkeypatch.setattr(engines, "BATCH_S", 1e9)  # as many a batch as there may be
-    monkeypatch.setattr(engines, "MAX_BATCH", 5)
+    monkeypatch.setattr(cluster, "BATCH_S", 1e9)  # as many a batch as there may be
+    monkeypatch.setattr(cluster, "MAX_BATCH", 5)
     done = run_campaign(p, tmp_path / "a", Dask(client))
     assert (done.finished, done.failed) == (48, 1)
     table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
     assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
     assert all(r["key"] == p.key(r["run"]) for r in table)
     assert max(client.batches) == 5
-    assert client.most <= engines.AHEAD * 2 + max(client.batches)  # no more than what is in flight
+    assert client.most <= cluster.AHEAD * 2 + max(client.batches)  # no more than what is in flight
 
 
-def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
     """The worker dies after its run has ended and before the result was fetched."""
-    import distributed
-
     p, client = plan(tmp_path), _Client(lost=frozenset({0, 7, 48}))
-    monkeypatch.setattr(distributed, "as_completed", lambda loop: _AsCompleted(client))
     done = run_campaign(p, tmp_path / "a", Dask(client))
     assert (done.finished, done.failed) == (p.runs, 0)
     assert sum(client.batches) == p.runs  # none was given out twice
@@ -310,7 +302,7 @@ def test_what_cannot_be_done_is_one_line(
 ) -> None:
     import distributed
 
-    monkeypatch.setattr(engines, "CONNECT_S", 0.2)
+    monkeypatch.setattr(cluster, "CONNECT_S", 0.2)
     monkeypatch.setattr(distributed, "Client", None)  # one that finds nobody would hang, and complain, when it goes
     path = write(tmp_path)
     if "--out" not in arguments:

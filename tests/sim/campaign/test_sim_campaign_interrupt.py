@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from campaign_examples import CAMPAIGN, CLUSTER, rows_on_disk, write
 
-from sortie.sim.campaign import engine as engines
 from sortie.sim.campaign.engine import open_engine
+from sortie.sim.campaign.signals import undisturbed
 from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")
@@ -116,7 +116,7 @@ def test_ctrl_c_waits_for_the_end_of_what_must_not_be_broken_off() -> None:
     blocked, before = [], signal.getsignal(signal.SIGINT)
 
     def work() -> None:
-        with engines._undisturbed():
+        with undisturbed():
             signal.raise_signal(signal.SIGINT)
             with subprocess.Popen(["sleep", "60"]) as child:
                 blocked.append(_blocks_ctrl_c(child.pid))

@@ -24,7 +24,8 @@ from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.report import write_report
 from sortie.sim.campaign.rows import find_row, read_rows
-from sortie.sim.campaign.store import FILE, TABLE, CampaignStore
+from sortie.sim.campaign.store import FILE, CampaignStore
+from sortie.sim.campaign.table import TABLE
 from sortie.sim.campaign.work import RunResult, Task
 from sortie.sim.folders import RunError
 
@@ -68,17 +69,15 @@ def test_a_damaged_row_is_reported_and_costs_itself_alone(tmp_path: Path, harm: 
         change(folder, "DELETE FROM rows WHERE run = 47")
         change(folder, "UPDATE rows SET run = 47 WHERE run = 31")
     elif harm == "copied":
-        change(
-            folder, "UPDATE rows SET (row, checksum) = (SELECT row, checksum FROM rows WHERE run = 3) WHERE run = 31"
-        )
+        change(folder, "UPDATE rows SET (row, sha256) = (SELECT row, sha256 FROM rows WHERE run = 3) WHERE run = 31")
     elif harm == "text":
-        change(folder, "UPDATE rows SET row = x'00ff', checksum = 'x' WHERE run = 31")
+        change(folder, "UPDATE rows SET row = x'00ff', sha256 = 'x' WHERE run = 31")
     else:
         other = tmp_path / "other"
         run_campaign(plan(tmp_path, CAMPAIGN.replace("seed: 5", "seed: 6")), other, Pretended())
         with closing(sqlite3.connect(other / FILE)) as db:
-            row = db.execute("SELECT row, checksum FROM rows WHERE run = 31").fetchone()
-        change(folder, "UPDATE rows SET row = ?, checksum = ? WHERE run = 31", *row)
+            row = db.execute("SELECT row, sha256 FROM rows WHERE run = 31").fetchone()
+        change(folder, "UPDATE rows SET row = ?, sha256 = ? WHERE run = 31", *row)
     broken = 47 if harm == "renumbered" else 31
     message = rf"campaign\.sqlite: the row of run {broken} is broken; the campaign's command flies it again$"
     with pytest.raises(RunError, match=message):
@@ -264,7 +263,7 @@ def test_folders_of_others_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"campaign\.sqlite: was changed by hand, its digest is another"):
         run_campaign(p, folder, Pretended())
     change(folder, "UPDATE plan SET spec = json_set(spec, '$.format', 0)")
-    with pytest.raises(RunError, match="holds results of format 0, must be 1"):
+    with pytest.raises(RunError, match="holds results of format 0, must be 2"):
         run_campaign(p, folder, Pretended())
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").write_text("x")
