@@ -13,6 +13,7 @@ driver, a worker or the scheduler with SIGKILL or SIGTERM. Then the same command
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -31,7 +32,7 @@ CAMPAIGN = """
 campaign: killed
 base: base.yaml
 vary: {fleet.battery.initial_soc: {kind: uniform, low: 0.2, high: 1}}
-sample: {count: 60}
+sample: {count: 20}
 policies: [worked, "best-2(received_budget=0.1)"]
 metrics: [bytes.data_sent, energy_j.total]
 seed: 5
@@ -87,11 +88,14 @@ def main() -> int:
         assert _command(folder, "whole", ["--workers", "0"]).wait() == 0
         takes_s = time.monotonic() - begin_s
         whole = (folder / "whole" / "runs" / "table.parquet").read_bytes()
-        trials = []
-        for i in range(options.kills):
-            trials.append(_trial(folder, f"trial-{i}", draw, takes_s, whole))
-            sys.stdout.write(f"{i + 1:3} {trials[-1]}\n")
-            sys.stdout.flush()
+        trials = list[Trial]()
+        for i in itertools.count():
+            if len(trials) == options.kills:
+                break
+            if (trial := _trial(folder, f"trial-{i}", draw, takes_s, whole)) is not None:
+                trials.append(trial)
+                sys.stdout.write(f"{len(trials):3} {trial}\n")
+                sys.stdout.flush()
     passed = sum(trial.passed for trial in trials)
     sys.stdout.write(
         f"{passed} of {len(trials)} kills: one line at most, nothing left running, resumed, the same table\n"
@@ -99,7 +103,8 @@ def main() -> int:
     return 0 if passed == len(trials) else 1
 
 
-def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: bytes) -> Trial:
+def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: bytes) -> Trial | None:
+    """One kill; None where the command was through before it."""
     engine = draw.choice(list(ENGINES))
     victim, number = draw.choice(ENGINES[engine]), draw.choice([signal.SIGKILL, signal.SIGTERM])
     at_s, pick = draw.uniform(0, takes_s), draw.random()
@@ -107,11 +112,14 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
         driver = _command(
             folder, name, how if engine == "joined" else ["--workers", "0" if engine == "no dask" else "2"]
         )
-        time.sleep(at_s)
-        found = _victims(victim, driver.pid, others)
-        if found:
-            with suppress(ProcessLookupError):
-                os.kill(found[int(pick * len(found))], number)
+        begin_s = time.monotonic()
+        while time.monotonic() < begin_s + at_s or not (found := _victims(victim, driver.pid, others)):
+            if driver.poll() is not None:
+                driver.communicate()
+                return None
+            time.sleep(0.01)
+        at_s = time.monotonic() - begin_s
+        os.kill(found[int(pick * len(found))], number)
         try:
             _, text = driver.communicate(timeout=ENDS_S)
             code: int | None = driver.returncode
@@ -123,9 +131,7 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
     again.communicate()
     table = folder / name / "runs" / "table.parquet"
     same = table.is_file() and table.read_bytes() == whole
-    return Trial(
-        engine, victim if found else f"({victim})", number, at_s, code, text.splitlines(), left, again.returncode, same
-    )
+    return Trial(engine, victim, number, at_s, code, text.splitlines(), left, again.returncode, same)
 
 
 def _command(folder: Path, name: str, how: list[str]) -> subprocess.Popen[str]:
