@@ -81,20 +81,21 @@ def run(
     """Fly a campaign. After an interruption the same command continues it; the table is the same in the end."""
     folder = out_dir
     try:
-        from sortie._api import campaign_folder
-        from sortie.scenarios.reading.campaign import load_campaign
-        from sortie.sim.folders import RunError
+        with ended_by_sigterm():
+            from sortie._api import campaign_folder
+            from sortie.scenarios.reading.campaign import load_campaign
+            from sortie.sim.folders import RunError
 
-        if scheduler is not None and workers is not None:
-            raise RunError("--workers and --scheduler: name one of them")
-        name = load_campaign(campaign).campaign.campaign
-        folder = out_dir or campaign_folder(name)
-        with ended_by_sigterm(), _bar(name) as show:
-            done = sortie.campaign(
-                campaign, out=folder, workers=workers, scheduler=scheduler, security=security,
-                worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, resume=resume,
-                retry_failed=retry_failed, progress=show, notice=_notice,
-            )  # fmt: skip
+            if scheduler is not None and workers is not None:
+                raise RunError("--workers and --scheduler: name one of them")
+            name = load_campaign(campaign).campaign.campaign
+            folder = out_dir or campaign_folder(name)
+            with _bar(name) as show:
+                done = sortie.campaign(
+                    campaign, out=folder, workers=workers, scheduler=scheduler, security=security,
+                    worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, resume=resume,
+                    retry_failed=retry_failed, progress=show, notice=_notice,
+                )  # fmt: skip
     except KeyboardInterrupt as end:
         where = "" if folder is None else f" in {folder}"
         what, code = ("ended by SIGTERM", 143) if isinstance(end, EndedError) else ("interrupted", 130)

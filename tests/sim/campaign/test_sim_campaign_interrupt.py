@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -13,10 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from campaign_examples import CAMPAIGN, CLUSTER, rows_on_disk, write
+from campaign_examples import CAMPAIGN, CLUSTER, plan, rows_on_disk, write
 
 from sortie.sim.campaign.engine import open_engine
-from sortie.sim.campaign.signals import undisturbed
+from sortie.sim.campaign.signals import EndedError, ended_by_sigterm, undisturbed
 from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")
@@ -31,9 +32,19 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-def test_ctrl_c_is_one_line_and_leaves_nothing_running(tmp_path: Path, workers: int) -> None:
-    """It goes to the whole process group, as a terminal sends it."""
+@pytest.mark.parametrize(
+    ("workers", "number", "what", "code"),
+    [
+        (0, signal.SIGINT, "interrupted", 130),
+        (2, signal.SIGINT, "interrupted", 130),
+        (0, signal.SIGTERM, "ended by SIGTERM", 143),
+        (2, signal.SIGTERM, "ended by SIGTERM", 143),
+    ],
+)
+def test_an_end_from_outside_is_one_line_and_leaves_nothing_running(
+    tmp_path: Path, workers: int, number: signal.Signals, what: str, code: int
+) -> None:
+    """Ctrl-C goes to the whole process group, as a terminal sends it; SIGTERM to the driver alone."""
     folder, script = tmp_path / "a", tmp_path / "driver.py"
     script.write_text(DRIVER)
     campaign = write(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 200}"))
@@ -47,10 +58,13 @@ def test_ctrl_c_is_one_line_and_leaves_nothing_running(tmp_path: Path, workers: 
             assert time.monotonic() < deadline
             time.sleep(0.01)
         assert len(_processes(driver.pid)) >= 1 + workers
-        os.killpg(driver.pid, signal.SIGINT)
+        if number == signal.SIGINT:
+            os.killpg(driver.pid, number)
+        else:
+            driver.send_signal(number)
         said, _ = driver.communicate(timeout=60)
-    assert said == f"interrupted; what is finished is kept in {folder}, the same command goes on\n"
-    assert driver.returncode == 130
+    assert said == f"{what}; what is finished is kept in {folder}, the same command goes on\n"
+    assert driver.returncode == code
     while _processes(driver.pid):  # multiprocessing's resource tracker goes last, by itself
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -110,6 +124,51 @@ def test_a_question_to_the_cluster_that_ctrl_c_breaks_off_is_not_told(caplog: py
         hand.join()
     assert caplog.messages == []
     assert logging.getLogger("tornado.application").isEnabledFor(logging.ERROR)
+
+
+def test_sigterm_is_an_error_of_the_block_alone() -> None:
+    with ended_by_sigterm():
+        with pytest.raises(EndedError):
+            signal.raise_signal(signal.SIGTERM)
+        reached = False
+
+        def work() -> None:
+            nonlocal reached
+            with undisturbed():
+                signal.raise_signal(signal.SIGTERM)
+                reached = True
+
+        with pytest.raises(EndedError):
+            work()
+        assert reached
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize(("number", "what"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")])
+def test_an_end_while_commands_are_imported_is_one_line(number: signal.Signals, what: str) -> None:
+    text = "import builtins, signal; import sortie.__main__ as m; real = builtins.__import__; "
+    text += (
+        f"builtins.__import__ = lambda n, *a: signal.raise_signal({number:d}) if n.endswith('.app') else real(n, *a); "
+    )
+    ended = subprocess.run([sys.executable, "-c", text + "m.main()"], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + number, "", f"{what}; nothing was written\n")
+
+
+def test_a_process_whose_driver_was_killed_says_nothing(tmp_path: Path) -> None:
+    """Killed before the process reads its task, and before it answers."""
+    p = plan(tmp_path)
+    for sent in (False, True):
+        ours, theirs = multiprocessing.Pipe()
+        with subprocess.Popen(
+            [sys.executable, "-c", f"from sortie.sim.campaign.one_process import serve; serve({theirs.fileno()})"],
+            pass_fds=[theirs.fileno()], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        ) as process:  # fmt: skip
+            theirs.close()
+            if sent:
+                ours.send((p.code, (0, p.task(0)), None))
+            ours.close()
+            assert process.communicate(timeout=300)[0] == b""
+        assert process.returncode == 0
 
 
 def test_ctrl_c_waits_for_the_end_of_what_must_not_be_broken_off() -> None:

@@ -92,7 +92,7 @@ def test_a_file_of_somebody_else_is_named_and_not_read(flown: tuple[CampaignPlan
     line = (
         f"{folder}/runs/mine.parquet: not written by the campaign, and not read; only runs/table.parquet is its table"
     )
-    with pytest.warns(UserWarning) as warned:
+    with pytest.warns(UserWarning, match="mine") as warned:
         again = sortie.open_campaign(folder)
     assert [str(w.message) for w in warned] == [line]
     assert again.rows.equals(rows)
