@@ -342,8 +342,7 @@ def campaign(
     Args:
         campaign: a campaign file, or a library campaign's name.
         out: its folder; None takes `runs/campaign-NAME`.
-        workers: worker processes; 0 flies in one process beside this one, without dask. None takes one a core. A script
-            that asks for workers keeps its calls under `if __name__ == "__main__":`, since each worker imports the script.
+        workers: worker processes, at least one; None takes one a core. Nothing flies in this process.
         scheduler: the address of a dask cluster that is running, `tcp://host:8786`.
         security: PEM files for TLS with the cluster: the authority's certificate, one's own, its key.
         worker_memory_gb: what a worker may take; a run that needs more is a failed run. None divides the machine's memory

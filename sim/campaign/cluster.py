@@ -1,4 +1,4 @@
-"""A dask.distributed cluster, local or joined: certificates, workers that come and go, a scheduler that dies."""
+"""A dask.distributed cluster that is already running: certificates, workers that come and go, a scheduler that dies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sortie.sim.campaign.one_process import fly_apart
+from sortie.sim.campaign.processes import AHEAD, fly_apart
 from sortie.sim.campaign.signals import undisturbed
 from sortie.sim.campaign.work import RunResult, Task, killed
 from sortie.sim.folders import RunError
@@ -27,8 +27,6 @@ BATCH_S = 1.0
 """A task of the engine is about this long, so that its overhead of some milliseconds is below a hundredth."""
 MAX_BATCH = 200
 CONNECT_S = 15
-AHEAD = 2
-"""Tasks of the engine given out per worker: one flies, one waits."""
 WAIT_S = 300.0
 """How long a cluster may be without workers."""
 PATIENCE_S = 3.0
@@ -43,7 +41,7 @@ class Dask:
     def __init__(
         self,
         client: Any,
-        where: str | None = None,
+        where: str,
         memory_b: int | None = None,
         wait_s: float = WAIT_S,
         notice: Callable[[str], None] = lambda line: None,
@@ -124,7 +122,7 @@ class Dask:
             return
         now_s = time.monotonic()
         self._alone_since_s = now_s if self._alone_since_s is None else self._alone_since_s
-        begin = "" if self._where is None else f"; start one: dask worker {self._where}"
+        begin = f"; start one: dask worker {self._where}"
         if (alone_s := now_s - self._alone_since_s) >= self._wait_s:
             raise RunError(
                 f"{self._name}: no worker for {self._wait_s:g} s (--wait-for-workers); what is finished is kept, "
@@ -136,7 +134,7 @@ class Dask:
 
     @property
     def _name(self) -> str:
-        return "the local cluster" if self._where is None else f"--scheduler {self._where}"
+        return f"--scheduler {self._where}"
 
     def _gone(self) -> RunError:
         return RunError(f"{self._name}: the scheduler is gone; what is finished is kept, the same command goes on")
@@ -163,8 +161,7 @@ class Dask:
 
 @contextmanager
 def open_cluster(
-    workers: int,
-    scheduler: str | None,
+    scheduler: str,
     security: Security | None,
     memory_b: int | None,
     wait_s: float,
@@ -173,38 +170,25 @@ def open_cluster(
     """The engine of a cluster, as `open_engine` describes it."""
     try:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client
     except ImportError as error:
         raise RunError(
-            "dask.distributed is missing: pip install 'sortie-sim[campaign]', or fly with --workers 0"
+            "dask.distributed is missing: pip install 'sortie-sim[campaign]', or fly with --workers"
         ) from error
-    settings = {
-        "distributed.scheduler.allowed-failures": 3,
-        "distributed.comm.timeouts.connect": f"{CONNECT_S}s",
-        "distributed.worker.profile.enabled": False,  # a sample every 10 ms, and nobody looks at them
-    }
-    with dask.config.set(settings), _quiet():
+    with dask.config.set({"distributed.comm.timeouts.connect": f"{CONNECT_S}s"}), _quiet():
         certificates = _certificates(security)
-        if scheduler is not None:
-            _ensure_answers(scheduler, certificates, given=security is not None)
+        _ensure_answers(scheduler, certificates, given=security is not None)
         opened = ExitStack()
         try:
             with undisturbed():
                 try:
-                    joins: Any = scheduler
-                    if scheduler is None:
-                        joins = opened.enter_context(
-                            LocalCluster(
-                                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                                memory_limit=0, silence_logs="CRITICAL", security=certificates,
-                            )
-                        )  # fmt: skip
                     client = opened.enter_context(
-                        Client(joins, timeout=f"{CONNECT_S}s", set_as_default=False, security=certificates)
+                        Client(scheduler, timeout=f"{CONNECT_S}s", set_as_default=False, security=certificates)
                     )
-                except Exception as error:  # a worker, or the scheduler, that dies in these seconds
-                    what = "the workers did not start" if scheduler is None else f"--scheduler {scheduler}: is gone"
-                    raise RunError(f"{what} ({_in_one_line(error)}); the same command goes on") from error
+                except Exception as error:  # a scheduler that dies in these seconds
+                    raise RunError(
+                        f"--scheduler {scheduler}: is gone ({_in_one_line(error)}); the same command goes on"
+                    ) from error
             yield Dask(client, scheduler, memory_b, wait_s, notice)
         finally:
             with undisturbed(), suppress(Exception):  # the rows are on disk, whatever a dying cluster says

@@ -1,4 +1,4 @@
-"""Where runs are flown: in one process beside the driver's, on a local cluster, or on a cluster that is already running.
+"""Where runs are flown: in processes beside the driver's, or on a cluster that is already running.
 
 An engine takes tasks as it can use them and gives results as they come; it never holds more than what is in flight.
 """
@@ -11,8 +11,7 @@ from typing import Protocol
 
 from sortie.sim.campaign.cluster import WAIT_S, Security, open_cluster
 from sortie.sim.campaign.memory import machine_memory_b
-from sortie.sim.campaign.one_process import OneProcess
-from sortie.sim.campaign.signals import undisturbed
+from sortie.sim.campaign.processes import Processes
 from sortie.sim.campaign.work import RunResult, Task
 from sortie.sim.folders import RunError
 
@@ -37,12 +36,12 @@ def open_engine(
     wait_s: float = WAIT_S,
     notice: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Engine]:
-    """An engine: `scheduler` joins a running cluster, `workers` > 0 starts a local one, 0 starts one process without dask.
+    """An engine: `scheduler` joins a running cluster; without one, `workers` processes start here, at least one.
 
     Nothing flies in the driver: a run that ends its process, or takes all memory, is one failed run.
 
     Args:
-        workers: processes of a local cluster.
+        workers: processes on this machine.
         scheduler: the address of a cluster that is running.
         security: files of certificates for TLS.
         memory_b: what a worker may take. None divides the machine's memory among the workers, and leaves it to the workers of
@@ -53,16 +52,15 @@ def open_engine(
     Raises:
         RunError: dask.distributed is missing, there is no scheduler at that address, or the certificates do not fit.
     """
-    if scheduler is None and memory_b is None:
-        memory_b = machine_memory_b() // max(1, workers)
-    if scheduler is not None or workers > 0:
-        with open_cluster(workers, scheduler, security, memory_b, wait_s, notice) as engine:
-            yield engine
+    if scheduler is not None:
+        with open_cluster(scheduler, security, memory_b, wait_s, notice) as cluster:
+            yield cluster
         return
     if security is not None:
-        raise RunError("--security: needs --scheduler, or --workers above 0")
-    one = OneProcess(undisturbed, memory_b)
+        raise RunError("--security: needs --scheduler")
+    count = max(1, workers)
+    processes = Processes(count, machine_memory_b() // count if memory_b is None else memory_b)
     try:
-        yield one
+        yield processes
     finally:
-        one.close()
+        processes.close()

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from typing import Any
 
 
@@ -42,7 +40,6 @@ def undisturbed() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # handlers are the main thread's
         yield
         return
-    _ensure_tracker()  # it lifts the block when it begins
     came: list[int] = []
     before: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
     if callable(signal.getsignal(signal.SIGTERM)):
@@ -58,12 +55,3 @@ def undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
     if came and callable(handler := before[came[0]]):
         handler(came[0], None)
-
-
-def _ensure_tracker() -> None:
-    """Begin multiprocessing's resource tracker; it tidies up after a driver that is killed, and need not warn of that."""
-    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
-    try:
-        resource_tracker.ensure_running()
-    finally:
-        sys.warnoptions.pop()

@@ -45,7 +45,7 @@ def run(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Number of worker processes; 0 flies in one process, without dask; default: one per core.",
+            help="Number of worker processes, at least one; default: one per core.",
             min=0,
         ),
     ] = None,
@@ -54,7 +54,7 @@ def run(
         tuple[Path, Path, Path] | None,
         typer.Option(
             metavar="CA CERT KEY",
-            help="TLS between driver, scheduler and workers: PEM files of the authority's certificate, your certificate, its key.",
+            help="TLS with the scheduler: PEM files of the authority's certificate, your certificate, its key.",
         ),
     ] = None,
     worker_memory: Annotated[

@@ -2,7 +2,7 @@
 
     python tests/validation/kill_campaign.py --kills 40
 
-Each trial starts a campaign in a new folder: without dask, on a local cluster, or on a cluster that is joined. It kills the
+Each trial starts a campaign in a new folder: with one worker, with two, or on a dask cluster that is joined. It kills the
 driver, a worker or the scheduler with SIGKILL or SIGTERM. Then the same command runs to the end. A trial passes when
 
 - the disturbed command printed at most one line about it, and no traceback;
@@ -37,8 +37,8 @@ policies: [worked, "best-2(received_budget=0.1)"]
 metrics: [bytes.data_sent, energy_j.total]
 seed: 5
 """
-ENGINES = {"no dask": ("driver", "worker"), "local": ("driver", "worker"), "joined": ("driver", "worker", "scheduler")}
-"""What may be killed of each engine; a local cluster's scheduler is in the driver's process."""
+ENGINES = {"1": ("driver", "worker"), "2": ("driver", "worker"), "cluster": ("driver", "worker", "scheduler")}
+"""What may be killed, by the number of workers or on a cluster."""
 ENDS_S = 180.0
 """A command that takes longer than this hangs."""
 
@@ -69,7 +69,7 @@ class Trial:
         return self.code is not None and lines and self.left == 0 and self.again == 0 and self.same
 
     def __str__(self) -> str:
-        what = f"{self.engine:8} {self.victim:9} {self.number.name:8} at {self.at_s:5.1f} s: exit {self.code}"
+        what = f"{self.engine:7} {self.victim:9} {self.number.name:8} at {self.at_s:5.1f} s: exit {self.code}"
         return f"{'pass' if self.passed else 'FAIL'} {what}, table {'same' if self.same else 'OTHER'}; {' | '.join(self.said)}"
 
 
@@ -85,7 +85,7 @@ def main() -> int:
         (folder / "base.yaml").write_text(BASE)
         (folder / "killed.yaml").write_text(CAMPAIGN)
         begin_s = time.monotonic()
-        assert _command(folder, "whole", ["--workers", "0"]).wait() == 0
+        assert _command(folder, "whole", ["--workers", "1"]).wait() == 0
         takes_s = time.monotonic() - begin_s
         whole = (folder / "whole" / "runs" / "table.parquet").read_bytes()
         trials = list[Trial]()
@@ -108,10 +108,8 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
     engine = draw.choice(list(ENGINES))
     victim, number = draw.choice(ENGINES[engine]), draw.choice([signal.SIGKILL, signal.SIGTERM])
     at_s, pick = draw.uniform(0, takes_s), draw.random()
-    with _cluster(engine == "joined") as (how, others):
-        driver = _command(
-            folder, name, how if engine == "joined" else ["--workers", "0" if engine == "no dask" else "2"]
-        )
+    with _cluster(engine == "cluster") as (how, others):
+        driver = _command(folder, name, how if engine == "cluster" else ["--workers", engine])
         begin_s = time.monotonic()
         while time.monotonic() < begin_s + at_s or not (found := _victims(victim, driver.pid, others)):
             if driver.poll() is not None:
@@ -127,7 +125,7 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
             driver.kill()
             text, code = driver.communicate()[1] + "\nit hangs", None
         left = _still_running(driver.pid)
-    again = _command(folder, name, ["--workers", "0"])
+    again = _command(folder, name, ["--workers", "1"])
     again.communicate()
     table = folder / name / "runs" / "table.parquet"
     same = table.is_file() and table.read_bytes() == whole

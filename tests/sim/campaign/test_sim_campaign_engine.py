@@ -18,6 +18,7 @@ from sortie.sim.campaign.cluster import Dask
 from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
+from sortie.sim.campaign.processes import AHEAD, Processes
 from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
@@ -38,7 +39,6 @@ def decide(view, *, how="fail"):
 """
 
 
-@CLUSTER
 @pytest.mark.slow
 def test_zero_one_and_two_workers_give_the_same_bytes(tmp_path: Path) -> None:
     p = plan(tmp_path)
@@ -78,6 +78,43 @@ def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
     assert not victims
     assert (done.finished, done.failed) == (96, 0)
     assert table_bytes(tmp_path / "cluster") == table_bytes(tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_processes_that_are_killed_cost_nothing(tmp_path: Path) -> None:
+    """Five times one of three, while it starts, flies, or waits."""
+    p = plan(tmp_path)
+    run_campaign(p, tmp_path / "alone", InProcess())
+    killed: list[int] = []
+
+    def progress(done: Progress) -> None:
+        if done.flown > 6 * (len(killed) + 1) and len(killed) < 5:
+            process = engine._processes[len(killed) % 3]._process
+            killed.append(process.pid)
+            process.kill()
+
+    with open_engine(3) as engine:
+        assert isinstance(engine, Processes)
+        done = run_campaign(p, tmp_path / "a", engine, progress=progress)
+    assert len(killed) == 5
+    assert (done.finished, done.failed) == (48, 0)
+    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "alone")
+
+
+def test_rows_that_came_are_kept_when_another_run_cannot_fly(tmp_path: Path) -> None:
+    """A worker with other code raises; what the others flew comes first."""
+    p = plan(tmp_path)
+    with open_engine(1) as engine:
+        rows = engine.results(p.code, iter([(3, p.task(3))]))
+        assert [row.run for row in next(rows)] == [3]
+        assert list(rows) == []
+        assert isinstance(engine, Processes)
+        engine._landed.put(RunError("planted"))
+        engine._landed.put(fly_batch(p.code, [(4, p.task(4))])[0][0])
+        late = engine.results(p.code, iter([(5, p.task(5)), (6, p.task(6))]))
+        assert [row.run for row in next(late)] == [4]
+        with pytest.raises(RunError, match="planted"):
+            next(late)
 
 
 class _Future:
@@ -136,19 +173,19 @@ def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
     p, client = plan(tmp_path), _Client(deadly=17)
     monkeypatch.setattr(cluster, "BATCH_S", 1e9)  # as many a batch as there may be
     monkeypatch.setattr(cluster, "MAX_BATCH", 5)
-    done = run_campaign(p, tmp_path / "a", Dask(client))
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
     assert (done.finished, done.failed) == (48, 1)
     table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
     assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
     assert all(r["key"] == p.key(r["run"]) for r in table)
     assert max(client.batches) == 5
-    assert client.most <= cluster.AHEAD * 2 + max(client.batches)  # no more than what is in flight
+    assert client.most <= AHEAD * 2 + max(client.batches)  # no more than what is in flight
 
 
 def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
     """The worker dies after its run has ended and before the result was fetched."""
     p, client = plan(tmp_path), _Client(lost=frozenset({0, 7, 48}))
-    done = run_campaign(p, tmp_path / "a", Dask(client))
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
     assert (done.finished, done.failed) == (p.runs, 0)
     assert sum(client.batches) == p.runs  # none was given out twice
     run_campaign(p, tmp_path / "alone", InProcess())
@@ -156,7 +193,7 @@ def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> No
 
 
 def test_batches_are_about_a_second_long() -> None:
-    engine = Dask(_Client())
+    engine = Dask(_Client(), "tcp://head:8786")
     assert engine._batch() == 1  # until it is known how long a run takes
     engine._learn(0.3)
     assert engine._batch() == 3

@@ -81,24 +81,28 @@ def _processes(session: int) -> list[int]:
     return found
 
 
-@CLUSTER
 @pytest.mark.slow
 def test_workers_never_get_ctrl_c_those_that_replace_dead_ones_either(tmp_path: Path) -> None:
+    p = plan(tmp_path)
     with open_engine(1) as engine:
-        client = engine._client  # type: ignore[attr-defined]
-        (first,) = client.run(os.getpid).values()
-        assert _blocks_ctrl_c(first)
-        os.kill(first, signal.SIGKILL)
-        deadline, second = time.monotonic() + 300, first
-        while second == first:
-            assert time.monotonic() < deadline
-            client.wait_for_workers(1)
-            with suppress(OSError, ValueError):
-                (second,) = client.run(os.getpid).values()
-        assert _blocks_ctrl_c(second)
-        (address,) = client.scheduler_info()["workers"]
-        with pytest.raises(RunError, match=f"--scheduler {address}: no scheduler answers there, but a Worker"):
-            open_engine(scheduler=address).__enter__()
+        rows, found = engine.results(p.code, ((run, p.task(run)) for run in range(8))), list[int]()
+        for _ in range(2):
+            next(rows)
+            (pid,) = _children(os.getpid())
+            assert _blocks_ctrl_c(pid)
+            found.append(pid)
+            os.kill(pid, signal.SIGKILL)
+        assert found[0] != found[1]
+        assert {row.status for some in rows for row in some} == {"done"}
+    assert _children(os.getpid()) == []
+
+
+def _children(pid: int) -> list[int]:
+    """Processes that serve a campaign's runs."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        found += [int(child) for child in (task / "children").read_text().split()]
+    return [child for child in found if b"processes import serve" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def _blocks_ctrl_c(pid: int) -> bool:
@@ -110,7 +114,17 @@ def _blocks_ctrl_c(pid: int) -> bool:
 @pytest.mark.slow
 def test_a_question_to_the_cluster_that_ctrl_c_breaks_off_is_not_told(caplog: pytest.LogCaptureFixture) -> None:
     """dask takes back what it has not asked yet, stumbles over that, and would log a traceback."""
-    with open_engine(1) as engine:
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
+        ) as cluster,
+        open_engine(scheduler=cluster.scheduler_address) as engine,
+    ):
+        (address,) = (worker.worker_address for worker in cluster.workers.values())
+        with pytest.raises(RunError, match=f"--scheduler {address}: no scheduler answers there, but a Worker"):
+            open_engine(scheduler=address).__enter__()
         loop = engine._client.loop  # type: ignore[attr-defined]
         loop.add_callback(time.sleep, 1)
         hand = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
@@ -160,7 +174,7 @@ def test_a_process_whose_driver_was_killed_says_nothing(tmp_path: Path) -> None:
     for sent in (False, True):
         ours, theirs = multiprocessing.Pipe()
         with subprocess.Popen(
-            [sys.executable, "-c", f"from sortie.sim.campaign.one_process import serve; serve({theirs.fileno()})"],
+            [sys.executable, "-c", f"from sortie.sim.campaign.processes import serve; serve({theirs.fileno()})"],
             pass_fds=[theirs.fileno()], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         ) as process:  # fmt: skip
             theirs.close()

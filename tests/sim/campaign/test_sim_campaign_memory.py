@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import sortie
 from sortie.sim.campaign import memory, work
 from sortie.sim.campaign.engine import open_engine
-from sortie.sim.campaign.one_process import OneProcess
+from sortie.sim.campaign.processes import Processes
 from sortie.sim.campaign.work import fly_batch
 from sortie.sim.cli.app import app
 
@@ -61,13 +61,13 @@ def test_a_container_has_less_than_its_machine(tmp_path: Path, monkeypatch: pyte
     assert memory.machine_memory_b() == 100_000_000
 
 
-def test_a_worker_may_take_what_the_machine_has_unless_it_is_told_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    with open_engine() as engine:
-        assert isinstance(engine, OneProcess)
-        assert engine.memory_b == memory.machine_memory_b()
-    with open_engine(memory_b=7) as engine:
-        assert isinstance(engine, OneProcess)
-        assert engine.memory_b == 7
+def test_workers_share_the_machine_unless_they_are_told_less() -> None:
+    whole = memory.machine_memory_b()
+    for how, count, limit_b in (({}, 1, whole), ({"workers": 2}, 2, whole // 2), ({"memory_b": 7}, 1, 7)):
+        with open_engine(**how) as engine:
+            assert isinstance(engine, Processes)
+            assert (engine.workers, engine.memory_b) == (count, limit_b)
+            assert [one.memory_b for one in engine._processes] == [limit_b] * count
 
 
 def test_a_run_without_memory_says_which_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,8 +119,14 @@ def test_a_run_that_takes_too_much_is_one_failed_run(tmp_path: Path) -> None:
 @CLUSTER
 @pytest.mark.slow
 def test_a_cluster_has_the_same_limit(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
+    distributed = pytest.importorskip("distributed")
     campaign = greedy(tmp_path)
-    done = [sortie.campaign(campaign, out=tmp_path / f"{n}", workers=n, worker_memory_gb=2) for n in (0, 1)]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
+    ) as cluster:
+        done = [
+            sortie.campaign(campaign, out=tmp_path / name, scheduler=scheduler, worker_memory_gb=2)
+            for name, scheduler in (("a", None), ("b", cluster.scheduler_address))
+        ]
     assert done[0].failed == done[1].failed > 0
-    assert table_bytes(tmp_path / "0") == table_bytes(tmp_path / "1")
+    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "b")

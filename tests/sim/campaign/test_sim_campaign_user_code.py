@@ -62,16 +62,22 @@ def test_what_a_policy_does_is_one_failed_run(
 @CLUSTER
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
+    distributed = pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(POLICY.format(what="re.match('(a+)+$', 'a' * 60 + 'b')"))
     text = CAMPAIGN.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']").replace(
         "{count: 6}", "{count: 2}"
     )
     campaign = write(tmp_path, text, BASE + "limits: {decision_s: 0.2}\n")
-    done = [sortie.campaign(campaign, out=tmp_path / f"{workers}", workers=workers) for workers in (0, 1)]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
+    ) as cluster:
+        done = [
+            sortie.campaign(campaign, out=tmp_path / name, scheduler=scheduler)
+            for name, scheduler in (("a", None), ("b", cluster.scheduler_address))
+        ]
     assert done[0].failed == done[1].failed > 0
-    assert table_bytes(tmp_path / "0") == table_bytes(tmp_path / "1")
+    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "b")
 
 
 def test_the_driver_runs_no_decision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,187 @@
+"""Processes in which runs fly, beside the driver's, or beside a cluster's worker where policies of a user's own fly.
+
+What ends such a process, or cannot be interrupted, is one failed run, and the next one flies in a new process.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+from sortie.scenarios.plugins.user_calls import STUCK
+from sortie.sim.campaign.signals import undisturbed
+from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
+
+AHEAD = 2
+"""Tasks given out per worker: one flies, one waits."""
+ATTEMPTS = 4
+"""As often as dask's scheduler tries a run whose worker dies: a process may be killed for no fault of the run."""
+_BEGIN = "from sortie.sim.campaign.processes import serve; serve({})"
+
+
+class OneProcess:
+    """Flies one run after the other in a process of its own.
+
+    It is started by `-P`, so that no module of the working folder takes the place of an installed one.
+    """
+
+    def __init__(self, memory_b: int | None = None) -> None:
+        """Args: `memory_b` is what it may take."""
+        self.memory_b = memory_b
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe: Connection | None = None
+        self._ended = False
+        self._starting = threading.Lock()
+
+    def end(self) -> None:
+        """End the process, also in the middle of a run; whoever waits for that run gets an EOFError."""
+        with self._starting:
+            self._ended = True
+            if self._process is not None:
+                self._process.kill()
+
+    def close(self) -> None:
+        """End the process; nobody flies with it any more."""
+        self.end()
+        if self._process is not None:
+            self._process.wait()
+        if self._pipe is not None:
+            self._pipe.close()
+
+    def fly(self, code: str, task: Task) -> RunResult:
+        """One run's row. Raises what the worker raises: RunError for other code or files; EOFError after `end`."""
+        for _ in range(ATTEMPTS):
+            answer = self._answer(code, task)
+            if isinstance(answer, Exception):
+                raise answer
+            if isinstance(answer, RunResult):
+                return answer
+            if answer in (STUCK, -signal.SIGXCPU):
+                return stuck(task, code)
+        return killed(task, code)
+
+    def _answer(self, code: str, task: Task) -> RunResult | Exception | int:
+        """The run's row, what the worker raised, or the exit code of a process that has ended."""
+        process, pipe = self._started()
+        try:
+            pipe.send((code, task, self.memory_b))
+            answer: RunResult | Exception = pipe.recv()
+            return answer
+        except (EOFError, OSError):
+            pipe.close()
+            self._pipe = None
+            return process.wait()
+
+    def _started(self) -> tuple[subprocess.Popen[bytes], Connection]:
+        with self._starting:
+            if self._ended:
+                raise EOFError
+            if self._process is None or self._pipe is None:
+                self._pipe, theirs = multiprocessing.Pipe()
+                self._process = subprocess.Popen(  # noqa: S603 - our own code
+                    [sys.executable, "-P", "-c", _BEGIN.format(theirs.fileno())], pass_fds=[theirs.fileno()]
+                )
+                theirs.close()
+            return self._process, self._pipe
+
+
+class Processes:
+    """An engine: some processes on this machine, without dask; a thread for each gives out its runs."""
+
+    def __init__(self, workers: int, memory_b: int | None = None) -> None:
+        """Args: how many processes, and what each of them may take."""
+        self.workers = workers
+        self.memory_b = memory_b
+        self._todo: queue.SimpleQueue[tuple[str, Task] | None] = queue.SimpleQueue()
+        self._landed: queue.SimpleQueue[RunResult | Exception] = queue.SimpleQueue()
+        self._processes = [OneProcess(memory_b) for _ in range(workers)]
+        self._threads = [threading.Thread(target=self._hand_out, args=(one,), daemon=True) for one in self._processes]
+        with undisturbed():  # what these threads begin never gets Ctrl-C
+            for thread in self._threads:
+                thread.start()
+
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+        """As `Engine`."""
+        flying = 0
+        while True:
+            for task in itertools.islice(tasks, AHEAD * self.workers - flying):
+                self._todo.put((code, task))
+                flying += 1
+            if not flying:
+                return
+            came = [self._landed.get()]
+            with suppress(queue.Empty):
+                while True:  # rows that come together are written together
+                    came.append(self._landed.get_nowait())
+            flying -= len(came)
+            if rows := [one for one in came if isinstance(one, RunResult)]:
+                yield rows
+            for one in came:
+                if isinstance(one, Exception):
+                    raise one
+
+    def close(self) -> None:
+        """End all processes."""
+        for one in self._processes:
+            self._todo.put(None)
+            one.end()
+        for thread, one in zip(self._threads, self._processes, strict=True):
+            thread.join()
+            one.close()
+
+    def _hand_out(self, one: OneProcess) -> None:
+        while (task := self._todo.get()) is not None:
+            try:
+                self._landed.put(one.fly(*task))
+            except EOFError:
+                return
+            except Exception as error:
+                self._landed.put(error)
+
+
+def fly_apart(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> tuple[list[RunResult], float]:
+    """`fly_in_worker` for a worker of a cluster: runs with a user's code fly in a process beside it."""
+    if not any(flies_user_code(task) for task in tasks):
+        return fly_in_worker(code, tasks, memory_b)
+    begin_s = time.perf_counter()
+    if not hasattr(_OF_THREAD, "one"):
+        _OF_THREAD.one = OneProcess()
+    _OF_THREAD.one.memory_b = memory_b
+    return [_OF_THREAD.one.fly(code, task) for task in tasks], time.perf_counter() - begin_s
+
+
+_OF_THREAD = threading.local()
+
+
+def serve(file: int) -> None:
+    """Fly what comes in until the driver is gone."""
+    pipe, driver = Connection(file), os.getppid()
+    threading.Thread(target=_end_with, args=(driver,), daemon=True).start()
+    while True:
+        try:
+            code, task, memory_b = pipe.recv()
+        except (EOFError, OSError):  # the driver was killed
+            return
+        try:
+            answer: RunResult | Exception = fly_in_worker(code, [task], memory_b)[0][0]
+        except Exception as error:
+            answer = error
+        with suppress(OSError):
+            pipe.send(answer)
+
+
+def _end_with(driver: int) -> None:
+    """End this process when the driver is gone, also in the middle of a run."""
+    while os.getppid() == driver:
+        time.sleep(0.5)
+    os._exit(1)
