@@ -39,15 +39,19 @@ from sortie.fleet.coverage import Poses, View, cameras_of, footprint_radius_m, v
 from sortie.fleet.energy.battery import RECORDED, FleetBatteries
 from sortie.fleet.energy.cell import energy_fraction, open_circuit_cell_v, resistance_factor
 from sortie.fleet.energy.recorded import BatteryTrace
+from sortie.fleet.flight.displaced import displaced
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.flight.rotor import climb_power_w, fleet_power_w, momentum_power_w, rotor_power_w
+from sortie.fleet.flight.viewpoints import Move, bounds_of, course_of, grant
 from sortie.fleet.gate import Gate, Payload
+from sortie.fleet.lies import falsified
 from sortie.fleet.memory import PeerMemory, Received
+from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, equipment_of
 from sortie.fleet.probes import Probes
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
-from sortie.fleet.trust import judge
+from sortie.fleet.trust import Arrival, goodput_doubt, judge
 from sortie.perception.geometry import USUAL
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
@@ -206,6 +210,35 @@ def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb(model: A
             wanted = rotor_power_w(motion.air_speed_mps[:, drone], own)
             wanted = wanted + climb_power_w(motion.velocity_mps[:, drone, 2], own)
         np.testing.assert_allclose(power_w[:, drone], wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("velocity", [(8.0, 0.0, 0.0), (0.0, 0.0, 5.0), (6.0, 2.0, 3.0)])
+def test_drag_takes_power_along_the_whole_way_through_the_air(velocity: tuple[float, float, float]) -> None:
+    """Half of density, drag area and the cube of the speed: forward, upward and both."""
+    still = np.zeros(3)
+    with_drag, without = (
+        float(momentum_power_w(np.array(velocity), still, Airframe(power_model="momentum", drag_area_m2=area)))
+        for area in (0.04, 0.0)
+    )
+    assert with_drag - without == pytest.approx(0.5 * 1.225 * 0.04 * float(np.linalg.norm(velocity)) ** 3, rel=1e-6)
+
+
+def test_a_drone_that_moves_within_the_formation_keeps_the_errors_of_its_belief() -> None:
+    """And its neighbours' ways stay as they were."""
+    fleet = Fleet.model_validate({"motion": {"pose_error_m": 2.0, "heading_error_deg": 5.0}})
+    base = fly(fleet, 30.0, 0.1, 3)
+    course = course_of(fleet, np.asarray(base.time_s))
+    move = grant(2, (5.0, 15.0), [()] * 5, course, bounds_of(fleet), 50)
+    assert isinstance(move, Move)
+    moved = displaced(base, base, course, [(), (), (move,), (), ()], 50)
+    off = [m.est_position_m - m.position_m for m in (base, moved)]
+    np.testing.assert_allclose(off[1], off[0], atol=1e-9)
+    turn = [np.mod(m.est_yaw_rad - m.yaw_rad + np.pi, 2 * np.pi) for m in (base, moved)]
+    np.testing.assert_allclose(turn[1], turn[0], atol=1e-9)
+    assert np.abs(moved.position_m[-1, 2] - base.position_m[-1, 2]).max() > 10
+    others = [0, 1, 3, 4]
+    np.testing.assert_array_equal(moved.position_m[:, others], base.position_m[:, others])
+    np.testing.assert_array_equal(moved.position_m[:50], base.position_m[:50])
 
 
 def test_headrooms_count_looks_maps_decisions_and_bytes() -> None:
@@ -440,6 +473,32 @@ def test_doubted_peers_are_left_out_of_what_is_believed_and_read_without_their_c
     assert mine.peers == [1, 2]
 
 
+def test_one_payload_that_came_faster_than_the_others_makes_no_claim_a_lie() -> None:
+    """What arrived is held against the claim in the median; only the fastest data rate bounds it from above."""
+    slow, fast = Arrival(20_000, 0.016, 100.0), Arrival(20_000, 0.0004, 600.0)  # 10 and 400 Mb/s
+    assert goodput_doubt(5.0, [slow, slow, fast]) == ""
+    assert "arrived" in goodput_doubt(5.0, [slow, fast, fast])
+    assert "frames came" in goodput_doubt(1000.0, [slow, fast])
+    assert goodput_doubt(800.0, [slow, fast]) == ""
+
+
+LIES = {
+    ("coverage", "much"): {"coverage_grid", "novelty_flags"}, ("coverage", "little"): {"coverage_grid", "novelty_flags"},
+    ("goodput", "much"): {"peer_goodput_mbps"}, ("goodput", "little"): {"peer_goodput_mbps"},
+    ("battery", "much"): {"battery_soc"}, ("battery", "little"): {"battery_soc"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_changes_what_it_is_about_and_nothing_else(lie: tuple[Any, Any]) -> None:
+    """Who claims to see nothing claims nothing new either; other flags stay."""
+    truth = DESCRIPTOR._replace(novelty_flags=0b111 if lie[1] == "little" else 0b110)
+    told = falsified(truth, *lie)
+    assert {f for f in truth._fields if getattr(told, f) != getattr(truth, f)} == LIES[lie]
+    if lie[0] == "coverage":
+        assert told.novelty_flags == (0b110 if lie[1] == "little" else 0b111)
+
+
 # --- one agent ------------------------------------------------------------------------------------------------
 
 
@@ -552,6 +611,24 @@ def test_a_drone_that_left_sends_and_publishes_nothing_more(leaves_s: float) -> 
     rig.env.run(until=1.2)
     assert len(rig.sent) > before[0]
     assert all(c.t_s >= 1.0 - 1e-9 for t_s, _, _, c in rig.sent if t_s > 1.0)
+
+
+def test_a_drone_that_lies_decides_by_the_truth_and_publishes_the_lie() -> None:
+    rig = Rig(lambda view: seen.append(view) or [], dwell_s=0.0)  # type: ignore[func-returns-value]
+    seen: list[FleetView] = []
+    rig.memory.status.lies[0] = lambda d: d._replace(battery_soc=0.05)
+    rig.env.run(until=0.35)
+    assert {round(decode_descriptor(datagram).battery_soc, 6) for _, datagram in rig.published} == {0.05}
+    assert {round(view.me.battery_soc, 6) for view in seen if view.me is not None} == {0.9}
+
+
+def test_a_drone_without_a_detector_never_looks() -> None:
+    rig = Rig(lambda view: [FULL._replace(destination=p) for p in view.peers], dwell_s=0.0)
+    rig.memory.status.looks = False
+    rig.hear(1, 2)
+    rig.env.run(until=0.5)
+    assert (rig.sent, rig.memory.status.work.looks, rig.memory.status.perceiving) == ([], 0, False)
+    assert rig.published
 
 
 def test_a_handshake_goes_to_peers_that_are_attached() -> None:

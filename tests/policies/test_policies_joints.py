@@ -50,6 +50,7 @@ from sortie.policies.contract import (
     TaskPhase,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 from sortie.policies.registry import POLICIES, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.views import draw_views
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS, WAITING_MBPS, probed_mbps
@@ -201,6 +202,39 @@ def test_a_deputy_is_appointed_by_its_link_to_the_receiver_and_not_by_the_way_ba
         links |= {(3, i): bad if i == best else good for i in range(3)}
         chosen = [i for i in range(3) if by_peer(deputies(of_ego(matrix(view, links, 50.0), i), k=1))[3].rho]
         assert chosen == [best]
+
+
+@pytest.mark.parametrize(("soc", "wins"), [(0.6, True), (0.59, True), (0.3, True), (0.29, False)])
+def test_a_deputy_s_battery_counts_in_three_steps_that_begin_at_their_bounds(soc: float, wins: bool) -> None:
+    """Drone 0 adds four times the cells of drone 1: at half weight it is still ahead, at a tenth no longer."""
+    view = changed(at_one_place(fleet_of(3)), (2,), coverage_grid=bytes(64))
+    view = changed(changed(view, (1,), coverage_grid=SEES_ALL[:16] + bytes(48)), (0,), battery_soc=soc)
+    chosen = [i for i in (0, 1) if by_peer(deputies(of_ego(view, i), k=1))[2].representation != NONE]
+    assert chosen == [0 if wins else 1]
+
+
+@pytest.mark.parametrize(("mbps", "wins"), [(100.0, True), (20.0, True), (7.0, True), (0.0, True)])
+def test_a_deputy_without_a_goodput_counts_a_quarter(mbps: float, wins: bool) -> None:
+    """Not nothing: it may be the only one that sees."""
+    view = changed(at_one_place(fleet_of(3)), (2,), coverage_grid=bytes(64))
+    view = changed(view, (1,), coverage_grid=SEES_ALL[:12] + bytes(52))
+    view = matrix(view, {(0, 2): mbps}, 100.0)
+    chosen = [i for i in (0, 1) if by_peer(deputies(of_ego(view, i), k=1))[2].representation != NONE]
+    assert chosen == [0 if wins else 1]
+
+
+def test_overlap_is_the_share_of_the_receiver_s_footprint() -> None:
+    """Of drones at different heights the two shares differ; each function takes the same one."""
+    low, high = (fleet_of(2).descriptors[i]._replace(position_m=(0.0, 0.0, 60.0)) for i in (0, 1))
+    low, high = low._replace(footprint_radius_m=20.0), high._replace(footprint_radius_m=40.0)
+    assert footprint_overlap(low, high) == 1.0
+    assert footprint_overlap(high, low) == 0.25
+    third = high._replace(agent_id=2, position_m=(5.0, 0.0, 60.0), footprint_radius_m=30.0)
+    view = FleetView(1, 0.1, {0: low, 1: high, 2: third}, {0: 0.0, 1: 0.0, 2: 0.0})
+    assert peers_by_overlap(view) == [2, 0]  # 0.56 of its footprint, and a quarter
+    assert peers_by_overlap(view, 0) == [1, 2]
+    seen = adaptive.features(view, 0.25)
+    assert seen[2] == pytest.approx((0.25 + footprint_overlap(high, third)) / 2)
 
 
 @pytest.mark.parametrize("policy", [worked, deputies])

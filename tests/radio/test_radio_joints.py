@@ -47,6 +47,7 @@ from sortie.radio.settings import AirSettings, BurstSettings
 
 Array = np.ndarray[Any, Any]
 CALM = AirSettings(shadowing_sigma_db=0.0)
+LOSSY = AirSettings(shadowing_sigma_db=0.0, retry_limit=0, bursts=BurstSettings(loss_good=0.5))
 
 
 def tilting(frames: int, n: int) -> Array:
@@ -334,9 +335,41 @@ def test_goodput_falls_at_once_and_rises_by_a_share_of_the_gap() -> None:
     assert goodput.read(0, 0.4)[1] == 4.0
 
 
-# --- draws that must be independent ------------------------------------------------------------------------
+@pytest.mark.parametrize("payload", [40, 150, 1300, 60_000])
+def test_no_goodput_is_above_what_the_link_carries_alone(payload: int) -> None:
+    """A lone small frame is acknowledged before a full one would be."""
+    flight = Hover(CALM, n=3)
+    flight.fly(2.0, lambda k: [flight.send(0, j, payload) for j in (1, 2)])
+    flight.air.advance()
+    known, carried = flight.air.goodput_mbps(0), flight.air.link_mbps()[0, 1:]
+    assert (np.array(known) <= carried * 1.006).all()  # what is carried has paid for a fade in two hundred
+    assert min(known) > 0.02 * carried.min()
 
-LOSSY = AirSettings(shadowing_sigma_db=0.0, retry_limit=0, bursts=BurstSettings(loss_good=0.5))
+
+def test_bytes_that_arrived_are_those_of_the_pieces_that_did() -> None:
+    """Of 53 pieces the last is shorter, and counts as what it is, whether it comes or not."""
+    flight = Hover(LOSSY, n=2)
+    flight.fly(8.0, lambda k: flight.send(0, 1, 52 * 200 + 30, piece_bytes=200))
+    cut = [r for r in flight.rows if r.missing]
+    assert {52 in r.missing for r in cut} == {True, False}
+    for r in cut:
+        assert r.arrived_bytes == sum(30 if k == 52 else 200 for k in range(53) if k not in r.missing)
+
+
+def test_a_link_too_weak_to_be_detected_is_none_for_routes_and_for_payloads() -> None:
+    """Though its rate would still be one."""
+    at = np.array([[0.0, 0.0, 60.0], [60.0, 0.0, 60.0], [400.0, 0.0, 60.0]])
+    heard, deaf = (AirSettings(shadowing_sigma_db=0.0, preamble_detection_dbm=dbm) for dbm in (-95.0, -70.0))
+    for config, there in ((heard, True), (deaf, False)):
+        flight = Hover(config, at)
+        flight.fly(0.3, lambda k, flight=flight: flight.send(0, 2, 500))  # type: ignore[misc]
+        mbps = flight.air.link_mbps()
+        assert mbps[0, 1] > 0
+        assert (mbps[0, 2] > 0) == there
+        assert all((r.reason == "no_link") != there for r in flight.rows)
+
+
+# --- draws that must be independent ------------------------------------------------------------------------
 
 
 def lost_pieces(sender: int, receiver: int, seed: int = 1, replication: int = 0) -> Array:

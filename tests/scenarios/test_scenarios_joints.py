@@ -35,7 +35,7 @@ from sortie.scenarios.link_state import (
     probed_mbps,
     state_of,
 )
-from sortie.scenarios.reading.load import loads
+from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 
@@ -109,6 +109,30 @@ def test_frames_of_every_rate_stand_in_their_periods(rate_hz: float, scored_hz: 
         inside = [f for f in s.scored_frames if first <= f < last]
         assert frame == (inside[0] if inside else first)
     assert len(tracked) == math.ceil(s.frames / each - 1e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 3.0, 7.0])
+def test_a_frame_begins_at_every_multiple_of_its_length_before_the_end(rate_hz: float) -> None:
+    """Though a product such as 4.1 · 10 is a digit above the whole number."""
+    for frames in range(1, 140):
+        made = scenario(
+            f"duration_s: {frames / rate_hz!r}\ncontext: {{rate_hz: {rate_hz}}}\nperception: {{detector: none}}"
+        )
+        assert made.frames == frames
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        "kind: link_drop, drone: 1", "kind: jam, position_m: [0, 0, 9]", "kind: gnss_loss", "kind: spoof, drone: 1",
+        "kind: lie, drone: 1",
+    ],
+)  # fmt: skip
+def test_an_event_ends_after_it_begins(event: str) -> None:
+    for until_s in (2, 1.5):
+        with pytest.raises(ScenarioError, match=rf"events\.0\.until_s: {until_s:g}, must be above at_s = 2"):
+            scenario(f"duration_s: 9\nevents: [{{{event}, at_s: 2, until_s: {until_s}}}]")
+    assert scenario(f"duration_s: 9\nevents: [{{{event}, at_s: 2, until_s: 2.001}}]").events
 
 
 # --- links ------------------------------------------------------------------------------------------------
