@@ -473,6 +473,28 @@ def test_doubted_peers_are_left_out_of_what_is_believed_and_read_without_their_c
     assert mine.peers == [1, 2]
 
 
+@pytest.mark.parametrize(("before_s", "doubted"), [(0.1, True), (0.49, True), (0.51, False), (0.9, False)])
+def test_who_sent_a_look_shortly_before_its_claim_looks(before_s: float, doubted: bool) -> None:
+    """Within half of the time for which a look stands; then a claim to see nothing cannot be so."""
+    mine = memory()
+    mine.hold(descriptor(0, 10.0), 10.0)
+    sent_s = 10.0 - before_s
+    mine.receive(Received(capture(1, sent_s - 0.04), payload(), sent_s + 0.02, sent_s - 0.04))
+    mine.hold(descriptor(1, 10.0, coverage_grid=bytes(64)), 10.0)
+    mine.judge(10.05)
+    assert (mine._standings[1].strikes > 0) == doubted
+    assert mine._standings[1].reason.startswith("coverage" if doubted else "")
+
+
+def test_payloads_of_a_peer_that_is_not_heard_are_kept_for_two_seconds() -> None:
+    mine = memory()
+    mine.hold(descriptor(0, 0.0), 0.0)
+    mine.receive(Received(capture(1, 0.9), payload(), 1.0, 0.9))
+    for now_s, kept in ((1.5, 1), (2.9, 1), (3.1, 0)):
+        mine.judge(now_s)
+        assert len(mine._arrivals[1]) == kept
+
+
 def test_one_payload_that_came_faster_than_the_others_makes_no_claim_a_lie() -> None:
     """What arrived is held against the claim in the median; only the fastest data rate bounds it from above."""
     slow, fast = Arrival(20_000, 0.016, 100.0), Arrival(20_000, 0.0004, 600.0)  # 10 and 400 Mb/s

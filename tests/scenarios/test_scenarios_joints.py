@@ -76,6 +76,15 @@ def test_what_pairing_saves_follows_from_each_side_s_own_spread() -> None:
     assert other.difference.mean == pytest.approx(-both.difference.mean)
 
 
+def test_one_pair_has_a_difference_and_no_spread() -> None:
+    one = paired(np.array([1.0, math.nan]), np.array([3.0, 5.0]))
+    assert (one.difference.mean, one.difference.count) == (2.0, 1)
+    assert math.isnan(one.saved)
+    none = paired(np.array([math.nan]), np.array([3.0]))
+    assert none.difference.count == 0
+    assert math.isnan(none.saved)
+
+
 def test_resamples_draw_as_many_as_there_are_alike_often() -> None:
     weights = resamples(7, 4000, 3)
     assert (weights.sum(axis=1) == 7).all()
