@@ -56,7 +56,9 @@ class Dask:
         """Number of worker threads; each flies one batch at a time."""
         with self._of_cluster():
             info = self._client.scheduler_info(n_workers=-1)
-        return sum(w["nthreads"] for w in info["workers"].values())
+            return sum(
+                w["nthreads"] for w in info["workers"].values()
+            )  # no "workers": the scheduler died before it answered
 
     def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         """As `Engine`. A batch on which workers died again and again is flown run by run, and the run at fault is reported."""

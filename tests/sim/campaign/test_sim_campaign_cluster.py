@@ -114,6 +114,16 @@ def test_a_scheduler_that_dies_is_one_line(tmp_path: Path, what: Callable[[_Clie
     assert str(told.value) == GONE
 
 
+def test_a_scheduler_that_dies_before_its_first_answer_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """dask passes over the error, and then knows nothing of workers."""
+    monkeypatch.setattr(_Client, "scheduler_info", lambda self, n_workers=5: {})
+    with pytest.raises(RunError) as told:
+        run_campaign(plan(tmp_path), tmp_path / "a", Dask(_Client(), "tcp://head:8786"))
+    assert str(told.value) == GONE
+
+
 def test_a_result_that_cannot_be_fetched_is_one_line(tmp_path: Path) -> None:
     def lose(client: _Client) -> int:
         def call() -> Any:
