@@ -30,7 +30,7 @@ HOMES = {
     "simpy": ("sim/*", "fleet/agent.py", "radio/mac/medium.py", "radio/air.py"),
     "torch": ("perception/*",),
     "rerun": ("sim/playback/*",),
-    "pymavlink": ("fleet/logs/mavlink.py",),
+    "pymavlink": ("fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
     "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
     "distributed": ("sim/campaign/cluster.py",),
     "dask": ("sim/campaign/cluster.py",),

@@ -6,6 +6,7 @@ expected, since logs end where the power did: what cannot be read is skipped, co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -39,8 +40,22 @@ class RawLog:
     def parameters(self) -> dict[str, float]:
         """The vehicle's parameters, by name; the last value where one was set anew."""
         table = self.tables.get("PARM", {})
-        names = table.get("Name", np.zeros(0, "S16"))
-        return dict(zip((n.decode("ascii", "replace") for n in names.tolist()), table.get("Value", []), strict=True))
+        names, values = table.get("Name"), table.get("Value")
+        if names is None or values is None or names.dtype.kind != "S" or not is_numbers(values):
+            return {}
+        named = zip((n.decode("ascii", "replace") for n in names.tolist()), values.tolist(), strict=True)
+        return {name: value for name, value in named if math.isfinite(value)}
+
+
+def is_numbers(column: Column, width: int | None = None) -> bool:
+    """Whether a column has a number in each row; with a width, as many numbers in each row."""
+    return column.dtype.kind in "biuf" and column.shape[1:] == (() if width is None else (width,))
+
+
+def parameter_table(values: Mapping[str, float]) -> dict[str, Column]:
+    """Parameters as the table PARM."""
+    names = np.array([n.encode() for n in values], "S16")
+    return {"Name": names, "Value": np.array(list(values.values()), float)}
 
 
 def is_dataflash(data: bytes) -> bool:
@@ -88,13 +103,16 @@ def read_dataflash(data: bytes) -> RawLog:
 
 
 def _describe(body: bytes, described: _Kinds) -> None:
-    """Take up an FMT message; one that contradicts itself is left out, and its messages are then unknown."""
+    """Take up an FMT message; one that contradicts itself is left out, and its messages are then unknown.
+
+    So is a second one for a kind that is described already: its messages have been counted by the first.
+    """
     kind, length = body[0], body[1]
     name, form, columns = (
         part.split(b"\0")[0].decode("ascii", "replace") for part in (body[2:6], body[6:22], body[22:])
     )
     fields = tuple(columns.split(",")) if columns else ()
-    if kind != _FMT_TYPE and all(c in _BINARY for c in form) and len(form) == len(fields):
+    if kind not in described and form and all(c in _BINARY for c in form) and len(form) == len(fields):
         dtype = np.dtype([(f"{i}", _BINARY[c]) for i, c in enumerate(form)])
         if dtype.itemsize + 3 == length:
             described[kind] = (name, length, form, fields)
@@ -102,13 +120,11 @@ def _describe(body: bytes, described: _Kinds) -> None:
 
 def _tables(data: bytes, described: _Kinds, begins: Mapping[int, list[int]]) -> dict[str, dict[str, Column]]:
     """Every kind's messages as columns, decoded at once."""
-    octets = np.frombuffer(data, np.uint8)
     tables: dict[str, dict[str, Column]] = {}
     for kind, offsets in begins.items():
         name, length, form, names = described[kind]
-        rows = octets[np.array(offsets)[:, None] + np.arange(3, length)]
         dtype = np.dtype([(f"{i}", _BINARY[c]) for i, c in enumerate(form)])
-        records = np.ascontiguousarray(rows).view(dtype)[:, 0]
+        records = np.frombuffer(b"".join(data[at + 3 : at + length] for at in offsets), dtype)
         tables[name] = {
             field: records[f"{i}"] * _SCALE[c] if c in _SCALE else records[f"{i}"]
             for i, (field, c) in enumerate(zip(names, form, strict=True))

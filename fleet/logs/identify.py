@@ -32,7 +32,7 @@ def stated_pack(log: FlightLog, cells: int, capacity_ah: float | None = None) ->
     if capacity_ah is None:
         capacity_ah = log.parameters.get(CAPACITY_PARAMETER, 0.0) / 1000.0
     if not capacity_ah > 0:
-        raise LogError(f"the log's parameters have no {CAPACITY_PARAMETER}: give the pack's capacity")
+        raise LogError(f"{log.path}: no parameter {CAPACITY_PARAMETER}: give the pack's capacity")
     return Battery(capacity_wh=capacity_ah * cells * MEAN_CELL_V, cells=cells)
 
 
@@ -47,7 +47,9 @@ def identify_pack(log: FlightLog, pack: Battery, until_s: float, polarisation_ti
     battery, soc = _measured(log)
     first = battery.time_s < until_s
     if first.sum() < 3:
-        raise LogError(f"{first.sum()} rows of voltage and current before {until_s:g} s, must be 3 at least")
+        raise LogError(
+            f"{log.path}: {first.sum()} rows of voltage and current before {until_s:g} s, must be 3 at least"
+        )
     time_s, (volts, current) = battery.time_s[first], battery.values[first].T
 
     def with_resistances(mohm: Array) -> Battery:
@@ -80,7 +82,7 @@ def hovering(log: FlightLog, from_s: float, until_s: float) -> npt.NDArray[np.bo
     """Rows of the battery between two times at which the vehicle neither moves nor climbs: below 0.5 and 0.3 m/s."""
     battery, _ = _measured(log)
     if log.velocity is None:
-        raise LogError("the log has no velocity")
+        raise LogError(f"{log.path}: has no velocity")
     east, north, up = (np.interp(battery.time_s, log.velocity.time_s, v) for v in log.velocity.values.T)
     still: npt.NDArray[np.bool_] = (np.hypot(east, north) < 0.5) & (np.abs(up) < 0.3)
     return still & (battery.time_s >= from_s) & (battery.time_s < until_s)
@@ -96,9 +98,9 @@ def electric_power_w(log: FlightLog) -> Array:
 def _measured(log: FlightLog) -> tuple[Series, float]:
     """Rows with voltage and current, and the charge when they begin."""
     if log.battery is None or log.charge is None:
-        raise LogError("the log has no voltage, current and charge")
+        raise LogError(f"{log.path}: has no voltage, current and charge")
     known = np.isfinite(log.battery.values).all(axis=-1)
     if not known.any():
-        raise LogError("the log's current was not measured")
+        raise LogError(f"{log.path}: its current was not measured")
     battery = Series(log.battery.time_s[known], log.battery.values[known])
     return battery, float(np.interp(battery.time_s[0], log.charge.time_s, log.charge.values[:, 0]))

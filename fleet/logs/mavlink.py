@@ -19,11 +19,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from pymavlink.dialects.v20 import common as mavlink2
 
 from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
-from sortie.fleet.logs.dataflash import Column, RawLog
 
 _SENSORS = (
     mavlink2.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -35,16 +33,12 @@ _UNKNOWN_U16 = 0xFFFF
 _MAX_I16 = 0x7FFF
 _FARTHEST_UP_M = 100_000.0
 """Of an origin; altitudes go in 32-bit millimetres."""
-_LOG_STAMP = struct.Struct(">Q")
+LOG_STAMP = struct.Struct(">Q")
+"""Before each frame of a telemetry log: µs since 1970."""
 SIGNING_EPOCH_US = 1_420_070_400_000_000
 """2015-01-01, from which the clocks of signed frames count."""
-_STAMP_BYTES = 8
-_MARKS = {0xFE: 8, 0xFD: 12}
-"""First byte of a MAVLink 1 and 2 frame, and what stands around its payload; a signature adds 13."""
-_SIGNED, _SIGNATURE_BYTES = 0x01, 13
 _BAD_SIGNATURE = "Invalid signature"
 """pymavlink's reason."""
-_YEARS_US = (0, 4_000_000_000_000_000)  # 1970 … 2096
 
 
 Vector = tuple[float, float, float]
@@ -339,92 +333,10 @@ def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             for time_us, frame in frames:
-                file.write(_LOG_STAMP.pack(time_us) + frame)
+                file.write(LOG_STAMP.pack(time_us) + frame)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
-
-
-def is_tlog(data: bytes) -> bool:
-    """Whether a file begins as a telemetry log: a time and a MAVLink frame."""
-    return _frame_bytes(data, 0) > 0
-
-
-def read_tlog(data: bytes) -> RawLog:
-    """A telemetry log's messages as columns; `timestamp` is the ground's clock, µs since the first.
-
-    The vehicle is the first system whose heartbeat names an autopilot; of other systems only RADIO_STATUS is kept,
-    which the vehicle's radio sends in its own name. Parameters become the table PARM. A frame whose checksum is wrong,
-    or a stretch that is no frame, is skipped, counted and told.
-    """
-    from pymavlink.dialects.v20 import ardupilotmega as dialect  # the widest set of messages
-
-    parser = dialect.MAVLink(None)
-    heard: dict[str, list[tuple[int, int, dict[str, object]]]] = {}
-    parameters: dict[str, float] = {}
-    at, end, skipped, stretches, bad, vehicle, restarts, boot_ms = 0, len(data), 0, 0, 0, -1, 0, 0
-    cut = False
-    while at < end:
-        size = _frame_bytes(data, at)
-        if not size:
-            cut = cut or _may_begin(data, at)
-            following = next((p for p in range(at + 1, end) if _frame_bytes(data, p)), end)
-            skipped, stretches, at = skipped + following - at, stretches + 1, following
-            continue
-        stamp_us = _LOG_STAMP.unpack_from(data, at)[0]
-        try:
-            message = parser.decode(bytearray(data[at + _STAMP_BYTES : at + size]))
-        except dialect.MAVError:
-            bad, at = bad + 1, at + size
-            continue
-        at += size
-        name, values, system = message.get_type(), message.to_dict(), message.get_srcSystem()
-        if name == "HEARTBEAT" and vehicle < 0 and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
-            vehicle = system
-        if name == "PARAM_VALUE":
-            parameters[message.param_id] = float(message.param_value)
-        if system == vehicle and "time_boot_ms" in values:
-            restarts += values["time_boot_ms"] < boot_ms - 1000
-            boot_ms = values["time_boot_ms"]
-        heard.setdefault(name, []).append((system, stamp_us, values))
-    tables: dict[str, dict[str, Column]] = {}
-    begin_us = min((each[0][1] for each in heard.values()), default=0)
-    for name, each in heard.items():
-        own = [row for row in each if row[0] == vehicle or name in ("RADIO_STATUS", "RADIO")]
-        if own and name != "PARAM_VALUE":
-            numbers = [key for key, value in own[0][2].items() if isinstance(value, int | float)]
-            tables[name] = {key: np.array([row[2][key] for row in own]) for key in numbers}
-            tables[name]["timestamp"] = np.array([row[1] - begin_us for row in own])
-    tables["PARM"] = {
-        "Name": np.array([n.encode() for n in parameters], "S16"),
-        "Value": np.array(list(parameters.values()), float),
-    }
-    told = (
-        (stretches, f"{skipped} bytes at {stretches} places are no message"),
-        (bad, f"{bad} messages are damaged or of no known kind"),
-        (restarts, f"the vehicle restarted {restarts} times"),
-        (cut, "the last message is cut off"),
-    )
-    return RawLog(tables, tuple(text for happened, text in told if happened))
-
-
-def _may_begin(data: bytes, at: int) -> bool:
-    """Whether a time that could be one and a frame's first byte stand here, or the file ends before."""
-    if len(data) - at <= _STAMP_BYTES:
-        return True
-    return data[at + _STAMP_BYTES] in _MARKS and _YEARS_US[0] < _LOG_STAMP.unpack_from(data, at)[0] < _YEARS_US[1]
-
-
-def _frame_bytes(data: bytes, at: int) -> int:
-    """Bytes of the stamp and frame that begin here, 0 where none does: the next has to begin where it ends."""
-    mark = at + _STAMP_BYTES
-    if mark + 3 > len(data) or not _may_begin(data, at):
-        return 0
-    version2 = data[mark] == 0xFD
-    size = _STAMP_BYTES + data[mark + 1] + _MARKS[data[mark]]
-    size += _SIGNATURE_BYTES if version2 and data[mark + 2] & _SIGNED else 0
-    after = at + size
-    return size if after == len(data) or (after < len(data) and _may_begin(data, after)) else 0

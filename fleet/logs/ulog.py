@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sortie.fleet.logs.dataflash import Column, RawLog
+from sortie.fleet.logs.dataflash import Column, RawLog, parameter_table
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER_BYTES = 16
@@ -23,7 +23,12 @@ _BINARY = {
     "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
     "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "?", "char": "S1",
 }  # fmt: skip
-_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? (\w+)")
+_FIELD = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
+_KIND = re.compile(b"[" + bytes(sorted(_KINDS)) + b"]")
+MAX_NESTING = 16
+"""Types within types; PX4 has two or three."""
+_MAX_ROW_BYTES = 65_535
+"""A message is no longer."""
 _CHAIN = 4
 """So many messages in a row have to be sound where reading goes on after damage."""
 
@@ -45,7 +50,8 @@ def read_ulog(data: bytes) -> RawLog:
         size, kind = struct.unpack_from("<HB", data, at)
         body, after = at + 3, at + 3 + size
         if kind not in _KINDS or after > end:
-            following = next((p for p in range(at + 1, end - 3) if _sound(data, p, end)), end)
+            places = (found.start() - 2 for found in _KIND.finditer(data, at + 3, max(end - 1, 0)))
+            following = next((place for place in places if _sound(data, place, end)), end)
             cut = cut or (kind in _KINDS and following == end)
             skipped_bytes, stretches, at = skipped_bytes + following - at, stretches + 1, following
             continue
@@ -66,14 +72,14 @@ def read_ulog(data: bytes) -> RawLog:
             case "O" if size >= 2:
                 dropouts, dropped_ms = dropouts + 1, dropped_ms + int.from_bytes(data[body : body + 2], "little")
     tables: dict[str, dict[str, Column]] = {}
-    for number, places in rows.items():
+    types = _Types(formats)
+    for number, messages in rows.items():
         name, format_name = topics.get(number, ("", ""))
-        dtype = _dtype(formats, format_name)
-        fitting = [p for p, size in places if dtype is not None and size >= dtype.itemsize]
-        unknown += len(places) - len(fitting)
+        dtype = types.row(format_name)
+        fitting = [p for p, size in messages if dtype is not None and size >= dtype.itemsize]
+        unknown += len(messages) - len(fitting)
         if dtype is not None and fitting:
-            octets = np.frombuffer(data, np.uint8)[np.array(fitting)[:, None] + np.arange(dtype.itemsize)]
-            records = np.ascontiguousarray(octets).view(dtype)[:, 0]
+            records = np.frombuffer(b"".join(data[p : p + dtype.itemsize] for p in fitting), dtype)
             tables[name] = {field: records[field] for field in dtype.names or ()}
     problems = []
     if stretches:
@@ -84,10 +90,7 @@ def read_ulog(data: bytes) -> RawLog:
         problems.append(f"the logger dropped data {dropouts} times, {dropped_ms / 1000:g} s in all")
     if cut or 0 < end - at < 3:
         problems.append("the last message is cut off")
-    tables["PARM"] = {
-        "Name": np.array([n.encode() for n in parameters], "S16"),
-        "Value": np.array(list(parameters.values()), float),
-    }
+    tables["PARM"] = parameter_table(parameters)
     return RawLog(tables, tuple(problems))
 
 
@@ -113,23 +116,40 @@ def _parameter(body: bytes, parameters: dict[str, float]) -> None:
         parameters[name] = float(struct.unpack("<i" if kind == "int32_t" else "<f", value)[0])
 
 
-def _dtype(formats: Mapping[str, str], name: str, nested: bool = False) -> np.dtype[Any] | None:
-    """A topic's rows; the padding at their end is not logged, that at the end of a nested type is."""
-    fields: list[Any] = []
-    parts = [part for part in formats.get(name, "").split(";") if part]
-    for i, part in enumerate(parts):
-        found = _FIELD.fullmatch(part)
-        if found is None:
-            return None
-        kind, count, field = found.groups()
-        if field.startswith("_padding") and i == len(parts) - 1 and not nested:
-            break
-        if kind in _BINARY:
-            binary: Any = _BINARY[kind]
-        else:
-            binary = _dtype(formats, kind, nested=True) if kind != name else None
-            if binary is None:
+class _Types:
+    """The rows that formats describe; each is made once, however often others name it."""
+
+    def __init__(self, formats: Mapping[str, str]) -> None:
+        self._formats = formats
+        self._nested: dict[str, np.dtype[Any] | None] = {}
+
+    def row(self, name: str) -> np.dtype[Any] | None:
+        """A topic's rows: the padding at their end is not logged. None where there is none that makes sense."""
+        return self._made(name, 0)
+
+    def _inner(self, name: str, depth: int) -> np.dtype[Any] | None:
+        """A type within another; the padding at its end is logged."""
+        if name not in self._nested:
+            self._nested[name] = None  # also of a type that leads back to itself
+            self._nested[name] = self._made(name, depth) if depth <= MAX_NESTING else None
+        return self._nested[name]
+
+    def _made(self, name: str, depth: int) -> np.dtype[Any] | None:
+        fields: dict[str, np.dtype[Any]] = {}
+        size = 0
+        parts = [part for part in self._formats.get(name, "").split(";") if part]
+        for i, part in enumerate(parts):
+            found = _FIELD.fullmatch(part)
+            if found is None:
                 return None
-        fields.append((field, binary, (int(count),)) if count else (field, binary))
-    names = {field for field, *_ in fields}
-    return np.dtype(fields) if fields and len(names) == len(fields) else None
+            kind, count, field = found.groups()
+            if field.startswith("_padding") and i == len(parts) - 1 and not depth:
+                break
+            binary = np.dtype(_BINARY[kind]) if kind in _BINARY else self._inner(kind, depth + 1)
+            if binary is None or field in fields:
+                return None
+            size += binary.itemsize * int(count or 1)
+            if size > _MAX_ROW_BYTES:
+                return None
+            fields[field] = np.dtype((binary, (int(count),))) if count else binary
+        return np.dtype(list(fields.items())) if size else None

@@ -5,18 +5,23 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import loads
+from sortie.scenarios.schema import Battery
 from sortie.sim.cli.console import out
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
 from sortie.sim.user_errors import user_errors
+
+if TYPE_CHECKING:
+    from sortie.fleet.logs.flightlog import FlightLog
 
 Array = np.ndarray[Any, Any]
 
@@ -45,45 +50,93 @@ def import_log(
         float | None,
         typer.Option(help="Metres added to every height; default: the lowest point is at 2 m.", min=-1e4, max=1e4),
     ] = None,
+    system: Annotated[
+        list[int] | None,
+        typer.Option(
+            help="MAVLink system id of a vehicle to take, once for each; default: every vehicle.", min=1, max=255
+        ),
+    ] = None,
 ) -> None:
-    """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it as one drone.
+    """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it.
 
-    Gaps, restarts, damaged and missing messages are reported and skipped. Gaps are empty cells of the trace.
+    Telemetry of several vehicles becomes several drones, by ascending system id. Gaps, restarts, damaged and missing
+    messages are reported and skipped. Gaps are empty cells of the trace.
     """
-    from sortie.fleet.logs.flightlog import read_log  # here: scipy's rotations and pyarrow are for this command alone
-    from sortie.fleet.logs.logtrace import context_trace, write_trace
+    from sortie.fleet.logs.logtrace import write_trace
 
     folder = out_dir or Path(slug(log))
     ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO})
     if (folder / SCENARIO).is_file() and MADE not in (folder / SCENARIO).read_text("utf-8", "replace"):
         raise RunError(f"{folder}: its {SCENARIO} is none that sortie import wrote; choose another folder or move it")
     with user_errors():
-        flight = read_log(log)
-        until = flight.duration_s if until_s is None else until_s
-        if until - from_s > LONGEST_S:
-            raise RunError(
-                f"{log}: {until - from_s:.0f} s to fly, must be at most {LONGEST_S:g}: name --from and --until"
-            )
-        columns = context_trace(flight, rate, from_s, until)
-        if "soc" in columns:
-            columns["soc"] = np.maximum(columns["soc"], LEAST_SOC)  # NaN stays
-        if "z_m" in columns:
-            columns["z_m"] += LOWEST_M - float(np.nanmin(columns["z_m"])) if lift is None else lift
-    text = scenario_text(slug(log), columns, flight.parameters, folder / TRACE, f"{flight.kind} log {log.name!r}")
-    loads(text, str(folder / SCENARIO))  # an impossible log is refused before anything is written
+        flights, columns, text = flown_log(log, folder, rate, from_s, until_s, lift, system or ())
     with replacing(folder) as new, user_errors():
         write_trace(new / TRACE, columns)
         write_text(new / SCENARIO, text)
-    rows = len(columns["t_s"])
+    rows, first = len(columns["t_s"]), flights[0]
     out.print(
-        f"{flight.kind}, {flight.duration_s:.1f} s; {rows} rows at {rate:g} Hz of {described(columns)}", soft_wrap=True
+        f"{first.kind}, {first.duration_s:.1f} s; {rows} rows at {rate:g} Hz of {described(columns)}", soft_wrap=True
     )
-    for problem in flight.problems:
-        out.print(f"  [yellow]{problem}[/yellow]", soft_wrap=True)
-    for lacking, instead in LACKING.items():
-        if lacking not in columns:
-            out.print(f"  [yellow]no {instead}[/yellow]", soft_wrap=True)
+    if len(flights) > 1:
+        who = ", ".join(f"drone {drone} is system {flight.system}" for drone, flight in enumerate(flights))
+        out.print(f"{len(flights)} vehicles: {who}", soft_wrap=True)
+    for line in told(flights, columns):
+        out.print(f"  [yellow]{line}[/yellow]", soft_wrap=True)
     out.print(f"sortie fly {folder / SCENARIO}", soft_wrap=True)
+
+
+def flown_log(
+    log: Path,
+    folder: Path,
+    rate: float = 10.0,
+    from_s: float = 0.0,
+    until_s: float | None = None,
+    lift: float | None = None,
+    systems: Sequence[int] = (),
+) -> tuple[Sequence[FlightLog], dict[str, Array], str]:
+    """A log's flights, their trace, and the scenario that flies it from `folder`; nothing is written.
+
+    Raises:
+        SortieError: the log cannot be read or flown; the message names it.
+    """
+    from sortie.fleet.logs.flightlog import read_logs  # here: scipy's rotations and pyarrow are for this command alone
+    from sortie.fleet.logs.logtrace import beside, context_trace
+
+    found = read_logs(log)
+    here = {flight.system: flight for flight in found if flight.system is not None}
+    if missing := [number for number in systems if number not in here]:
+        has = f"it has {', '.join(map(str, here))}" if here else f"a {found[0].kind} log has no systems"
+        raise RunError(f"{log}: no vehicle with system id {missing[0]}, {has}")
+    flights = beside([here[number] for number in sorted(set(systems))] or found)
+    until = flights[0].duration_s if until_s is None else until_s
+    if until - from_s > LONGEST_S:
+        raise RunError(f"{log}: {until - from_s:.0f} s to fly, must be at most {LONGEST_S:g}: name --from and --until")
+    columns = context_trace(flights, rate, from_s, until)
+    if "soc" in columns:
+        columns["soc"] = np.maximum(columns["soc"], LEAST_SOC)  # NaN stays
+    if "z_m" in columns:
+        columns["z_m"] += LOWEST_M - float(np.nanmin(columns["z_m"])) if lift is None else lift
+    capacities_ah = [flight.parameters.get("BATT_CAPACITY", 0.0) / 1000 for flight in flights]
+    source = f"{flights[0].kind} log {log.name!r}"
+    text = scenario_text(slug(log), columns, capacities_ah, folder / TRACE, source)
+    try:
+        loads(text, str(folder / SCENARIO))  # an impossible log is refused before anything is written
+    except SortieError as error:
+        raise RunError(f"{log}: cannot be flown: {error}") from None
+    return flights, columns, text
+
+
+def told(flights: Sequence[FlightLog], columns: Mapping[str, Array]) -> list[str]:
+    """What was wrong with a log and what its trace lacks; of one of several vehicles, with its system id."""
+    each = []
+    for drone, flight in enumerate(flights):
+        rows = columns["drone"] == drone
+        lacks = [text for name, text in LACKING.items() if name not in columns or np.isnan(columns[name][rows]).all()]
+        each.append([*flight.problems, *(f"no {text}" for text in lacks)])
+    lines = dict.fromkeys(problem for problem in each[0] if all(problem in others for others in each))
+    for flight, problems in zip(flights, each, strict=True):
+        lines |= dict.fromkeys(f"system {flight.system}: {problem}" for problem in problems if problem not in lines)
+    return list(lines)
 
 
 LACKING = {
@@ -107,18 +160,24 @@ def described(columns: Mapping[str, Array]) -> str:
 
 
 def scenario_text(
-    name: str, columns: Mapping[str, Array], parameters: Mapping[str, float], trace: Path, source: str
+    name: str, columns: Mapping[str, Array], capacities_ah: Sequence[float], trace: Path, source: str
 ) -> str:
-    """One drone that flies the trace, without a detector: the simulator's town is not the flight's place.
+    """Drones that fly the trace, without a detector: the simulator's town is not the flight's place.
 
-    A traced charge never lands it; capacity and cells, where the log tells them, are those of its pack.
+    A traced charge never lands one; capacity and cells, where the log tells them, are those of the first pack that can be:
+    damage makes capacities of any size.
     """
     battery = []
     if "voltage_v" in columns:
         cells = min(max(math.ceil(float(np.nanmax(columns["voltage_v"])) / FULL_CELL_V), 1), 24)
         battery.append(f"cells: {cells}")
-        if (capacity_ah := parameters.get("BATT_CAPACITY", 0.0) / 1000) > 0:
-            battery.append(f"capacity_wh: {capacity_ah * cells * MEAN_CELL_V:.1f}")
+        capacities_wh = (each * cells * MEAN_CELL_V for each in capacities_ah)
+        bounds: list[Any] = Battery.model_fields["capacity_wh"].metadata
+        most_wh = next(bound.le for bound in bounds if hasattr(bound, "le"))
+        if capacity_wh := next(
+            (each for each in capacities_wh if 0.05 <= each <= most_wh), None
+        ):  # 0.0 to a digit is none
+            battery.append(f"capacity_wh: {capacity_wh:.1f}")
     if "soc" in columns:
         battery.append("landing_soc: 0")
     return f"""# A real flight, {MADE} from the {source}.
@@ -128,7 +187,7 @@ name: {name}
 duration_s: {columns["t_s"][-1]:g}
 
 fleet:
-  drones: 1
+  drones: {int(columns["drone"].max()) + 1}
   trace: {json.dumps(str(trace.absolute()), ensure_ascii=False)}
   battery: {{{", ".join(battery)}}}
 

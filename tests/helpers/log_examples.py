@@ -31,14 +31,19 @@ def state(k: int) -> Telemetry:
     )
 
 
-def tlog() -> bytes:
+def tlog(steps: int = STEPS) -> bytes:
     """The flight as this project's own telemetry."""
     transmitter = Transmitter(0)
     out = b""
-    for k in range(STEPS):
+    for k in range(steps):
         for message in messages(state(k), ORIGIN):
-            out += struct.pack(">Q", 1_700_000_000_000_000 + k * 100_000) + transmitter.pack(message)
+            out += stamped(k, transmitter.pack(message))
     return out
+
+
+def stamped(k: int, frame: bytes) -> bytes:
+    """A frame of step k as a telemetry log has it."""
+    return struct.pack(">Q", 1_700_000_000_000_000 + k * 100_000) + frame
 
 
 _DATAFLASH = {
@@ -67,9 +72,9 @@ def dataflash_begin() -> bytes:
     return out + dataflash_message("PARM", 5_000_000, b"BATT_CAPACITY", 5000.0)
 
 
-def dataflash() -> bytes:
+def dataflash(steps: int = STEPS) -> bytes:
     """The flight as ArduPilot would log it, begun 5 s after boot."""
-    return dataflash_begin() + b"".join(dataflash_step(k) for k in range(STEPS))
+    return dataflash_begin() + b"".join(dataflash_step(k) for k in range(steps))
 
 
 def dataflash_step(k: int) -> bytes:
@@ -100,7 +105,7 @@ def ulog_message(kind: str, body: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
-def ulog() -> bytes:
+def ulog(steps: int = STEPS) -> bytes:
     """The flight as PX4 would log it."""
     out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 5_000_000)
     out += ulog_message("P", b"\x14float BAT_CAPACITY__" + struct.pack("<f", 5000.0))
@@ -108,7 +113,7 @@ def ulog() -> bytes:
         out += ulog_message("F", f"{name}:{fields}".encode())
     for number, name in enumerate(_TOPICS):
         out += ulog_message("A", struct.pack("<BH", 0, number) + name.encode())
-    for k in range(STEPS):
+    for k in range(steps):
         s, us = state(k), 5_000_000 + k * 100_000
         (east, north, up), (ve, vn, vu) = s.position_m, s.velocity_mps
         rows = (

@@ -13,9 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sortie.fleet.logs.dataflash import RawLog, read_dataflash
-from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, _from_dataflash, _from_ulog, local_m, read_log
+from sortie.fleet.logs.fields import from_dataflash, from_ulog
+from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, local_m, read_log
 from sortie.fleet.logs.identify import predicted_voltage
-from sortie.fleet.logs.mavlink import geodetic, read_tlog
+from sortie.fleet.logs.mavlink import geodetic
+from sortie.fleet.logs.tlog import read_tlog
 from sortie.fleet.logs.ulog import read_ulog
 from sortie.scenarios.schema import Battery
 
@@ -89,7 +91,7 @@ def assembled(kind: str, **tables: dict[str, list[object]]) -> FlightLog:
     for name, table in columns.items():
         if name != "PARM":
             table[stamp] = np.arange(len(next(iter(table.values())))) * 100_000
-    return _assemble(kind, RawLog(columns, ()), _from_ulog if kind == "ULog" else _from_dataflash)
+    return _assemble(Path("a.log"), kind, RawLog(columns, ()), from_ulog if kind == "ULog" else from_dataflash)
 
 
 def test_the_first_receiver_is_taken() -> None:
@@ -117,7 +119,7 @@ def test_what_an_autopilot_does_not_know_is_no_value() -> None:
 
 def test_a_pack_is_not_identified_without_a_current() -> None:
     unmeasured = {"voltage_v": [16.0] * 3, "current_a": [-1.0] * 3, "remaining": [0.9, 0.8, 0.7]}
-    with pytest.raises(LogError, match=r"^the log's current was not measured$"):
+    with pytest.raises(LogError, match=r"^a\.log: its current was not measured$"):
         predicted_voltage(assembled("ULog", battery_status=unmeasured), Battery())  # type: ignore[arg-type]
 
 
@@ -269,9 +271,11 @@ def test_no_damage_stops_a_reader(kind: str, data: st.DataObject) -> None:
                 flight[at:at] = data.draw(st.binary(max_size=50))
         if len(flight) < 20:
             break
-    read = {"bin": read_dataflash, "ulg": read_ulog, "tlog": read_tlog}[kind]
-    for table in read(bytes(flight)).tables.values():
-        assert len({len(column) for column in table.values()}) == 1
+    damaged = bytes(flight)
+    logs = {"bin": read_dataflash, "ulg": read_ulog}[kind](damaged) if kind != "tlog" else read_tlog(damaged)
+    for log in logs.values() if isinstance(logs, dict) else [logs]:
+        for table in log.tables.values():
+            assert len({len(column) for column in table.values()}) == 1
 
 
 @settings(max_examples=60)

@@ -10,6 +10,7 @@ import log_examples as examples
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from sim_examples import example
 from typer.testing import CliRunner
 
 from sortie.fleet.logs.flightlog import read_log
@@ -19,6 +20,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.export.telemetry import save_tlog
 from sortie.sim.folders import RunError
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[4] / "shared/flightlogs"))
@@ -159,3 +161,44 @@ def test_three_real_logs_fly(name: str, seconds: float, lacks: list[str], tmp_pa
     known = ~np.isnan(columns["soc"][: states.num_rows])
     flown, logged = states["soc"].to_numpy()[known], columns["soc"][: states.num_rows][known]
     np.testing.assert_allclose(flown, logged, atol=2e-3)
+
+
+def test_a_fleet_s_log_flies_as_the_fleet_that_it_was(tmp_path: Path) -> None:
+    """Exported and imported again: every drone's pose and charge, each where it was beside the others."""
+    record = run_sortie(example("duration_s=4", "fleet.drones=3"))
+    save_tlog(record, tmp_path / "fleet.tlog", 10**15)
+    command = ["import", str(tmp_path / "fleet.tlog"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert "3 vehicles: drone 0 is system 1, drone 1 is system 2, drone 2 is system 3" in done.output
+    scenario = load(tmp_path / "out/scenario.yaml")
+    assert scenario.fleet.drones == 3
+    again, before = run_sortie(scenario).tables["states"], record.tables["states"].slice(0, 3 * 39)
+    assert again["drone"].to_pylist() == before["drone"].to_pylist()
+    for names, precision in ((("x_m", "y_m", "z_m"), 0.05), (("qx", "qy", "qz", "qw"), 1e-3), (("soc",), 0.006)):
+        places = [np.stack([each[n].to_numpy().astype(float) for n in names], axis=-1) for each in (again, before)]
+        begin = places[1].min(axis=0) if names[0] == "x_m" else 0.0
+        offset = places[0].min(axis=0) - begin if names[0] == "x_m" else 0.0
+        np.testing.assert_allclose(places[0] - offset, places[1], atol=precision)
+
+
+def test_one_vehicle_of_several_is_chosen_by_its_system(tmp_path: Path) -> None:
+    save_tlog(run_sortie(example("duration_s=3", "fleet.drones=3")), tmp_path / "fleet.tlog", 10**15)
+    command = ["import", str(tmp_path / "fleet.tlog"), "--out", str(tmp_path / "out"), "--system"]
+    assert CliRunner().invoke(app, [*command, "2"], catch_exceptions=False).exit_code == 0
+    assert load(tmp_path / "out/scenario.yaml").fleet.drones == 1
+    with pytest.raises(RunError, match=r"fleet\.tlog: no vehicle with system id 9, it has 1, 2, 3$"):
+        CliRunner().invoke(app, [*command, "9"], catch_exceptions=False)
+    (tmp_path / "a.bin").write_bytes(examples.dataflash())
+    with pytest.raises(RunError, match=r"a\.bin: no vehicle with system id 1, a DataFlash log has no systems$"):
+        CliRunner().invoke(app, ["import", str(tmp_path / "a.bin"), "--system", "1"], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("capacity", [1e30, 1e-30, -1.0])
+def test_a_capacity_that_no_pack_has_is_left_out(capacity: float, tmp_path: Path) -> None:
+    """One damaged parameter made a scenario that does not load."""
+    log = tmp_path / "a.bin"
+    log.write_bytes(examples.dataflash().replace(struct.pack("<f", 5000.0), struct.pack("<f", capacity)))
+    done = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out")], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert load(tmp_path / "out/scenario.yaml").fleet.battery.capacity_wh == 130.0
