@@ -173,7 +173,11 @@ def test_every_package_at_the_root_is_a_room() -> None:
         ("policies/catalogue/worked.py", "import torch", "torch is at home in perception/*"),
         ("sim/engine/sortie.py", "from torch import nn", "torch is at home in perception/*"),
         ("sim/engine/sortie.py", "import rerun as rr", "rerun is at home in sim/playback/*"),
-        ("fleet/agent.py", "from pymavlink.dialects import v20", "pymavlink is at home in fleet/logs/mavlink.py"),
+        (
+            "fleet/agent.py",
+            "from pymavlink.dialects import v20",
+            "pymavlink is at home in fleet/logs/mavlink.py, fleet/logs/tlog.py",
+        ),
         (
             "scenarios/reading/nodes.py",
             "import yaml",

@@ -6,6 +6,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,10 @@ class Telemeter:
 
 
 class Stream:
-    """The frames of the whole fleet, in order of time: pose at every frame of the sortie, status once a second."""
+    """The messages of the whole fleet, in order of time: pose at every frame of the sortie, status once a second.
+
+    They are packed by `transmitters`, each when it is sent: packing numbers a frame and stamps its signature.
+    """
 
     def __init__(
         self, scenario: Scenario, origin: Origin, key: bytes | None = None, begin_us: int | None = None
@@ -82,15 +86,15 @@ class Stream:
         self._telemeter, self._origin = Telemeter(scenario), origin
         self._second = [-1] * n
 
-    def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, bytes]]:
-        """Time, drone and frame of everything that new rows have to tell."""
+    def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, Any]]:
+        """Time, drone and message of everything that new rows have to tell."""
         for drone, state in self._telemeter.add(new):
             second = int(state.time_s + 1e-6)
             status = second != self._second[drone]
             self._second[drone] = second
             for message in messages(state, self._origin):
                 if status or message.get_type() not in STATUS:
-                    yield state.time_s, drone, self.transmitters[drone].pack(message)
+                    yield state.time_s, drone, message
 
 
 def save_tlog(
@@ -107,7 +111,10 @@ def save_tlog(
         RunError: the file cannot be written.
     """
     stream = Stream(record.scenario, origin, key, None if key is None else begin_us)
-    frames = [(begin_us + round(t_s * 1e6), f) for t_s, _, f in stream.add(record.tables)]
+    frames = [
+        (begin_us + round(t_s * 1e6), stream.transmitters[drone].pack(message))
+        for t_s, drone, message in stream.add(record.tables)
+    ]
     try:
         write_tlog(path, frames)
     except OSError as error:
@@ -164,10 +171,10 @@ class MavlinkEndpoint:
         """Send what is new, each frame at its time."""
         if self._stream is None:
             return
-        for at_s, _, frame in self._stream.add(new):
+        for at_s, drone, message in self._stream.add(new):
             while self._pace is not None and (left_s := self._begin_s + at_s / self._pace - self._clock()) > 0:
                 self._listen(left_s)
-            self._send(frame)
+            self._send(drone, message)  # after the answers that were sent while it waited
         self._listen(0.0)
 
     def close(self) -> None:
@@ -186,16 +193,16 @@ class MavlinkEndpoint:
             self._peer = sender
         assert self._stream is not None  # noqa: S101 - set in `begin`
         for request in self._listener.heard(data):
-            for drone, transmitter in enumerate(self._stream.transmitters):
+            for drone in range(len(self._stream.transmitters)):
                 for message in answers(request, drone):
-                    self._send(transmitter.pack(message))
+                    self._send(drone, message)
 
-    def _send(self, frame: bytes) -> None:
+    def _send(self, drone: int, message: Any) -> None:
+        assert self._stream is not None  # noqa: S101 - set in `begin`
         if self._peer is not None:
-            try:
+            frame = self._stream.transmitters[drone].pack(message)
+            with suppress(OSError):  # best effort, as on any telemetry radio
                 self._socket.sendto(frame, self._peer)
-            except OSError:  # best effort, as on any telemetry radio
-                return
 
 
 def parse_address(address: str) -> tuple[bool, str, int]:

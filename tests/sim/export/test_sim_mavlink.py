@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import re
@@ -13,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,7 +181,7 @@ class Clock:
 
 
 @pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[MavlinkEndpoint, list[tuple[float, bytes]]]]:
+def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[MavlinkEndpoint, list[tuple[float, Any]]]]:
     """An endpoint at twice real time on a clock of its own, and what it sent when."""
     clock, sent = Clock(), []
     endpoint = MavlinkEndpoint("udpout:127.0.0.1:9", pace=2.0, clock=clock)
@@ -188,25 +190,70 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[MavlinkEndpoint, 
         clock.now_s += timeout_s
 
     monkeypatch.setattr(endpoint, "_listen", wait)
-    monkeypatch.setattr(endpoint, "_send", lambda frame: sent.append((clock.now_s - 100.0, frame)))
+    monkeypatch.setattr(endpoint, "_send", lambda drone, message: sent.append((clock.now_s - 100.0, message)))
     yield endpoint, sent
     endpoint.close()
 
 
 def test_frames_go_in_step_with_simulated_time(
-    watched: tuple[MavlinkEndpoint, list[tuple[float, bytes]]], record: SortieRecord
+    watched: tuple[MavlinkEndpoint, list[tuple[float, Any]]], record: SortieRecord
 ) -> None:
     endpoint, sent = watched
     again = run_sortie(record.scenario, observer=endpoint)
     assert again.fingerprint == record.fingerprint  # being watched changes nothing
-    parser = mavlink2.MAVLink(None)
     checked = 0
-    for wall_s, frame in sent:
-        for m in parser.parse_buffer(frame):
-            if m.get_type() == "LOCAL_POSITION_NED":
-                assert wall_s == pytest.approx(m.time_boot_ms / 2000.0, abs=1e-9)
-                checked += 1
+    for wall_s, m in sent:
+        if m.get_type() == "LOCAL_POSITION_NED":
+            assert wall_s == pytest.approx(m.time_boot_ms / 2000.0, abs=1e-9)
+            checked += 1
     assert checked == 5 * record.scenario.frames
+
+
+class Socket(socket.socket):
+    """Keeps what is sent."""
+
+    sent: list[bytes]
+
+    def sendto(self, data: bytes, *to: object) -> int:  # type: ignore[override]
+        self.sent.append(data)
+        return len(data)
+
+
+@pytest.mark.parametrize("key", [None, bytes(range(KEY_BYTES))], ids=["plain", "signed"])
+def test_frames_stay_in_order_while_a_ground_station_asks(
+    key: bytes | None, record: SortieRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """System 1 is asked ninety times in flight, each time while a frame waits for its moment.
+
+    The frame had its number and its signature's time before the answer, and went after it: a ground station counted
+    lost frames, and refused signatures.
+    """
+    now_s = 0.0
+
+    def clock() -> float:
+        nonlocal now_s
+        now_s += 1e-3
+        return now_s
+
+    monkeypatch.setattr("socket.socket", Socket)
+    endpoint = MavlinkEndpoint("udpin:127.0.0.1:0", pace=3.5, key=key, clock=clock)
+    monkeypatch.undo()
+    sent = endpoint._socket.sent = []  # type: ignore[attr-defined]
+    station = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+    with closing(endpoint), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _ in range(90):
+            asking.sendto(mavlink2.MAVLink_param_request_list_message(1, 1).pack(station), endpoint.address)
+        endpoint.begin(record.scenario, None)  # type: ignore[arg-type]
+        endpoint.second(4.0, record.tables)
+    listener = Listener(key)
+    heard = [m for frame in sent for m in listener.heard(frame)]
+    assert (len(heard), listener.refused) == (len(sent), 0)
+    for system in range(1, 6):
+        numbers = [m.get_seq() for m in heard if m.get_srcSystem() == system]
+        assert numbers == [k % 256 for k in range(len(numbers))]
+    answered = [k for k, m in enumerate(heard) if m.get_type() == "PARAM_VALUE"]
+    assert len(answered) == 90
+    assert sum(b - a > 1 for a, b in itertools.pairwise(answered)) > 10  # among the frames of the flight
 
 
 def test_a_waiting_endpoint_answers_a_ground_station_and_sends_to_it(record: SortieRecord) -> None:
