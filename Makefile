@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
+SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks
+.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks fuzz
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -40,6 +41,9 @@ lint: $(STAMP) ## style and types
 
 scenarios: $(STAMP) ## hold the library's scenarios to their own expectations (minutes each)
 	$(BIN)/python -m pytest scenarios/library
+
+fuzz: $(STAMP) ## try every reader with damaged inputs, ten minutes of processor time each (SECONDS_EACH=n, READER=name)
+	$(BIN)/python tests/fuzz $(READER) --seconds $(SECONDS_EACH)
 
 notebooks: $(STAMP) ## execute the notebooks
 	$(BIN)/python -m pytest --nbmake --nbmake-timeout=1200 notebooks

@@ -1,11 +1,20 @@
-"""Write a file whole: under a temporary name beside it, renamed when it is complete."""
+"""Write a file whole, under a temporary name beside it, renamed when it is complete; read arrays that may be damaged."""
 
 from __future__ import annotations
 
+import math
 import os
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MOST_DEFLATED = 1040
+"""Deflate makes at most so many bytes of one, and a little more at a stream's begin and end."""
 
 
 @contextmanager
@@ -21,3 +30,29 @@ def replacing(path: Path) -> Iterator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file.
+
+    What the archive claims is compared with what its bytes can hold, before memory is taken for it.
+
+    Raises:
+        Exception: a damaged archive can raise nearly anything: zlib.error, RuntimeError, NotImplementedError.
+    """
+    with path.open("rb") as stream:
+        with zipfile.ZipFile(stream) as archive:
+            for info in archive.infolist():
+                if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{info.filename} is compressed by method {info.compress_type}, must be 0 or 8")
+                with archive.open(info) as member:
+                    version = np.lib.format.read_magic(member)
+                    first = version == (1, 0)
+                    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+                    shape, _, dtype = read(member)
+                claimed, most = math.prod(shape) * dtype.itemsize, _MOST_DEFLATED * (info.compress_size + 64)
+                if claimed > min(info.file_size, most):
+                    raise ValueError(f"{info.filename} is of {claimed} B, its {info.compress_size} B cannot hold them")
+        stream.seek(0)
+        with np.load(stream, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}

@@ -59,6 +59,9 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
     for name in required:
         if name not in names:
             raise TraceError(f"{path}: no column {name}, a trace needs {', '.join(required)}")
+    for name in bounds:
+        if names.count(name) > 1:
+            raise TraceError(f"{path}: {names.count(name)} columns {name}, must be one at most")
     if not 0 < table.num_rows <= MAX_ROWS:
         raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
     columns = {}

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.difficulty import Split
-from sortie.perception.files import replacing
+from sortie.perception.files import read_npz, replacing
 from sortie.scenarios.errors import SortieError
 
 MANIFEST = "manifest.json"
@@ -35,11 +35,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         BenchmarkError: it cannot be read.
     """
     try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return {name: file[name] for name in COLUMNS}
-    except (
-        Exception
-    ) as error:  # a damaged archive can raise nearly anything: zlib.error, RuntimeError, NotImplementedError
+        arrays = read_npz(path)
+        return {name: arrays[name] for name in COLUMNS}
+    except Exception as error:
         raise BenchmarkError(f"{path}: cannot be read: {error}") from error
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.errors import InputError
+from sortie.perception.files import read_npz
 from sortie.perception.geometry import CELLS, CHANNELS, Geometry
 
 FORMAT = 1
@@ -22,6 +23,7 @@ NEEDED = ("format", "cell_m", "t_s", "pose", "boxes", "boxes_offset", "truth", "
 OPTIONAL = ("scene", "est_pose", "features", "confidence")
 LARGE = ("features", "confidence")
 """Read a frame at a time."""
+CELL_BOUNDS_M = (1e-3, 1e3)
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -143,7 +145,8 @@ class Recording:
 
 def cells_of(boxes: Floats, geometry: Geometry) -> tuple[Ints, Ints, NDArray[np.bool_]]:
     """Row and column of the exchanged cell that holds each box's centre, and whether the grid reaches it."""
-    row, column = (np.floor((boxes[:, :2] + geometry.half_extent_m) / geometry.cell_m)).astype(np.int64).T
+    places = np.floor((boxes[:, :2] + geometry.half_extent_m) / geometry.cell_m)
+    row, column = np.clip(places, -1, CELLS).astype(np.int64).T  # a box may be anywhere
     return row, column, (row >= 0) & (row < CELLS) & (column >= 0) & (column < CELLS)
 
 
@@ -160,14 +163,11 @@ def open_recording(path: Path | str) -> Recording:
     if path.is_dir():
         return checked(path, *from_zarr(path))
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_npz(path)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such recording, must be an npz file or a Zarr folder") from None
-    except (
-        Exception
-    ) as error:  # a damaged archive can raise nearly anything: zlib.error, RuntimeError, NotImplementedError
-        raise RecordingError(f"{path}: cannot be read as npz ({error})") from error
+    except Exception as error:
+        raise RecordingError(f"{path}: cannot be read as npz ({error or type(error).__name__})") from error
     return checked(
         path,
         {k: v for k, v in arrays.items() if k not in LARGE},
@@ -208,7 +208,8 @@ def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, A
     if version != FORMAT:
         raise RecordingError(f"{path}: format is {version}, must be {FORMAT}")
     cell_m = float(checks.numbers("cell_m", ()))
-    checks.require("cell_m", cell_m > 0, f"is {cell_m:g}", "above 0")
+    low, high = CELL_BOUNDS_M
+    checks.require("cell_m", low <= cell_m <= high, f"is {cell_m:g}", f"{low:g} to {high:g} m")
     t_s = checks.numbers("t_s", (None,))
     n = len(t_s)
     checks.require("t_s", n > 0, "is empty", "at least one frame")

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sortie.scenarios.errors import SortieError
+from sortie.scenarios.errors import SortieError, one_line
 
 Scalar = str | int | float | bool | None
 Path = tuple[str | int, ...]
@@ -22,18 +22,13 @@ class ScenarioError(SortieError):
         line: the message.
         issues: all that is wrong; none says that the message is all.
         """
-        super().__init__(_printable(line))
+        super().__init__(line)
         self._all = [*issues]
 
     @property
     def issues(self) -> tuple[str, ...]:
         """Everything that is wrong, as far as it was found, a line each."""
-        return tuple(_printable(str(issue)) for issue in self._all) or (str(self),)
-
-
-def _printable(line: str) -> str:
-    """One line whatever a broken file holds: control characters and odd spaces are escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+        return tuple(one_line(issue) for issue in self._all) or (str(self),)
 
 
 @dataclass(frozen=True, slots=True)

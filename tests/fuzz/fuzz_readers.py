@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import pickle
 import struct
+import subprocess
+import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import fuzz_mutators as m
 import log_examples
@@ -249,9 +254,37 @@ def _pickles() -> list[bytes]:
 
 
 def _pickle(path: Path) -> None:
+    """As the reader does it, but that the process of its own is a fork: starting Python would take nearly all the time."""
+    from sortie.perception.recordings import unpickle
     from sortie.perception.recordings.uav3d import read_infos
 
-    read_infos(path)
+    with mock.patch.object(unpickle.subprocess, "run", _forked):
+        read_infos(path)
+
+
+def _forked(command: list[str], *, input: bytes, **_: object) -> subprocess.CompletedProcess[bytes]:
+    from sortie.perception.recordings import unpickle
+
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        child = os.fork()
+        if not child:
+            code = 1
+            try:
+                warnings.simplefilter("default")
+                sys.stdin = io.TextIOWrapper(io.BytesIO(input))
+                sys.stdout = io.TextIOWrapper(out, encoding="utf-8")
+                unpickle.try_out()
+                sys.stdout.flush()
+                code = 0
+            except BaseException as error:
+                err.write(f"{type(error).__name__}: {error}".encode(errors="replace"))
+                err.flush()
+            finally:
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        out.seek(0)
+        err.seek(0)
+        return subprocess.CompletedProcess(command, code, out.read(), err.read())
 
 
 # --- flight logs -----------------------------------------------------------------------------------

@@ -26,6 +26,30 @@ def test_a_trace_in_another_encoding_is_told(tmp_path: Path) -> None:
         read_columns(path, {"t_s": (0.0, 1.0)})
 
 
+def test_two_columns_of_one_name_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_text("t_s,x_m,x_m,note,note\n0,1,2,3,4\n")
+    with pytest.raises(TraceError) as caught:
+        read_columns(path, {"t_s": (0.0, 1.0), "x_m": (0.0, 1.0)})
+    assert str(caught.value) == f"{path}: 2 columns x_m, must be one at most"
+    assert list(read_columns(path, {"t_s": (0.0, 1.0)})) == ["t_s"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-32", "cp500"])
+def test_a_trace_in_an_encoding_of_other_letters_is_one_line(encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_bytes("t_s,x_m\n0,1\n".encode(encoding))
+    with pytest.raises(TraceError) as caught:
+        read_columns(path, {"t_s": (0.0, 1.0)})
+    assert str(caught.value).startswith(f"{path}: ")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_an_error_is_one_line_whatever_a_file_holds() -> None:
+    assert str(TraceError("a\nb\u2028c\td\udcff")) == "a\\nb\\u2028c\\td\\udcff"
+    assert str(TraceError("ρ " * 5000)) == "ρ " * 999 + "ρ…"
+
+
 @pytest.mark.parametrize("name", ct.FILES)
 def test_the_files_are_what_their_maker_writes(name: str) -> None:
     assert (ct.PAPER_120S / name).read_text() == ct.text(name)

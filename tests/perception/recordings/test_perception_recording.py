@@ -104,7 +104,7 @@ def put(at: Any, value: Any) -> Any:
         (dict(t_s=None), "t_s is missing, a recording must hold format, cell_m, t_s, pose, boxes, boxes_offset, truth, truth_offset"),
         (dict(speed=np.zeros(2)), "speed is unknown, beside what it must hold a recording may hold scene, est_pose, features, confidence"),
         (dict(format=np.array(2)), "format is 2, must be 1"),
-        (dict(cell_m=np.array(0.0)), "cell_m is 0, must be above 0"),
+        (dict(cell_m=np.array(0.0)), "cell_m is 0, must be 0.001 to 1000 m"),
         (dict(cell_m=np.array("a")), "cell_m is <U1, must be numbers"),
         (dict(t_s=np.array([0.1, 0.1])), "t_s is 0.1 in frame 1, must be above 0.1, the frame before"),
         (dict(t_s=np.array([0.0, np.nan])), "t_s [1] is nan, must be finite"),
@@ -248,3 +248,52 @@ def test_a_damaged_archive_is_one_line(damage: str, tmp_path: Path) -> None:
     for read, error in ((open_recording, RecordingError), (read_arrays, BenchmarkError)):
         with pytest.raises(error, match=rf"^{re.escape(str(path))}: cannot be read[^\n]*$"):
             read(path)  # type: ignore[operator]
+
+
+def rewritten(path: Path, **members: bytes) -> None:
+    """Put other bytes in place of arrays of an npz file."""
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in (contents | {f"{k}.npy": v for k, v in members.items()}).items():
+            archive.writestr(name, content)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"no array", "cannot be read as npz (the magic string is not correct"),
+        (b"", "cannot be read as npz (EOF: reading magic string, expected 8 bytes got 0)"),
+        (
+            b"\x93NUMPY\x01\x00\x46\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,), }".ljust(69) + b"\n",
+            "cannot be read as npz (t_s.npy is of 80000000000 B, its",
+        ),
+    ],
+    ids=["bytes", "nothing", "80 GB"],
+)  # fmt: skip
+def test_a_member_that_is_no_array_or_claims_too_much_is_one_line(content: bytes, said: str, path: Path) -> None:
+    """Bytes in place of an array ended in AttributeError; eighty gigabytes were asked for before they were missed."""
+    rewritten(path, t_s=content)
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path)
+    assert str(caught.value).startswith(f"{path}: {said}")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_an_archive_of_another_method_is_one_line(path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    with pytest.raises(RecordingError, match=r"compressed by method 14, must be 0 or 8\)$"):
+        open_recording(path)
+
+
+def test_a_box_may_be_anywhere(path: Path) -> None:
+    """Of 1e300 m: it lies in no cell, and nothing warns."""
+    arrays = dict(np.load(path))
+    arrays["boxes"][:, :2] = 1e300
+    del arrays["features"]
+    np.savez(path, **arrays)
+    assert not open_recording(path).rank(0, 0, "confidence").any()
