@@ -8,6 +8,7 @@ does not know are left unread, so that it can carry notes of its own.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
     import pyarrow.parquet
 
     path = located(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise TraceError(f"{path}: no such trace")
     try:
         table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
@@ -85,7 +86,8 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
 def located(path: Path) -> Path:
     """The path itself where it leads to a file, else the shipped trace of that name where there is one."""
     shipped = SHIPPED / path
-    return shipped if not path.is_file() and shipped.is_file() else path
+    # os.path: a name that is too long is no file, where pathlib raises
+    return shipped if not os.path.isfile(path) and os.path.isfile(shipped) else path
 
 
 def check_whole(path: Path, name: str, values: Array) -> None:

@@ -24,7 +24,7 @@ from sortie.scenarios.reading.load import (
     validated,
 )
 from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
-from sortie.scenarios.reading.strict_yaml import read_scalar
+from sortie.scenarios.reading.strict_yaml import MAX_DEPTH, read_scalar
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,
@@ -143,8 +143,11 @@ def _section(root: Node, name: str) -> dict[str, Node]:
 
 def _put(root: Node, name: str, new: Node) -> Node:
     """`assign`, with a path that leads nowhere told at the line that names it."""
+    parts = name.split(".")
+    if len(parts) > MAX_DEPTH:
+        raise ScenarioError(f"{new.where}: {len(parts)} levels deep, must be at most {MAX_DEPTH}")
     try:
-        return assign(root, name.split("."), new)
+        return assign(root, parts, new)
     except ScenarioError as error:
         raise ScenarioError(f"{new.where}{str(error).removeprefix(new.source)}") from None
 

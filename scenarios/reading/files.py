@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def found_beside(scenario: Scenario, folder: Path) -> Scenario:
 def placed(name: str, folder: Path) -> str:
     """A file's name as it is where that leads to a file or a folder (a shipped trace among them), else below `folder`."""
     here = located(Path(name))
-    return name if here.exists() or not (folder / name).exists() else str(folder / name)
+    return name if os.path.exists(here) or not os.path.exists(folder / name) else str(folder / name)
 
 
 def named_models(sections: dict[str, Any]) -> list[tuple[str, str]]:

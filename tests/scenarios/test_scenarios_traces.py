@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from sortie.scenarios import context_traces as ct
+from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import load
+from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.traces import TraceError, located, read_columns
 
 
@@ -94,3 +96,18 @@ def test_the_mission_is_the_scenarios() -> None:
             assert float(r["region_x_m"]) == x_m + scenario.mission.target.speed_mps * t_s
             assert float(r["region_y_m"]) == y_m
             assert float(r["region_radius_m"]) == track.region.radius_m
+
+
+def test_a_name_that_no_file_can_have_is_no_file(tmp_path: Path) -> None:
+    """A scenario that names it ended in OSError."""
+    (tmp_path / "a.yaml").write_text(f"name: a\nfleet: {{trace: {'a' * 400}}}\n")
+    assert load(tmp_path / "a.yaml").fleet.trace == "a" * 400
+    with pytest.raises(TraceError, match="no such trace"):
+        read_columns(Path("a" * 400), {})
+
+
+def test_a_field_named_thousands_deep_is_one_line(tmp_path: Path) -> None:
+    """It ended in RecursionError."""
+    (tmp_path / "a.yaml").write_text(f"campaign: a\nbase: track_target\nmetrics: [ap50]\nset:\n  {'.'.join('a' * 500)}: 1\n")
+    with pytest.raises(ScenarioError, match=r"a\.yaml:\d+: .*levels deep, must be at most 20$"):
+        load_campaign(tmp_path / "a.yaml")
