@@ -31,6 +31,7 @@ from sortie.fleet.energy.cell import energy_fraction
 from sortie.fleet.energy.recorded import BatteryTrace
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.flight.motion import Trajectories, body_rates, fly
+from sortie.scenarios import scratch
 from sortie.scenarios.schema import Fleet
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
@@ -129,7 +130,7 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
         "position_m", "orientation_xyzw", "velocity_mps", "acceleration_mps2", "body_rates_radps", "yaw_rad",
         "est_position_m", "est_yaw_rad",
     )  # fmt: skip
-    new: dict[str, Array] = {name: getattr(motion, name).copy() for name in names}
+    new: dict[str, Array] = {name: scratch.copied(getattr(motion, name)) for name in names}
     for drone, pose in posed.items():
         t_s = np.clip(motion.time_s, pose.time_s[0], pose.time_s[-1])
         beyond = np.abs(motion.time_s - t_s) > ROUNDING_S

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sortie.fleet.flight.motion import Trajectories
+from sortie.scenarios import scratch
 
 
 def descending(flown: Trajectories, drone: int, frame: int, descent_mps: float) -> Trajectories:
@@ -18,7 +19,7 @@ def descending(flown: Trajectories, drone: int, frame: int, descent_mps: float) 
     """
     time_s, rest = flown.time_s, slice(frame, None)
     position, believed, velocity = (
-        getattr(flown, name).copy() for name in ("position_m", "est_position_m", "velocity_mps")
+        scratch.copied(getattr(flown, name)) for name in ("position_m", "est_position_m", "velocity_mps")
     )
     level_m = flown.position_m[rest, drone, 2]
     height_m = np.maximum(0.0, level_m[0] - descent_mps * (time_s[rest] - time_s[frame]))
@@ -37,6 +38,6 @@ def level_again(flown: Trajectories, level: Trajectories, drone: int, frame: int
     """
     heights = {}
     for name in ("position_m", "est_position_m", "velocity_mps"):
-        heights[name] = getattr(flown, name).copy()
+        heights[name] = scratch.copied(getattr(flown, name))
         heights[name][frame:, drone, 2] = getattr(level, name)[frame:, drone, 2]
     return replace(flown, **heights)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, Trajectories, attitude, body_rates
 from sortie.fleet.flight.viewpoints import Course, Plan, shifts
+from sortie.scenarios import scratch
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def displaced(
         "position_m", "velocity_mps", "acceleration_mps2", "orientation_xyzw", "body_rates_radps", "yaw_rad",
         "est_position_m", "est_yaw_rad",
     )  # fmt: skip
-    new: dict[str, Array] = {name: getattr(flown, name).copy() for name in names}
+    new: dict[str, Array] = {name: scratch.copied(getattr(flown, name)) for name in names}
     rest = slice(frame, None)
     path = course.path
     cos, sin = np.cos(path.yaw_rad[rest])[:, None], np.sin(path.yaw_rad[rest])[:, None]

@@ -3,7 +3,8 @@
 The formation is a rigid virtual structure that moves along the route and turns with it. A drone holds its slot
 up to a smooth random offset, in a mean wind with gusts of its own. Its attitude follows from its acceleration by
 differential flatness; no controller is simulated. Nothing here needs the clock, so the whole flight is computed
-as arrays [T frames, N drones, ...] before it begins. Frames as in `sortie.fleet.flight.frames`.
+as arrays [T frames, N drones, ...] before it begins. It is computed in blocks of frames, and long flights lie on disk
+(`sortie.scenarios.scratch`). Frames as in `sortie.fleet.flight.frames`.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.flight.noise import LAGS, gauss_markov, smooth
+from sortie.fleet.flight.frames import up_vector, yaw_rad
+from sortie.fleet.flight.noise import LAGS, GaussMarkov, Smooth
 from sortie.fleet.flight.route import frame_path
-from sortie.scenarios import schema
+from sortie.scenarios import schema, scratch
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.formation import slots
 from sortie.scenarios.streams import stream
@@ -61,8 +62,32 @@ class Trajectories:
     @property
     def air_speed_mps(self) -> Array:
         """Horizontal speed through the air [T, N]."""
-        air = self.velocity_mps[..., :2] - self.wind_mps[..., :2]
-        return np.hypot(air[..., 0], air[..., 1])
+        return air_speed_mps(self.velocity_mps, self.wind_mps)
+
+    def up(self) -> Array:
+        """The bodies' z axes [T, N, 3], ENU; each call computes them anew."""
+        up = scratch.empty(self.position_m.shape)
+        for rows in scratch.blocks(len(up), self.orientation_xyzw[0].nbytes):
+            up[rows] = up_vector(self.orientation_xyzw[rows])
+            scratch.release()
+        return up
+
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max of everything flown, ENU."""
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for rows in scratch.blocks(len(self.position_m), self.position_m[0].nbytes):
+            xy_m = self.position_m[rows, :, :2]
+            low, high = np.minimum(low, xy_m.min(axis=(0, 1))), np.maximum(high, xy_m.max(axis=(0, 1)))
+            scratch.release()
+        if not np.isfinite([low, high]).all():
+            raise ValueError("the motion is not finite")
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def air_speed_mps(velocity_mps: Array, wind_mps: Array) -> Array:
+    """Horizontal speed through the air [...] of velocities and winds [..., 3]."""
+    air = velocity_mps[..., :2] - wind_mps[..., :2]
+    return np.hypot(air[..., 0], air[..., 1])
 
 
 def attitude(thrust_mps2: Array, heading_rad: Array) -> Array:
@@ -110,67 +135,100 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     Raises:
         MotionError: the asked motion needs thrust that points downwards.
     """
-    n, config = fleet.drones, fleet.motion
+    n = fleet.drones
     frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
-    time_s: Array = np.arange(frames, dtype=np.float64) * frame_s
-    path = frame_path(
-        fleet.route.waypoints_m, fleet.route.speed_mps, fleet.route.turn_time_s, fleet.formation.spacing_m, time_s
-    )
+    flight = _Flight(fleet, frame_s, seed, replication)
+    shapes = {
+        "time_s": (), "position_m": (n, 3), "orientation_xyzw": (n, 4), "velocity_mps": (n, 3), "acceleration_mps2": (n, 3),
+        "body_rates_radps": (n, 3), "wind_mps": (n, 3), "yaw_rad": (n,), "est_position_m": (n, 3), "est_yaw_rad": (n,),
+        "frame_position_m": (3,), "frame_yaw_rad": (),
+    }  # fmt: skip
+    whole = {name: scratch.empty((frames, *shape)) for name, shape in shapes.items()}
+    for rows in scratch.blocks(frames, 8 * sum(math.prod(shape) for shape in shapes.values())):
+        block = flight.block(np.arange(rows.start, rows.stop, dtype=np.float64) * frame_s)
+        for name, values in block.items():
+            whole[name][rows] = values
+        turned = whole["orientation_xyzw"][max(0, rows.start - 1) : rows.stop]
+        whole["body_rates_radps"][max(0, rows.start - 1) : rows.stop] = body_rates(turned, frame_s)
+        scratch.release()
+    return Trajectories(**whole)
 
-    def draws(purpose: str, *shape: int) -> Array:  # [T, *shape, N]
-        per_drone = [stream(seed, replication, i, purpose).standard_normal((frames, *shape)) for i in range(n)]
-        return np.stack(per_drone, axis=-1)
 
-    # the virtual structure: p + R(ψ)·s and its two time derivatives, [T, N, 3]
-    slot = slots(fleet.formation.shape, n, fleet.formation.spacing_m)
-    cos, sin = np.cos(path.yaw_rad)[:, None], np.sin(path.yaw_rad)[:, None]
-    arm = np.stack([cos * slot[:, 0] - sin * slot[:, 1], sin * slot[:, 0] + cos * slot[:, 1]], axis=-1)
-    across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
-    rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
-    position = _raise(path.position_m[:, None] + arm, np.array(fleet.altitudes_m))
-    velocity = _raise(path.velocity_mps[:, None] + rate * across)
-    acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
+class _Flight:
+    """A formation on its route, block after block."""
 
-    offsets = smooth(draws("pose_jitter", LAGS, 3), config.pose_jitter_m, config.pose_jitter_time_s, frame_s)
-    position, velocity, acceleration = (
-        held + np.moveaxis(offset, -1, 1)
-        for held, offset in zip((position, velocity, acceleration), offsets, strict=True)
-    )
-    gusts = gauss_markov(draws("gust", 3), config.gust_sigma_mps, config.gust_time_s, frame_s)
-    wind = np.array([*config.wind_mps, 0.0]) + np.moveaxis(gusts, -1, 1)
+    def __init__(self, fleet: schema.Fleet, frame_s: float, seed: int, replication: int) -> None:
+        self._fleet, config, drones = fleet, fleet.motion, range(fleet.drones)
+        self._slot = slots(fleet.formation.shape, fleet.drones, fleet.formation.spacing_m)
+        self._streams = {
+            purpose: [stream(seed, replication, i, purpose) for i in drones]
+            for purpose in ("pose_jitter", "gust", "pose_error", "heading_error")
+        }
+        self._jitter = Smooth(config.pose_jitter_m, config.pose_jitter_time_s, frame_s)
+        self._gusts = GaussMarkov(config.gust_sigma_mps, config.gust_time_s, frame_s)
+        self._pose_error = GaussMarkov(config.pose_error_m, ESTIMATE_TIME_S, frame_s)
+        self._heading_error = GaussMarkov(math.radians(config.heading_error_deg), ESTIMATE_TIME_S, frame_s)
+        self._before: Array | None = None  # the attitudes of the frame before
 
-    thrust = acceleration + DRAG_PER_S * (velocity - wind)
-    thrust[..., 2] += GRAVITY_MPS2
-    if thrust[..., 2].min() <= 0:
-        frame, drone = np.unravel_index(np.argmin(thrust[..., 2]), thrust.shape[:2])
-        raise MotionError(
-            f"drone {drone} at {time_s[frame]:.1f} s would have to thrust downwards: fleet.motion.pose_jitter_m "
-            f"{config.pose_jitter_m:g} within pose_jitter_time_s {config.pose_jitter_time_s:g} or gust_sigma_mps "
-            f"{config.gust_sigma_mps:g} cannot be flown"
+    def _draws(self, purpose: str, frames: int, *shape: int) -> Array:  # [T, *shape, N]
+        return np.stack([each.standard_normal((frames, *shape)) for each in self._streams[purpose]], axis=-1)
+
+    def block(self, time_s: Array) -> dict[str, Array]:
+        """The next frames, by the names of `Trajectories`; all but the body rates."""
+        fleet, config, slot, frames = self._fleet, self._fleet.motion, self._slot, len(time_s)
+        path = frame_path(
+            fleet.route.waypoints_m, fleet.route.speed_mps, fleet.route.turn_time_s, fleet.formation.spacing_m, time_s
         )
-    quaternion = _continuous(attitude(thrust, np.broadcast_to(path.yaw_rad[:, None], (frames, n))))
-    yaw = yaw_rad(quaternion)
 
-    est_position = position.copy()
-    error = gauss_markov(draws("pose_error", 2), config.pose_error_m, ESTIMATE_TIME_S, frame_s)
-    est_position[..., :2] += np.moveaxis(error, -1, 1)
-    est_yaw = yaw + gauss_markov(
-        draws("heading_error"), math.radians(config.heading_error_deg), ESTIMATE_TIME_S, frame_s
-    )
-    return Trajectories(
-        time_s=time_s,
-        position_m=position,
-        orientation_xyzw=quaternion,
-        velocity_mps=velocity,
-        acceleration_mps2=acceleration,
-        body_rates_radps=body_rates(quaternion, frame_s),
-        wind_mps=wind,
-        yaw_rad=yaw,
-        est_position_m=est_position,
-        est_yaw_rad=np.mod(est_yaw + np.pi, 2 * np.pi) - np.pi,
-        frame_position_m=_raise(path.position_m, fleet.formation.altitude_m),
-        frame_yaw_rad=path.yaw_rad,
-    )
+        # the virtual structure: p + R(ψ)·s and its two time derivatives, [T, N, 3]
+        cos, sin = np.cos(path.yaw_rad)[:, None], np.sin(path.yaw_rad)[:, None]
+        arm = np.stack([cos * slot[:, 0] - sin * slot[:, 1], sin * slot[:, 0] + cos * slot[:, 1]], axis=-1)
+        across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+        rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
+        position = _raise(path.position_m[:, None] + arm, np.array(fleet.altitudes_m))
+        velocity = _raise(path.velocity_mps[:, None] + rate * across)
+        acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
+
+        offsets = self._jitter.block(self._draws("pose_jitter", frames, LAGS, 3))
+        position, velocity, acceleration = (
+            held + np.moveaxis(offset, -1, 1)
+            for held, offset in zip((position, velocity, acceleration), offsets, strict=True)
+        )
+        gusts = self._gusts.block(self._draws("gust", frames, 3))
+        wind = np.array([*config.wind_mps, 0.0]) + np.moveaxis(gusts, -1, 1)
+
+        thrust = acceleration + DRAG_PER_S * (velocity - wind)
+        thrust[..., 2] += GRAVITY_MPS2
+        if thrust[..., 2].min() <= 0:
+            frame, drone = np.unravel_index(np.argmin(thrust[..., 2]), thrust.shape[:2])
+            raise MotionError(
+                f"drone {drone} at {time_s[frame]:.1f} s would have to thrust downwards: fleet.motion.pose_jitter_m "
+                f"{config.pose_jitter_m:g} within pose_jitter_time_s {config.pose_jitter_time_s:g} or gust_sigma_mps "
+                f"{config.gust_sigma_mps:g} cannot be flown"
+            )
+        quaternion = attitude(thrust, np.broadcast_to(path.yaw_rad[:, None], thrust.shape[:2]))
+        before = quaternion[:1] if self._before is None else self._before[None]
+        quaternion = _continuous(np.concatenate([before, quaternion]))[1:]
+        self._before = quaternion[-1]
+        yaw = yaw_rad(quaternion)
+
+        est_position = position.copy()
+        error = self._pose_error.block(self._draws("pose_error", frames, 2))
+        est_position[..., :2] += np.moveaxis(error, -1, 1)
+        est_yaw = yaw + self._heading_error.block(self._draws("heading_error", frames))
+        return {
+            "time_s": time_s,
+            "position_m": position,
+            "orientation_xyzw": quaternion,
+            "velocity_mps": velocity,
+            "acceleration_mps2": acceleration,
+            "wind_mps": wind,
+            "yaw_rad": yaw,
+            "est_position_m": est_position,
+            "est_yaw_rad": np.mod(est_yaw + np.pi, 2 * np.pi) - np.pi,
+            "frame_position_m": _raise(path.position_m, fleet.formation.altitude_m),
+            "frame_yaw_rad": path.yaw_rad,
+        }
 
 
 def body_rates(quaternion_xyzw: Array, step_s: float) -> Array:

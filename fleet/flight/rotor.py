@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sortie.fleet.flight.motion import Trajectories
+from sortie.fleet.flight.motion import Trajectories, air_speed_mps
+from sortie.scenarios import scratch
 from sortie.scenarios.plugins.reference import PluginError, checked_call, name_of, resolve
 from sortie.scenarios.schema import Airframe, Fleet
 
@@ -133,7 +134,7 @@ def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
         PluginError: a power model of one's own that is not there, fails, or returns something else.
     """
     machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
-    power_w = np.empty(motion.position_m.shape[:2])
+    power_w = scratch.empty(motion.position_m.shape[:2])
     distinct: list[Airframe] = []
     for airframe, _ in machines:
         if airframe not in distinct:
@@ -141,18 +142,20 @@ def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
     for airframe in distinct:
         of = [i for i, (a, _) in enumerate(machines) if a == airframe]
         mass_kg = airframe.mass_kg + np.array([machines[i][1] for i in of])
-        climb_mps = motion.velocity_mps[:, of, 2]
-        if airframe.power_model == "level":
-            level_w = rotor_power_w(motion.air_speed_mps[:, of], airframe, mass_kg)
-            power_w[:, of] = level_w + climb_power_w(climb_mps, airframe, mass_kg)
-            continue
-        air_mps = (motion.velocity_mps - motion.wind_mps)[:, of]
-        acceleration_mps2 = motion.acceleration_mps2[:, of]
-        if airframe.power_model == "momentum":
-            power_w[:, of] = momentum_power_w(air_mps, acceleration_mps2, airframe, mass_kg)
-        else:
+        if airframe.power_model not in ("level", "momentum"):  # asked once: it may look at the whole flight
             model = resolve("power", airframe.power_model, airframe.power_params)
-            power_w[:, of] = _own_power_w(model, air_mps, acceleration_mps2, climb_mps, mass_kg)
+            air_mps, climb_mps = (motion.velocity_mps - motion.wind_mps)[:, of], motion.velocity_mps[:, of, 2]
+            power_w[:, of] = _own_power_w(model, air_mps, motion.acceleration_mps2[:, of], climb_mps, mass_kg)
+            continue
+        for rows in scratch.blocks(len(power_w), motion.velocity_mps[0].nbytes):
+            velocity_mps, wind_mps = motion.velocity_mps[rows][:, of], motion.wind_mps[rows][:, of]
+            if airframe.power_model == "momentum":
+                acceleration_mps2 = motion.acceleration_mps2[rows][:, of]
+                power_w[rows, of] = momentum_power_w(velocity_mps - wind_mps, acceleration_mps2, airframe, mass_kg)
+            else:
+                level_w = rotor_power_w(air_speed_mps(velocity_mps, wind_mps), airframe, mass_kg)
+                power_w[rows, of] = level_w + climb_power_w(velocity_mps[..., 2], airframe, mass_kg)
+            scratch.release()
     return power_w
 
 

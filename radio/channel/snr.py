@@ -22,6 +22,7 @@ from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.own_links import changed_snr, own_link
 from sortie.radio.rates import CURVES, group_curve
 from sortie.radio.settings import AirSettings
+from sortie.scenarios import scratch
 from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -54,6 +55,15 @@ def earshot_m(settings: AirSettings) -> float:
     needed_db = min(CURVES[0].snr_db(0.5), group_db)
     noise = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
     return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
+
+
+def _is_finite(values: FloatArray) -> bool:
+    """Whether [frames, ...] all are; block by block, since a long flight lies on disk."""
+    for rows in scratch.blocks(len(values), values[0].nbytes if len(values) else 0):
+        if not np.isfinite(values[rows]).all():
+            return False
+        scratch.release()
+    return True
 
 
 class FrameLinks:
@@ -114,14 +124,14 @@ class Channel:
         self._positions_m = p = np.asarray(positions_m, dtype=float)
         if p.ndim != 3 or p.shape[1] < 1 or p.shape[2] != 3:
             raise ValueError(f"positions_m has shape {p.shape}, must be (frames, drones, 3)")
-        if not np.isfinite(p).all():
+        if not _is_finite(p):
             raise ValueError("positions_m holds a value that is not finite")
         if not frame_s > 0:
             raise ValueError(f"frame_s is {frame_s!r}, must be > 0")
         self._up = u = None if up is None else np.asarray(up, dtype=float)
         if u is not None and u.shape != p.shape:
             raise ValueError(f"up has shape {u.shape}, must be {p.shape}, as positions_m")
-        if u is not None and not np.isfinite(u).all():
+        if u is not None and not _is_finite(u):
             raise ValueError("up holds a value that is not finite")
         self.settings = settings
         self.n = n_drones = p.shape[1]
@@ -203,7 +213,7 @@ class Channel:
         p = np.asarray(positions_m, dtype=float)
         u = None if up is None else np.asarray(up, dtype=float)
         for name, new in (("positions_m", p), ("up", u)):
-            if new is not None and (new.shape != self._positions_m.shape or not np.isfinite(new).all()):
+            if new is not None and (new.shape != self._positions_m.shape or not _is_finite(new)):
                 raise ValueError(f"{name} has shape {new.shape}, must be {self._positions_m.shape} and finite")
         self._positions_m, self._up = p, u
         if self._crowd is None and self.frame >= 0:

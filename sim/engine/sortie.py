@@ -15,7 +15,6 @@ import simpy
 from sortie.fleet.agent import Agent
 from sortie.fleet.clock import oscillators
 from sortie.fleet.energy.battery import FleetBatteries
-from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
@@ -48,7 +47,7 @@ from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, own_antennas, route_bounds, strongest_dbm
+from sortie.sim.engine.world import OwnSenses, World, own_antennas, strongest_dbm
 from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
 from sortie.sim.results import disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
@@ -174,7 +173,6 @@ def build(
     motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
     batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges)
-    up = up_vector(motion.orientation_xyzw)
     air = Air(
         env,
         AirSettings.of(
@@ -186,13 +184,13 @@ def build(
         seed=seed,
         replication=replication,
         frame_s=scenario.frame_s,
-        up=up,
+        up=motion.up(),
     )
     mission = scenario.mission
     scene = SceneModel(
         scenario.perception.scene,
         mission.target,
-        route_bounds(motion),
+        motion.bounds_m(),
         mission.more_targets,
         scenario.perception.people,
     )
@@ -265,6 +263,7 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
             if scorer is not None:
                 scorer.flush()
             observer.second(t_s, recorder.take_new())
+        recorder.spill()
 
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
@@ -289,12 +288,11 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
 def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replication: int) -> SortieRecord:
     """The record of a sortie that has ended."""
     air, notes, recorder = parts.air, parts.notes, parts.recorder
-    tables = recorder.tables()
-    recorder.rows.clear()  # the parts hold each other in cycles, which would keep the rows until a collection
-    if parts.journal is not None:
-        tables |= _decided(parts.journal, policies, parts.scenario)
+    more = {} if parts.journal is None else _decided(parts.journal, policies, parts.scenario)
     if parts.scenario.context.roster:
-        tables[rosters.TABLE] = notes.rosters.table()
+        more[rosters.TABLE] = notes.rosters.table()
+    for name, table in more.items():
+        recorder.spool.add_table(name, table)
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters) if f.name != "lost_to"}
     return SortieRecord(
         scenario=parts.scenario,
@@ -303,7 +301,7 @@ def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replica
         replication=replication,
         version=code_version(),
         detector="none" if parts.detector is None else name_of(parts.detector),
-        tables=tables,
+        tables=recorder.finish(),
         totals={**notes.totals(), **parts.audit.totals(), **counters, "medium_busy_fraction": air.utilisation},
         calibration=parts.detector.calibration if isinstance(parts.detector, DetectsMany) else None,
         wall=notes.policy_eval_us(),

@@ -19,7 +19,6 @@ from sortie.fleet.agent import Platform, Task
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import RANGE_M, cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
-from sortie.fleet.flight.frames import up_vector
 from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.plane import DroneStatus
@@ -122,7 +121,7 @@ class World:
         self._scenario, self._recorder = scenario, recorder
         self._computers = scenario.fleet.computers
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
-        self._rotor_w: list[list[float]] = fleet_power_w(scenario.fleet, motion).tolist()
+        self._rotor_w = fleet_power_w(scenario.fleet, motion)
         self._cameras = cameras_of(scenario.fleet)
         self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, self._cameras)
         recorder.unfold["states"] = self._unfold_states
@@ -196,9 +195,9 @@ class World:
     def reroute(self, motion: Trajectories) -> None:
         """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
-        self._rotor_w = fleet_power_w(self._scenario.fleet, motion).tolist()
+        self._rotor_w = fleet_power_w(self._scenario.fleet, motion)
         self._flight = FlightSenses(motion, self._scenario.frame_s, self.scene.height_field, self._cameras)
-        self.air.reroute(motion.position_m, up_vector(motion.orientation_xyzw))
+        self.air.reroute(motion.position_m, motion.up())
 
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land the drones that are empty."""
@@ -211,7 +210,7 @@ class World:
         self._airtime_s = airtime_s
         self.batteries.step(
             dt_s,
-            self._rotor_w[self._frame],
+            self._rotor_w[self._frame].tolist(),
             [busy if d.perceiving else 0.0 for d, busy in zip(self.drones, self._busy_sensing, strict=True)],
             airtime_share,
         )
@@ -406,12 +405,3 @@ def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
     if roi is not None:
         x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
     return scene.cars_near(capture.t_s, x_m, y_m, radius_m)
-
-
-def route_bounds(motion: Trajectories) -> tuple[float, float, float, float]:
-    """x_min, y_min, x_max, y_max of everything flown, ENU."""
-    low = motion.position_m.min(axis=(0, 1))
-    high = motion.position_m.max(axis=(0, 1))
-    if not all(math.isfinite(v) for v in (*low, *high)):
-        raise ValueError("the motion is not finite")
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

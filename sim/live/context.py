@@ -9,7 +9,7 @@ are no part of a trace, because a live drone has them itself (`sortie.sim.live.o
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -31,7 +31,7 @@ from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
-from sortie.sim.engine.world import INSTANT_S, cars_in_reach, route_bounds
+from sortie.sim.engine.world import INSTANT_S, cars_in_reach
 
 _REPLAYED_EVENTS = frozenset(
     {"drone_joins", "drone_leaves", "drone_lost", "landed", "stays_down", "battery_fault", "cell_failure", "link_drop", "link_back"}
@@ -76,7 +76,7 @@ class Trace:
 def unflown(scenario: Scenario, drone: int) -> Trace:
     """The trace of a drone that is never sensed: its way by the plan, nothing published."""
     motion, _ = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
-    return Trace(_only(motion, drone), route_bounds(motion))
+    return Trace(_only(motion, drone), motion.bounds_m())
 
 
 def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) -> list[Trace]:
@@ -91,16 +91,18 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
     parts = build(flown, plan_for(flown), flown.seed)
-    bounds = route_bounds(parts.world.motion)
+    bounds = parts.world.motion.bounds_m()
     fly(parts, progress)
-    tables = parts.recorder.tables()
+    tables = parts.recorder.finish()
     return [
         _trace(scenario, drone, _only(parts.world.motion, drone), bounds, tables)
         for drone in range(scenario.fleet.drones)
     ]
 
 
-def _trace(scenario: Scenario, drone: int, motion: Trajectories, bounds: Bounds, tables: dict[str, pa.Table]) -> Trace:
+def _trace(
+    scenario: Scenario, drone: int, motion: Trajectories, bounds: Bounds, tables: Mapping[str, pa.Table]
+) -> Trace:
     frame_s = scenario.frame_s
     own = {
         name: tables[name].filter(pc.equal(tables[name]["drone"], drone))

@@ -39,7 +39,7 @@ class Playback:
         canvas = Canvas(recording, scenario.context.rate_hz, root)
         self._scene, self._charts = Drawing(canvas, scenario, scene), Charts(canvas, scenario)
         self._mission, self._groups = scenario.mission, len(scenario.mission.phases_of)
-        self._missions = Recorder().tables()["mission"]
+        self._missions = Recorder().take_new()["mission"]
         if not root:
             recording.send_recording_name(name or f"{scenario.name} · {scenario.policy.name}")
         canvas.static("about", legend(scenario))

@@ -1,6 +1,7 @@
 """The record of a sortie: what happened, as tables, and its fingerprint.
 
-Rows are gathered as plain tuples while the sortie flies and become Arrow tables at its end. The column lists
+Rows are gathered as plain tuples while the sortie flies. They become Arrow batches, which leave memory
+(`sortie.sim.results.spool`), so that an hour takes no more of it than a minute. The column lists
 below are those of the Parquet files, and `ABOUT` says what a row is; `outcome.md` shows both. Wall-clock figures are
 kept apart, so that the fingerprint is a function of (scenario, policy, seed, version) alone.
 """
@@ -8,6 +9,7 @@ kept apart, so that the fingerprint is a function of (scenario, policy, seed, ve
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -23,10 +25,12 @@ from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
+from sortie.scenarios import scratch
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.identity import release_of
 from sortie.sim.results.rosters import RosterLog
+from sortie.sim.results.spool import BATCH_BYTES, FIRST_ROWS, Spool, SpooledTables, Unfold, batches, schema_of
 
 NAN = float("nan")
 DECISIONS_OF = "decisions_of "
@@ -37,6 +41,8 @@ HANDSHAKE = "handshake"
 """The `representation` of transmissions that carry a method's requests and answers, and no payload."""
 _LINKS = {link: link.name.lower() for link in LinkHealth}
 _NO_DISC = (NAN, NAN, NAN)
+_EVAL_STEP_NS = 100
+"""Wall times of decisions are counted in steps of this."""
 F, I, S, B = pa.float64(), pa.int32(), pa.string(), pa.bool_()  # noqa: E741 - read as a column of types below
 
 pa.array(())  # pyarrow looks for pandas at its first array; at import, that is no part of a flight's time
@@ -164,26 +170,28 @@ class SortieRecord:
         digest = hashlib.sha256(f"{release_of(self.version)}/{self.policy}/{self.seed}/{self.replication}".encode())
         for name in sorted(self.tables.keys() & TABLES.keys()):
             digest.update(name.encode())
-            for column in self.tables[name].column_names:
+            for column in schema_of(self.tables, name).names:
                 digest.update(column.encode())
-                _digest_column(digest, self.tables[name][column])
+                _digest_column(digest, self.tables, name, column)
         for name in sorted(self.totals):
             digest.update(f"{name}={self.totals[name]!r}".encode())
         return digest.hexdigest()
 
 
-def _digest_column(digest: Any, column: pa.ChunkedArray) -> None:
+def _digest_column(digest: Any, tables: Mapping[str, pa.Table], name: str, column: str) -> None:
     """Hash a column's values, not its buffers: their padding and chunking may differ."""
-    array = column.combine_chunks()
-    if pa.types.is_list(array.type):
-        digest.update(np.asarray(array.value_lengths(), np.int64).tobytes())
-        array = array.flatten()
-    if pa.types.is_string(array.type) or pa.types.is_binary(array.type):
-        if len(array):  # all values as one text, a zero behind each
-            together = pa.ListArray.from_arrays([0, len(array)], array.cast(pa.binary()))
-            digest.update(pc.binary_join(together, b"\0")[0].as_py() + b"\0")
-    else:
-        digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
+    is_list = pa.types.is_list(schema_of(tables, name).field(column).type)
+    if is_list:
+        for batch in batches(tables, name, [column]):
+            digest.update(np.asarray(batch.column(0).value_lengths(), np.int64).tobytes())
+    for batch in batches(tables, name, [column]):
+        array = batch.column(0).flatten() if is_list else batch.column(0)
+        if pa.types.is_string(array.type) or pa.types.is_binary(array.type):
+            if len(array):  # all values as one text, a zero behind each
+                together = pa.ListArray.from_arrays([0, len(array)], array.cast(pa.binary()))
+                digest.update(pc.binary_join(together, b"\0")[0].as_py() + b"\0")
+        else:
+            digest.update(np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).tobytes())
 
 
 def classes_in(table: pa.Table) -> np.ndarray:
@@ -191,41 +199,66 @@ def classes_in(table: pa.Table) -> np.ndarray:
     return table["kind"].to_numpy() if "kind" in table.column_names else np.zeros(table.num_rows, np.int8)
 
 
-Unfold = Callable[[Sequence[tuple[Any, ...]]], Sequence[Any]]
-"""Some rows to a table's columns, in the order of `TABLES`."""
-
-
 class Recorder:
     """Gathers rows by table; `rows["events"].append((...))` in the column order of `TABLES`.
 
     A table that many rows go to at once may gather something terser instead, and put into `unfold` how that
-    becomes columns.
+    becomes columns. `spill` moves gathered rows out of memory.
     """
 
     def __init__(self, *, classes: bool = False) -> None:
         """Args: `classes`: whether boxes name their class."""
         self.classes = classes
-        self._columns = TABLES | {name: TABLES[name] | CLASS_COLUMN for name in OF_CLASSES} if classes else TABLES
         self.rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in TABLES}
         self.unfold: dict[str, Unfold] = {}
+        self.spool = Spool()
+        for name, columns in TABLES.items():
+            self.spool.define(name, columns | CLASS_COLUMN if classes and name in OF_CLASSES else columns)
         self._taken = dict.fromkeys(TABLES, 0)
-
-    def tables(self) -> dict[str, pa.Table]:
-        """All rows so far as Arrow tables."""
-        return {name: self._table(name, rows) for name, rows in self.rows.items()}
+        self._due = dict.fromkeys(TABLES, FIRST_ROWS)
 
     def take_new(self) -> dict[str, pa.Table]:
-        """The rows since the last call, for a viewer that follows the flight."""
+        """The rows since the last call, for a viewer that follows the flight. Each call comes before the next `spill`."""
         new = {}
         for name, rows in self.rows.items():
-            new[name] = self._table(name, rows[self._taken[name] :])
+            new[name] = pa.Table.from_batches([self._batch(name, rows[self._taken[name] :])])
             self._taken[name] = len(rows)
         return new
 
-    def _table(self, name: str, rows: list[tuple[Any, ...]]) -> pa.Table:
-        columns = self._columns[name]
-        values = self.unfold.get(name, _columns)(rows) if rows else [()] * len(columns)
-        return pa.table({c: pa.array(v, t) for (c, t), v in zip(columns.items(), values, strict=True)})
+    def spill(self) -> None:
+        """Move the rows of tables that have gathered a batch out of memory; called once a simulated second.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        for name, rows in self.rows.items():
+            if len(rows) >= self._due[name]:
+                self._due[name] = max(1, len(rows) * BATCH_BYTES // max(1, self._spill(name, rows)))
+        scratch.release()
+
+    def finish(self) -> SpooledTables:
+        """All tables. They hold nothing of the flight's parts; nothing can be gathered any more.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        for name, rows in self.rows.items():
+            if rows:
+                self._spill(name, rows)
+        return self.spool.finish()
+
+    def _spill(self, name: str, rows: list[tuple[Any, ...]]) -> int:
+        """Returns the batch's size."""
+        batch = self._batch(name, rows)
+        self.spool.add(name, batch)
+        rows.clear()  # whoever gathers has this list
+        self._taken[name] = 0
+        return int(batch.nbytes)
+
+    def _batch(self, name: str, rows: Sequence[tuple[Any, ...]]) -> pa.RecordBatch:
+        if not rows:
+            return self.spool.batch(name, None)
+        return self.spool.batch(name, self.unfold.get(name, _columns)(rows))
 
 
 def _columns(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
@@ -258,8 +291,8 @@ class AgentNotes:
         self._rows, self._deciding = recorder.rows, deciding
         recorder.unfold |= {"descriptors": partial(_unfold_descriptors, drones=drones), "ages": _unfold_ages}
         self.rosters = RosterLog()
-        self._eval_ns: list[int] = []
-        self._descriptor_bytes = self._directives = 0
+        self._eval_steps: defaultdict[int, int] = defaultdict(int)  # decisions by their wall time
+        self._descriptor_bytes = self._directives = self._decisions = 0
 
     def descriptor(self, t_s: float, d: Descriptor, wire_bytes: int) -> None:
         """One descriptor was published."""
@@ -287,7 +320,8 @@ class AgentNotes:
 
     def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
         """A policy decided, reading peers' descriptors of these ages."""
-        self._eval_ns.append(elapsed_ns)
+        self._eval_steps[elapsed_ns // _EVAL_STEP_NS] += 1
+        self._decisions += 1
         self._rows["ages"].append((t_s, drone, peer_ages_s))
 
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
@@ -304,12 +338,13 @@ class AgentNotes:
             "context_descriptor_bytes": self._descriptor_bytes,
             "context_directive_bytes": self._directives * DIRECTIVE_BYTES,
             "directives": self._directives,
-            "decisions": len(self._eval_ns),
+            "decisions": self._decisions,
         }
 
     def policy_eval_us(self) -> dict[str, float]:
         """Wall time of a policy decision, µs, median and 99th percentile."""
-        if not self._eval_ns:
+        if not self._eval_steps:
             return {}
-        p50, p99 = np.percentile(np.array(self._eval_ns) / 1e3, [50, 99])
-        return {"policy_eval_us_p50": float(p50), "policy_eval_us_p99": float(p99)}
+        steps, counts = np.array(sorted(self._eval_steps.items())).T
+        p50, p99 = steps[np.searchsorted(np.cumsum(counts), np.array([0.50, 0.99]) * self._decisions)]
+        return {"policy_eval_us_p50": p50 * _EVAL_STEP_NS * 1e-3, "policy_eval_us_p99": p99 * _EVAL_STEP_NS * 1e-3}

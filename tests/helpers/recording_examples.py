@@ -12,7 +12,6 @@ from sortie.perception.recordings.exchange import moved
 from sortie.perception.recordings.writing import write_recording
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.world import route_bounds
 
 REACH_M = 45.0
 
@@ -24,7 +23,7 @@ def record_flight(scenario: Scenario, path: Path, *, lower: float = 0.0, feature
     one is recorded.
     """
     motion = fly(scenario.fleet, scenario.duration_s, scenario.frame_s, scenario.seed)
-    scene = SceneModel(scenario.perception.scene, scenario.mission.target, route_bounds(motion))
+    scene = SceneModel(scenario.perception.scene, scenario.mission.target, motion.bounds_m())
     pose = np.concatenate([motion.position_m[..., :2], motion.yaw_rad[..., None]], axis=-1)
     est = np.concatenate([motion.est_position_m[..., :2], motion.est_yaw_rad[..., None]], axis=-1)
     pose, est, times_s = pose[::every], est[::every], motion.time_s[::every]

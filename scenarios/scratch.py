@@ -1,0 +1,116 @@
+"""Room on disk for what a long sortie cannot keep in memory: files without a name, and arrays in such files.
+
+The operating system removes these files with the process that has them, however it ends, so a killed sortie leaves nothing.
+The pages of an array count as the process's memory once they are touched; `release` gives them back, and loses nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import sys
+import tempfile
+import threading
+import weakref
+from typing import BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.scenarios.errors import SortieError
+
+IN_MEMORY_BYTES = 1 << 20
+"""Arrays up to this size stay in memory: a short sortie needs no disk."""
+_LARGE = "/var/tmp"  # noqa: S108 (the convention: /tmp may be a part of the memory, this is not)
+_maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+_lock = threading.Lock()  # sorties may fly in threads (`sortie.sim.env`)
+
+
+class ScratchError(SortieError):
+    """No room on disk for what a sortie puts there while it flies."""
+
+
+def folder() -> str:
+    """Where scratch files lie: `TMPDIR` where that is set, else a folder on disk if there is one."""
+    if "TMPDIR" not in os.environ and os.access(_LARGE, os.W_OK):
+        return _LARGE
+    return tempfile.gettempdir()
+
+
+def new_file(size: int = 0) -> BinaryIO:
+    """A file without a name.
+
+    Args:
+        size: bytes that are set aside for it.
+
+    Raises:
+        ScratchError: the disk refuses.
+    """
+    try:
+        file = cast(BinaryIO, tempfile.TemporaryFile(dir=folder()))
+        if size:
+            if sys.platform == "darwin":
+                file.truncate(size)
+            else:  # a full disk would otherwise end the process at a later write
+                os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        raise no_room(error) from error
+    return file
+
+
+def no_room(error: OSError) -> ScratchError:
+    """The error of a disk that refuses, in words."""
+    return ScratchError(
+        f"{folder()}: no room for the sortie's temporary files: {error.strerror}; set TMPDIR to another"
+    )
+
+
+def mapped(file: BinaryIO, *, writable: bool = False) -> mmap.mmap:
+    """A file's bytes; `release` counts them in."""
+    access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+    new = mmap.mmap(file.fileno(), 0, access=access)
+    with _lock:
+        _maps.add(new)
+    return new
+
+
+def empty(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """A new array of floats; its values are undefined until they are written.
+
+    Raises:
+        ScratchError: the disk refuses.
+    """
+    count = math.prod(shape)
+    if count * 8 <= IN_MEMORY_BYTES:
+        return np.empty(shape)
+    with new_file(count * 8) as file:
+        return np.frombuffer(mapped(file, writable=True), np.float64, count).reshape(shape)
+
+
+def copied(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An array of its own with the same values.
+
+    Raises:
+        ScratchError: the disk refuses.
+    """
+    new = empty(values.shape)
+    for rows in blocks(len(values), values[0].nbytes if len(values) else 0):
+        new[rows] = values[rows]
+        release()
+    return new
+
+
+def blocks(rows: int, row_bytes: int) -> list[slice]:
+    """All rows of an array in blocks of about a megabyte, none of a single row unless there is no other."""
+    each = max(2, (1 << 20) // max(1, row_bytes))
+    begins = list(range(0, max(1, rows - 1), each))
+    return [slice(a, b) for a, b in zip(begins, [*begins[1:], rows], strict=True)]
+
+
+def release() -> None:
+    """Take the pages of all arrays and maps out of memory. They come back when they are touched."""
+    with _lock:
+        maps = list(_maps)
+    for each in maps:
+        each.madvise(mmap.MADV_DONTNEED)

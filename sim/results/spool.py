@@ -1,0 +1,156 @@
+"""Rows that leave memory while a sortie flies: Arrow record batches, one behind the other in one file without a name.
+
+A short sortie's batches stay in memory. A killed flight leaves nothing that could be taken for a run.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow as pa
+
+from sortie.scenarios import scratch
+
+IN_MEMORY_BYTES = 16 << 20
+"""So much stays in memory. What is more goes to disk, with all before it."""
+BATCH_BYTES = 512 << 10
+"""About the size of a batch: as Python objects its rows are some eight times as large."""
+FIRST_ROWS = 32
+"""Of a table of which nothing is known yet."""
+_READ_BYTES = 8 << 20
+"""After so much was read, what was read leaves memory."""
+_ALIGNED = 64  # as in Arrow's own files
+
+Unfold = Callable[[Sequence[tuple[Any, ...]]], Sequence[Any]]
+"""Some rows to a table's columns."""
+
+
+class Spool:
+    """Batches of several tables, in the order in which they come."""
+
+    def __init__(self) -> None:
+        self._file: BinaryIO = io.BytesIO()
+        self._in_memory = True
+        self._size = 0
+        self._schemas: dict[str, pa.Schema] = {}
+        self._places: dict[str, list[tuple[int, int]]] = {}
+
+    def define(self, name: str, columns: Mapping[str, pa.DataType]) -> None:
+        """A table, which may stay empty."""
+        self._schemas[name] = pa.schema(list(columns.items()))
+        self._places[name] = []
+
+    def batch(self, name: str, values: Sequence[Any] | None) -> pa.RecordBatch:
+        """Rows of a table from the values of its columns; None makes none."""
+        schema = self._schemas[name]
+        each = [()] * len(schema) if values is None else values
+        arrays = [pa.array(v, field.type) for v, field in zip(each, schema, strict=True)]
+        return pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+    def add(self, name: str, batch: pa.RecordBatch) -> None:
+        """Append rows to a table.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        message = batch.serialize()
+        padded = len(message) + -len(message) % _ALIGNED
+        if self._in_memory and self._size + padded > IN_MEMORY_BYTES:
+            on_disk = scratch.new_file()
+            self._write(on_disk, self._file.getbuffer())  # type: ignore[attr-defined]
+            self._file, self._in_memory = on_disk, False
+        self._write(self._file, message)
+        self._write(self._file, bytes(padded - len(message)))
+        self._places[name].append((self._size, len(message)))
+        self._size += padded
+
+    def add_table(self, name: str, table: pa.Table) -> None:
+        """A whole table that was not defined before.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        self._schemas[name], self._places[name] = table.schema, []
+        for batch in table.to_batches():
+            self.add(name, batch)
+
+    @staticmethod
+    def _write(file: BinaryIO, data: Any) -> None:
+        try:
+            file.write(data)
+        except OSError as error:
+            raise scratch.no_room(error) from error
+
+    def finish(self) -> SpooledTables:
+        """The tables; nothing can be added any more.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        if self._in_memory:
+            return SpooledTables(pa.py_buffer(self._file.getbuffer()), self._schemas, self._places)  # type: ignore[attr-defined]
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise scratch.no_room(error) from error
+        return SpooledTables(pa.py_buffer(scratch.mapped(self._file)), self._schemas, self._places)
+
+
+class SpooledTables(Mapping[str, pa.Table]):
+    """The tables of a spool. Their values lie in the file and come to memory where they are read."""
+
+    def __init__(
+        self, data: pa.Buffer, schemas: Mapping[str, pa.Schema], places: Mapping[str, Sequence[tuple[int, int]]]
+    ) -> None:
+        self._data, self._schemas, self._places = data, schemas, places
+
+    def __getitem__(self, name: str) -> pa.Table:
+        return pa.Table.from_batches(list(self.batches(name)), self._schemas[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._schemas)
+
+    def __len__(self) -> int:
+        return len(self._schemas)
+
+    def __reduce__(self) -> Any:
+        return dict, (dict(self),)
+
+    def schema(self, name: str) -> pa.Schema:
+        """A table's columns."""
+        return self._schemas[name]
+
+    def batches(self, name: str) -> Iterator[pa.RecordBatch]:
+        """A table, batch after batch."""
+        schema = self._schemas[name]
+        for at, size in self._places[name]:
+            yield pa.ipc.read_record_batch(self._data.slice(at, size), schema)
+
+
+def schema_of(tables: Mapping[str, pa.Table], name: str) -> pa.Schema:
+    """The columns of a table of a record, spooled or not."""
+    return tables.schema(name) if isinstance(tables, SpooledTables) else tables[name].schema
+
+
+def batches(
+    tables: Mapping[str, pa.Table], name: str, columns: Sequence[str] | None = None
+) -> Iterator[pa.RecordBatch]:
+    """A table in pieces that memory has room for; what was read before may leave it.
+
+    Args:
+        tables: of a record, spooled or not.
+        name: of the table.
+        columns: those that are wanted; None is all.
+    """
+    pieces = tables.batches(name) if isinstance(tables, SpooledTables) else tables[name].to_batches()
+    read_bytes = 0
+    for piece in pieces:
+        yield piece if columns is None else piece.select(columns)
+        read_bytes += piece.nbytes
+        if read_bytes > _READ_BYTES:
+            read_bytes = 0
+            scratch.release()
+    scratch.release()
