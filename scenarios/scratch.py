@@ -48,7 +48,7 @@ def new_file(size: int = 0) -> BinaryIO:
         ScratchError: the disk refuses.
     """
     try:
-        file = cast(BinaryIO, tempfile.TemporaryFile(dir=folder()))
+        file = cast(BinaryIO, tempfile.TemporaryFile(dir=folder()))  # noqa: SIM115 (the caller has it)
         if size:
             if sys.platform == "darwin":
                 file.truncate(size)

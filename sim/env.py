@@ -28,7 +28,7 @@ from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView,
 from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
-from sortie.sim.results.outcome import matched
+from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord
 
 RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)

@@ -7,7 +7,7 @@ figures show it. `sortie.sim.results.outcome_fields.MissionOutcome` defines each
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +20,7 @@ from sortie.perception.geometry import FULL, USUAL, Cameras, Lens, camera_margin
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.scene.traffic import TARGET_SIZE_M, TargetPath
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.spool import batches, in_blocks
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,36 +31,45 @@ picture."""
 PLACES = 400
 """Places in the region, spread evenly; each stands for a 400th of its area."""
 FOUND_IOU = 0.5
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+BLOCK_FRAMES = 512
+"""Frames worked out at once."""
 _INSTANT_S = 1e-6
 
 
 def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `mission` of the outcome."""
-    states, n = record.tables["states"], record.scenario.fleet.drones
-    t_s = states["t_s"].to_numpy()[::n]
+    n = record.scenario.fleet.drones
+    t_s, flying, looks = _flown(record.tables, n)
     width_s = np.diff(t_s, append=record.scenario.duration_s)
-    flying = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
-    looks = np.reshape(states["looks"].to_numpy(), (-1, n))
-    looking = flying & _looked_lately(looks, max(1, round(LOOK_S / record.scenario.frame_s)))
-    pose = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=-1)
-    pose = pose.reshape(-1, n, 7)
+    looking = flying & _looked_lately(looks, _frames_a_look(record))
     groups = _groups(record.tables["mission"])
-    cameras = cameras_of(record.scenario.fleet)
     tracks = _tracked(groups, len(t_s))
-    seen = []
-    for target_xy_m, tracked in tracks.values():
-        in_view = _in_any_view(target_xy_m[:, None], pose, looking & tracked[:, None], cameras)[:, 0]
-        seen.append((in_view, tracked, width_s))
-    in_view_share, out_of_view_s = _share_and_gap(seen)
+    in_view, region_share = _seen(record, groups, tracks, looking, t_s)
+    in_view_share, out_of_view_s = _share_and_gap((in_view[k], tracked, width_s) for k, (_, tracked) in tracks.items())
     detected_share, undetected_s = _detected(record, t_s, {k: tracked for k, (_, tracked) in tracks.items()})
     return {
         "flown_share": 1.0 - float(width_s @ (~flying).sum(axis=1)) / (n * float(width_s.sum())),
-        "region_observed_share": _region_observed(record, groups, t_s, pose, looking),
+        "region_observed_share": region_share,
         "target_in_view_share": in_view_share,
         "target_longest_out_of_view_s": out_of_view_s,
         "target_detected_share": detected_share,
         "target_longest_undetected_s": undetected_s,
     }
+
+
+def _flown(tables: Mapping[str, pa.Table], n: int) -> tuple[Floats, Bools, NDArray[np.int32]]:
+    """When the frames began [T], and of each drone whether it flew and how often it had looked [T, N]."""
+    parts = [
+        (piece["t_s"].to_numpy()[::n], *(np.reshape(piece[c].to_numpy(), (-1, n)) for c in ("airborne", "looks")))
+        for piece in in_blocks(tables, "states", ["t_s", "airborne", "looks"], n * BLOCK_FRAMES)
+    ]
+    t_s, flying, looks = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return t_s, flying, looks
+
+
+def _frames_a_look(record: SortieRecord) -> int:
+    return max(1, round(LOOK_S / record.scenario.frame_s))
 
 
 def _groups(missions: pa.Table) -> list[pa.Table]:
@@ -119,22 +129,39 @@ def _in_any_view(xy_m: Floats, pose: Floats, looking: Bools, cameras: Sequence[C
     return seen
 
 
-def _region_observed(
-    record: SortieRecord, groups: Sequence[pa.Table], t_s: Floats, pose: Floats, looking: Bools
-) -> float | None:
-    """Share of the mission regions' area that is in view, averaged over regions and the time in which there are any."""
-    every = max(1, round(LOOK_S / record.scenario.frame_s))
-    width_s = np.diff(t_s[::every], append=record.scenario.duration_s)
-    cameras = cameras_of(record.scenario.fleet)
-    shares = lasts_s = 0.0
-    for rows in groups:
-        disc = np.stack([rows[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")], axis=-1)[::every]
-        there = ~np.isnan(disc[:, 2])
-        if there.any():
-            seen = _disc_in_view(disc[there], pose[::every][there], looking[::every][there], cameras)
-            shares += float(seen @ width_s[there])
-            lasts_s += float(width_s[there].sum())
-    return shares / lasts_s if lasts_s else None
+def _seen(
+    record: SortieRecord,
+    groups: Sequence[pa.Table],
+    tracks: Mapping[int, tuple[Floats, Bools]],
+    looking: Bools,
+    t_s: Floats,
+) -> tuple[dict[int, Bools], float | None]:
+    """Whether each target was in view in each frame [T], and the share of the mission regions' area that was: averaged over
+    regions and the time in which there are any."""
+    n, every, cameras = looking.shape[1], _frames_a_look(record), cameras_of(record.scenario.fleet)
+    in_view = {k: np.zeros(len(looking), bool) for k in tracks}
+    discs = [np.stack([rows[f"region_{c}"].to_numpy() for c in ("x_m", "y_m", "radius_m")], axis=-1) for rows in groups]
+    shares: list[list[Floats]] = [[] for _ in groups]
+    frames = every * -(-BLOCK_FRAMES // every)  # each block begins with a frame in which the region is sampled
+    for k, piece in enumerate(in_blocks(record.tables, "states", POSE, n * frames)):
+        pose = np.stack([piece[c].to_numpy() for c in POSE], axis=-1).reshape(-1, n, len(POSE))
+        here = slice(k * frames, k * frames + len(pose))
+        for target, (xy_m, tracked) in tracks.items():
+            wanted = looking[here] & tracked[here, None]
+            in_view[target][here] = _in_any_view(xy_m[here, None], pose, wanted, cameras)[:, 0]
+        for disc, share in zip(discs, shares, strict=True):
+            disc = disc[here][::every]
+            there = ~np.isnan(disc[:, 2])
+            if there.any():
+                share.append(_disc_in_view(disc[there], pose[::every][there], looking[here][::every][there], cameras))
+    seconds_s = np.diff(t_s[::every], append=record.scenario.duration_s)
+    observed = lasts_s = 0.0
+    for disc, share in zip(discs, shares, strict=True):
+        if share:
+            there = ~np.isnan(disc[::every, 2])
+            observed += float(np.concatenate(share) @ seconds_s[there])
+            lasts_s += float(seconds_s[there].sum())
+    return in_view, observed / lasts_s if lasts_s else None
 
 
 def _disc_in_view(disc: Floats, pose: Floats, looking: Bools, cameras: Sequence[Cameras]) -> Floats:
@@ -149,26 +176,31 @@ def _disc_in_view(disc: Floats, pose: Floats, looking: Bools, cameras: Sequence[
 
 def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) -> tuple[float | None, float | None]:
     """Share of the scoring periods in which a drone's boxes hold the target, and the longest time without."""
-    scenario, boxes = record.scenario, record.tables["detections"]
+    scenario = record.scenario
     if record.detector == "none" or not tracked:
         return None, None
     instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
     periods_s = np.array([period.start for period in scenario.scoring_periods]) * scenario.frame_s
     flown = instants < scenario.duration_s - _INSTANT_S
     instants, lasts_s = instants[flown], np.diff(periods_s, append=scenario.duration_s)[flown]
-    columns = ("x_m", "y_m", "length_m", "width_m", "yaw_rad")
-    found = np.stack([boxes[c].to_numpy() for c in columns], axis=-1)
-    of = np.searchsorted(instants, boxes["t_s"].to_numpy() - _INSTANT_S)
-    size_m, seen = TARGET_SIZE_M[:2], []
+    size_m = TARGET_SIZE_M[:2]
+    paths = {k: TargetPath.of(scenario.mission.targets[k]) for k in tracked}
+    truths = {
+        k: np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, instants.tolist())]).reshape(-1, 5)
+        for k, path in paths.items()
+    }
+    hit = {k: np.zeros(len(instants), bool) for k in tracked}
+    for batch in batches(record.tables, "detections", ("t_s", "x_m", "y_m", "length_m", "width_m", "yaw_rad")):
+        if not batch.num_rows:
+            continue
+        at_s, *box = (column.to_numpy() for column in batch.columns)
+        found, of = np.stack(box, axis=-1), np.searchsorted(instants, at_s - _INSTANT_S)
+        here = slice(int(of.min()), int(of.max()) + 1)
+        for k, truth in truths.items():
+            _, which, iou = overlapping(found, truth[here], of, np.arange(len(instants))[here])
+            hit[k][here][which[iou >= FOUND_IOU]] = True
     frame = np.searchsorted(frame_s, instants + _INSTANT_S, side="right") - 1
-    for k, now in tracked.items():
-        path = TargetPath.of(scenario.mission.targets[k])
-        truth = np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, instants.tolist())]).reshape(-1, 5)
-        _, which, iou = overlapping(found, truth, of, np.arange(len(instants)))
-        hit = np.zeros(len(instants), bool)
-        hit[which[iou >= FOUND_IOU]] = True
-        seen.append((hit, now[frame], lasts_s))
-    return _share_and_gap(seen)
+    return _share_and_gap((hit[k], now[frame], lasts_s) for k, now in tracked.items())
 
 
 def _share_and_gap(targets: Iterable[tuple[Bools, Bools, Floats]]) -> tuple[float | None, float | None]:
@@ -189,7 +221,7 @@ def _share_and_gap(targets: Iterable[tuple[Bools, Bools, Floats]]) -> tuple[floa
     return (1.0 - missed_s / counted_s, longest_s) if counted_s else (None, None)
 
 
-def _looked_lately(looks: NDArray[np.int64], frames: int) -> Bools:
+def _looked_lately(looks: NDArray[np.int32], frames: int) -> Bools:
     """Whether a drone's perception ran in a frame, or in one of the `frames` - 1 frames before it: [T, N].
 
     Args:
@@ -197,7 +229,10 @@ def _looked_lately(looks: NDArray[np.int64], frames: int) -> Bools:
             stands for it.
         frames: how many a look is good for.
     """
-    ran = np.diff(looks, axis=0, append=2 * looks[-1:] - looks[-2:-1] if len(looks) > 1 else looks[-1:] + 1)
-    total = np.cumsum(np.concatenate([np.zeros_like(ran[:1]), ran]), axis=0)
-    since = np.maximum(np.arange(1, len(ran) + 1) - frames, 0)
-    return np.asarray(total[1:] > total[since])
+    after = 2 * looks[-1:] - looks[-2:-1] if len(looks) > 1 else looks[-1:] + 1
+    since = np.maximum(np.arange(1, len(looks) + 1) - frames, 0)
+    lately = np.empty(looks.shape, bool)
+    for drone in range(looks.shape[1]):
+        own = np.append(looks[:, drone], after[:, drone])
+        lately[:, drone] = own[1:] > own[since]
+    return lately

@@ -16,7 +16,8 @@ from sortie.perception.scene.traffic import TargetPath
 from sortie.scenarios.link_state import is_tried
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome import matched, transitions
+from sortie.sim.results.accuracy import matched
+from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
 
 if TYPE_CHECKING:

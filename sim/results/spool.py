@@ -9,7 +9,6 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, BinaryIO
 
-import numpy as np
 import pyarrow as pa
 
 from sortie.scenarios import scratch
@@ -154,3 +153,16 @@ def batches(
             read_bytes = 0
             scratch.release()
     scratch.release()
+
+
+def in_blocks(tables: Mapping[str, pa.Table], name: str, columns: Sequence[str], rows: int) -> Iterator[pa.Table]:
+    """A table in pieces of exactly so many rows; the last may have fewer. Arguments as for `batches`."""
+    schema = schema_of(tables, name)
+    held = pa.schema([schema.field(column) for column in columns]).empty_table()
+    for piece in batches(tables, name, columns):
+        held = pa.concat_tables([held, pa.Table.from_batches([piece])])
+        while held.num_rows >= rows:
+            yield held.slice(0, rows)
+            held = held.slice(rows)
+    if held.num_rows:
+        yield held

@@ -14,7 +14,8 @@ from sortie.policies.registry import own_fusion, resolve
 from sortie.scenarios.intervals import SHARE, Estimate, mean_interval
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import matched, outcome
+from sortie.sim.results.accuracy import matched
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 SEEDS = 8

@@ -16,7 +16,8 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome import matched, outcome
+from sortie.sim.results.accuracy import matched
+from sortie.sim.results.outcome import outcome
 
 FIXED = ("all-4", "best-2", "worst-2", "random-2", "fixed-compression", "silence")
 """Policies that do the same whatever the condition; the best of them, and the best of them in each condition, are the

@@ -20,7 +20,7 @@ from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import both_matched
+from sortie.sim.results.accuracy import both_matched
 from sortie.sim.studies.conditions import scenario_of
 
 POLICIES = ("silence", "all-4", "boxes")

@@ -27,7 +27,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import write_text
-from sortie.sim.results.outcome import matched
+from sortie.sim.results.accuracy import matched
 from sortie.sim.studies.in_flight import torch_answers
 
 BUDGETS = (0.01, 0.04, 0.2, 0.6)

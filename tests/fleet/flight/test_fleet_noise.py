@@ -72,4 +72,4 @@ def test_zero_sigma_is_silence_and_longer_series_begin_alike() -> None:
 
 def test_a_lag_is_the_recursive_filter() -> None:
     driven = np.random.default_rng(1).standard_normal((50, 3, 2))
-    np.testing.assert_allclose(noise._lag(driven, 0.9), lfilter([1.0], [1.0, -0.9], driven, axis=0), rtol=1e-14)
+    np.testing.assert_allclose(noise._Lag(0.9).block(driven), lfilter([1.0], [1.0, -0.9], driven, axis=0), rtol=1e-14)

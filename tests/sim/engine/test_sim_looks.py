@@ -12,7 +12,8 @@ from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import both_matched, outcome
+from sortie.sim.results.accuracy import both_matched
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 SEEING = ("perception.detector=surrogate", "perception.sample_rate_hz=1")

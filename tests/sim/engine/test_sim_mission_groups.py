@@ -15,7 +15,8 @@ from sortie.perception.surrogate.features import Traffic
 from sortie.scenarios.schema import Scene, Target
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import matched, outcome
+from sortie.sim.results.accuracy import matched
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
 

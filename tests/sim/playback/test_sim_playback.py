@@ -27,7 +27,8 @@ from sortie.sim.playback.canvas import goodput_colours
 from sortie.sim.playback.received import hatch
 from sortie.sim.playback.recording import save_rrd, scene_of
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
-from sortie.sim.results.outcome import accuracy, matched, outcome, transitions
+from sortie.sim.results.accuracy import accuracy, matched
+from sortie.sim.results.outcome import outcome, transitions
 from sortie.sim.results.record import TABLES, SortieRecord
 from sortie.sim.results.sentences import decision_in_words
 

@@ -18,7 +18,8 @@ from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.playback.layout import legend
 from sortie.sim.playback.recording import save_rrd
-from sortie.sim.results.outcome import matched, outcome
+from sortie.sim.results.accuracy import matched
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.report import page

@@ -24,9 +24,10 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.mission_outcome import sees_ground
-from sortie.sim.results.outcome import both_matched, outcome
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import check_number, open_keys
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions

@@ -15,7 +15,7 @@ from sortie.perception.surrogate.model import SHIPPED
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import accuracy, both_matched
+from sortie.sim.results.accuracy import accuracy, both_matched
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.studies.in_flight import ConditionAp, flights, means, torch_answers
 

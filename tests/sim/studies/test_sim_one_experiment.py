@@ -15,7 +15,7 @@ from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.recordings.instrument import evaluate_recording
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import matched
+from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord
 
 FLIGHT = (

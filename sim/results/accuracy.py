@@ -1,0 +1,252 @@
+"""Average precision of a sortie: the boxes of every scored fusion matched to the truth.
+
+Fusions are matched in blocks, so that memory keeps scores and hits alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from sortie.perception.classes import CAR, TargetClass
+from sortie.perception.metrics.ap import Judged, Matched, average_precision, judge
+from sortie.perception.types import Boxes
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.regions import Regions
+from sortie.sim.results.spool import batches, schema_of
+
+Key = tuple[float, int]
+"""A scored fusion: its time and its ego."""
+Both = dict[str, dict[Key, Matched]]
+"""Matched fusions, `full_scene` and `mission`."""
+FULL_SCENE, MISSION = "full_scene", "mission"
+BLOCK_FUSIONS = 1024
+"""Fusions matched at once."""
+Columns = dict[str, NDArray[Any]]
+
+
+def matched(
+    record: SortieRecord, *, mission: bool, begin_s: float = 0.0, end_s: float = float("inf")
+) -> dict[Key, Matched]:
+    """The cars of every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
+
+    Args:
+        mission: count the mission disc alone, and only fusions made while there is one.
+    """
+    return score(record, [CAR], begin_s, end_s).pools[CAR, MISSION if mission else FULL_SCENE].by_fusion()
+
+
+def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
+    """AP@0.5 of cars in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
+    return score(record, [CAR]).ap(CAR, begin_s, end_s)
+
+
+def both_matched(record: SortieRecord) -> Both:
+    """The cars of every scored fusion matched in the full scene and in the mission disc."""
+    scored = score(record, [CAR])
+    return {scope: scored.pools[CAR, scope].by_fusion() for scope in (FULL_SCENE, MISSION)}
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Matched detections of n fusions, one fusion after the other, each best first."""
+
+    t_s: NDArray[np.float64]
+    drone: NDArray[np.int32]
+    first: NDArray[np.int64]
+    """[n + 1]: the detections of fusion k are first[k] … first[k + 1] − 1."""
+    score: NDArray[np.float64]
+    hit: NDArray[np.bool_]
+    truths: NDArray[np.int64]
+
+    def by_fusion(self) -> dict[Key, Matched]:
+        """Each fusion by itself."""
+        keys = zip(self.t_s.tolist(), self.drone.tolist(), strict=True)
+        spans = zip(self.first[:-1].tolist(), self.first[1:].tolist(), self.truths.tolist(), strict=True)
+        return {key: Matched(self.score[a:b], self.hit[a:b], n) for key, (a, b, n) in zip(keys, spans, strict=True)}
+
+    def ap(self, begin_s: float = 0.0, end_s: float = float("inf")) -> float | None:
+        """AP of the fusions from `begin_s` to before `end_s`; None without a truth."""
+        a, b = np.searchsorted(self.t_s, [begin_s, end_s])
+        here = slice(self.first[a], self.first[b])
+        ap = average_precision([Matched(self.score[here], self.hit[here], int(self.truths[a:b].sum()))])
+        return None if np.isnan(ap) else ap
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """The fusions of a record, matched."""
+
+    pools: Mapping[tuple[TargetClass, str], Pool]
+    """By class, and `full_scene` or `mission`."""
+    grounded: Mapping[str, int]
+    """Cars about the places of drones that left the air, by `full_scene` and `mission`."""
+
+    def ap(self, kind: TargetClass, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
+        """AP of a class in the full scene and in the mission disc."""
+        return {scope: self.pools[kind, scope].ap(begin_s, end_s) for scope in (FULL_SCENE, MISSION)}
+
+    def grounded_blind(self) -> dict[str, float | None]:
+        """AP of cars with every drone that left the air counted as one that detects nothing.
+
+        Its cars join the truths and it adds no detection. So precision stays, and each recall and AP shrink by one factor.
+        """
+        blind = {}
+        for scope, ap in self.ap(CAR).items():
+            sought = int(self.pools[CAR, scope].truths.sum())
+            every = sought + self.grounded[scope]
+            blind[scope] = sought / every * (ap or 0.0) if every else None
+        return blind
+
+
+def score(
+    record: SortieRecord, kinds: Sequence[TargetClass], begin_s: float = 0.0, end_s: float = float("inf")
+) -> Scored:
+    """Match the boxes of some classes in every scored fusion from `begin_s` to before `end_s`."""
+    fusions = record.tables["fusions"]
+    t_s, drone = fusions["t_s"].to_numpy(), fusions["drone"].to_numpy()
+    within = (begin_s <= t_s) & (t_s < end_s)
+    t_s, drone = t_s[within], drone[within]
+    regions = Regions(record.tables["mission"], record.scenario.mission)
+    found, truth = _Rows(record.tables, "detections"), _Rows(record.tables, "truths")
+    parts: dict[tuple[TargetClass, str], list[_Part]] = {
+        (kind, scope): [] for kind in kinds for scope in (FULL_SCENE, MISSION)
+    }
+    grounded = dict.fromkeys((FULL_SCENE, MISSION), 0)
+    for here, until_s in _blocks(t_s):
+        keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
+        discs = regions.at(t_s[here], drone[here])
+        block = _Block(keys, discs, found.before(until_s), truth.before(until_s))
+        for kind in kinds:
+            parts[kind, FULL_SCENE].append(block.in_full(kind))
+            parts[kind, MISSION].append(block.in_mission(kind))
+        for scope, count in block.grounded(regions).items():
+            grounded[scope] += count
+    return Scored({key: _pool(each) for key, each in parts.items()}, grounded)
+
+
+_Part = tuple[list[Key], list[Matched]]
+
+
+def _pool(parts: Sequence[_Part]) -> Pool:
+    """The blocks of a class and scope joined."""
+    keys, all_matched = [key for keys, _ in parts for key in keys], [m for _, each in parts for m in each]
+    t_s, drone = zip(*keys, strict=True) if keys else ((), ())
+    return Pool(
+        np.array(t_s, np.float64),
+        np.array(drone, np.int32),
+        np.concatenate([[0], np.cumsum([len(m.score) for m in all_matched])]).astype(np.int64),
+        np.concatenate([np.zeros(0), *(m.score for m in all_matched)]),
+        np.concatenate([np.zeros(0, bool), *(m.hit for m in all_matched)]),
+        np.array([m.truths for m in all_matched], np.int64),
+    )
+
+
+def _blocks(t_s: NDArray[np.float64]) -> Iterator[tuple[slice, float]]:
+    """Fusions in blocks, and the time before which a block's boxes stand; those of one time stay together."""
+    begin, count = 0, len(t_s)
+    while True:
+        after = begin + BLOCK_FUSIONS
+        if after >= count:
+            yield slice(begin, count), float("inf")
+            return
+        end = int(np.searchsorted(t_s, t_s[after]))
+        if end == begin:  # so many at one time
+            end = int(np.searchsorted(t_s, t_s[after], side="right"))
+        yield slice(begin, end), float(t_s[end]) if end < count else float("inf")
+        if end >= count:
+            return
+        begin = end
+
+
+class _Rows:
+    """A table of boxes in order of time, part after part."""
+
+    def __init__(self, tables: Mapping[str, pa.Table], name: str) -> None:
+        self._pieces = batches(tables, name)
+        empty = schema_of(tables, name).empty_table()
+        self._held: Columns = {column: empty[column].to_numpy() for column in empty.column_names}
+
+    def before(self, end_s: float) -> Columns:
+        """The next rows, of times before this one."""
+        parts = [self._held]
+        while not len(parts[-1]["t_s"]) or parts[-1]["t_s"][-1] < end_s:
+            piece = next(self._pieces, None)
+            if piece is None:
+                break
+            parts.append({name: piece[name].to_numpy() for name in self._held})
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in self._held}
+        end = int(np.searchsorted(whole["t_s"], end_s))
+        self._held = {name: values[end:] for name, values in whole.items()}
+        return {name: values[:end] for name, values in whole.items()}
+
+
+class _Block:
+    """Some fusions; overlaps are computed once for all classes, and for the scene and the disc."""
+
+    def __init__(self, keys: Sequence[Key], discs: NDArray[np.float64], found: Columns, truth: Columns) -> None:
+        self._keys, self._discs, self._rows = keys, discs, truth
+        boxes, at = _boxes_of(keys, found)
+        self._at = _fusions_of(keys, truth)
+        self._truth, cars = _boxes_of(keys, truth)
+        self._judged: Judged = judge(boxes, at, self._truth, cars, len(keys))
+        self._boxes = boxes.take(self._judged.order)
+
+    def in_full(self, kind: TargetClass) -> _Part:
+        """Those of a class in the full scene."""
+        return list(self._keys), self._judged.matched(*self._of(kind))
+
+    def in_mission(self, kind: TargetClass) -> _Part:
+        """Those of a class in the mission disc, of fusions that have one."""
+        disc, (boxes, truth) = self._discs, self._of(kind)
+        images, cars = self._judged.image, self._judged.cars
+        inside = self._judged.matched(
+            boxes & _within(self._boxes, disc[images]), truth & _within(self._truth, disc[cars])
+        )
+        there = np.flatnonzero(~np.isnan(disc[:, 2])).tolist()
+        return [self._keys[k] for k in there], [inside[k] for k in there]
+
+    def grounded(self, regions: Regions) -> dict[str, int]:
+        """Cars of drones that have no fusion: they left the air."""
+        blind = (self._at < 0) & (_kinds(self._rows) == CAR)
+        t_s, drone, x_m, y_m = (self._rows[c][blind] for c in ("t_s", "drone", "x_m", "y_m"))
+        disc_x_m, disc_y_m, radius_m = regions.at(t_s, drone).T
+        inside = (x_m - disc_x_m) ** 2 + (y_m - disc_y_m) ** 2 <= radius_m**2
+        return {FULL_SCENE: len(t_s), MISSION: int(np.count_nonzero(inside))}
+
+    def _of(self, kind: TargetClass) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which boxes and which truths are of a class."""
+        return self._boxes.kind == kind, self._truth.kind == kind
+
+
+def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each box's centre is in its disc [n, 3], as `Boxes.inside` says; in none that is NaN."""
+    dx, dy = boxes.xy_m[:, 0] - disc[:, 0], boxes.xy_m[:, 1] - disc[:, 1]
+    return np.asarray(dx * dx + dy * dy <= disc[:, 2] ** 2)
+
+
+def _kinds(rows: Columns) -> NDArray[np.int8]:
+    """The class of each box; cars where the record does not name classes."""
+    return rows["kind"] if "kind" in rows else np.zeros(len(rows["t_s"]), np.int8)
+
+
+def _fusions_of(keys: Sequence[Key], rows: Columns) -> NDArray[np.int64]:
+    """Which of some fusions (time, ego) each row belongs to; −1: none. Rows of one fusion stand together."""
+    t_s, drone = rows["t_s"], rows["drone"]
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(t_s) != 0) | (np.diff(drone) != 0)])[: len(t_s)])
+    number = {key: k for k, key in enumerate(keys)}
+    of = [number.get(key, -1) for key in zip(t_s[first].tolist(), drone[first].tolist(), strict=True)]
+    return np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
+
+
+def _boxes_of(keys: Sequence[Key], rows: Columns) -> tuple[Boxes, NDArray[np.int64]]:
+    """The boxes of some fusions (time, ego), and which of them each is of; both in order of time."""
+    at = _fusions_of(keys, rows)
+    xy, size = (np.column_stack([rows[a], rows[b]]) for a, b in (("x_m", "y_m"), ("length_m", "width_m")))
+    boxes = Boxes(xy, size, rows["yaw_rad"], rows.get("score", np.ones(len(at))), kind=_kinds(rows))
+    return (boxes, at) if len(at) == 0 or at.min() >= 0 else (boxes.take(at >= 0), at[at >= 0])

@@ -1,0 +1,118 @@
+"""What became of payloads: counts and bytes by kind and fate, from one pass over the record's `transmissions`."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from sortie.radio.transmission import Status
+from sortie.sim.results.outcome_fields import REASONS
+from sortie.sim.results.record import HANDSHAKE
+from sortie.sim.results.selection import percentiles
+from sortie.sim.results.spool import batches
+
+DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
+Span = tuple[float, float]
+"""From a time (inclusive) to another (exclusive)."""
+_BY = ["representation", "status", "reason"]
+
+
+class Fate(NamedTuple):
+    """What payloads of one kind came to."""
+
+    representation: str
+    status: str
+    reason: str
+
+
+class Sums(NamedTuple):
+    """Over payloads."""
+
+    payloads: int
+    payload_bytes: int
+    arrived_bytes: int
+
+
+class Traffic:
+    """The payloads that were captured in a time, by their fate."""
+
+    def __init__(self, sums: Mapping[Fate, Sums]) -> None:
+        self._sums = sums
+
+    @property
+    def sent_bytes(self) -> int:
+        """Of all payloads."""
+        return sum(s.payload_bytes for s in self._sums.values())
+
+    @property
+    def handshake_bytes(self) -> int:
+        """Of methods' requests and answers."""
+        return sum(s.payload_bytes for fate, s in self._sums.items() if fate.representation == HANDSHAKE)
+
+    def bytes_by_status(self) -> dict[str, int]:
+        """Payload bytes by what they came to. Of a payload that arrived in part, the rest came to what its reason says."""
+        out = {
+            status: sum(s.payload_bytes for fate, s in self._sums.items() if fate.status == status)
+            for status in DATA_STATUSES
+        }
+        for fate, s in self._sums.items():
+            if fate.status == "partial":
+                out["delivered"] += s.arrived_bytes
+                for status in (Status.LOST, Status.EXPIRED):
+                    if fate.reason in REASONS[status]:
+                        out[status] += s.payload_bytes - s.arrived_bytes
+        return out
+
+    def fates(self) -> dict[str, int]:
+        """How many payloads came to each `status/reason`."""
+        counts: defaultdict[tuple[str, str], int] = defaultdict(int)
+        for fate, s in self._sums.items():
+            counts[fate.status, fate.reason] += s.payloads
+        ordered = sorted(counts.items(), key=lambda item: item[0][0])
+        return {f"{status}{'/' + reason if reason else ''}": count for (status, reason), count in ordered}
+
+    def miss_rate(self) -> float | None:
+        """Payloads that missed their deadline or were replaced before it, over those with a known fate.
+
+        One of tiles that was cut short is one, whatever of it had come: it is `partial`, with the reason of an expired one.
+        """
+        known = sum(s.payloads for fate, s in self._sums.items() if fate.status != Status.IN_FLIGHT)
+        missed = sum(s.payloads for fate, s in self._sums.items() if fate.reason in REASONS[Status.EXPIRED])
+        return missed / known if known else None
+
+
+def traffic(tables: Mapping[str, pa.Table], spans: Sequence[Span]) -> list[Traffic]:
+    """All payloads, and then those that were captured in each span."""
+    sums: list[dict[Fate, Sums]] = [{} for _ in range(1 + len(spans))]
+    for batch in batches(tables, "transmissions", ["captured_s", *_BY, "payload_bytes", "arrived_bytes"]):
+        whole = pa.Table.from_batches([batch])
+        for into, part in zip(sums, [whole, *(_within(whole, span) for span in spans)], strict=True):
+            totals = [([], "count_all"), ("payload_bytes", "sum"), ("arrived_bytes", "sum")]
+            for row in part.group_by(_BY, use_threads=False).aggregate(totals).to_pylist():
+                fate, before = Fate(*(row[c] for c in _BY)), into.get(Fate(*(row[c] for c in _BY)), Sums(0, 0, 0))
+                now = row["count_all"], row["payload_bytes_sum"], row["arrived_bytes_sum"]
+                into[fate] = Sums(*(a + b for a, b in zip(before, now, strict=True)))
+    return [Traffic(each) for each in sums]
+
+
+def feature_payload_p50(tables: Mapping[str, pa.Table], span: Span) -> float | None:
+    """The median size of feature payloads that were captured in a span, bytes."""
+
+    def sizes() -> Iterator[NDArray[np.float64]]:
+        for batch in batches(tables, "transmissions", ["captured_s", "representation", "payload_bytes"]):
+            rows = _within(pa.Table.from_batches([batch]), span)
+            yield rows.filter(pc.equal(rows["representation"], "features"))["payload_bytes"].to_numpy().astype(float)
+
+    found = percentiles(sizes, (50.0,))
+    return None if found is None else found[0]
+
+
+def _within(rows: pa.Table, span: Span) -> pa.Table:
+    captured_s: Any = rows["captured_s"]
+    return rows.filter(pc.and_(pc.greater_equal(captured_s, span[0]), pc.less(captured_s, span[1])))
