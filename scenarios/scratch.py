@@ -1,4 +1,4 @@
-"""Room on disk for what a long sortie cannot keep in memory: files without a name, and arrays in such files.
+"""Room on disk for what a long sortie cannot keep in memory: arrays and tapes in files without a name.
 
 The operating system removes these files with the process that has them, however it ends, so a killed sortie leaves nothing.
 The pages of an array count as the process's memory once they are touched; `release` gives them back, and loses nothing.
@@ -6,6 +6,7 @@ The pages of an array count as the process's memory once they are touched; `rele
 
 from __future__ import annotations
 
+import io
 import math
 import mmap
 import os
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import threading
 import weakref
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from sortie.scenarios.errors import SortieError
 
 IN_MEMORY_BYTES = 1 << 20
 """Arrays up to this size stay in memory: a short sortie needs no disk."""
+TAPE_IN_MEMORY_BYTES = 16 << 20
+"""So much of a tape stays in memory. What is more goes to disk, with all before it."""
 _LARGE = "/var/tmp"  # noqa: S108 (the convention: /tmp may be a part of the memory, this is not)
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = threading.Lock()  # sorties may fly in threads (`sortie.sim.env`)
@@ -38,37 +41,68 @@ def folder() -> str:
     return tempfile.gettempdir()
 
 
-def new_file(size: int = 0) -> BinaryIO:
-    """A file without a name.
+class Tape:
+    """Bytes that are written one behind the other and read when all are there; on disk where they are many."""
 
-    Args:
-        size: bytes that are set aside for it.
+    def __init__(self) -> None:
+        self._early = io.BytesIO()
+        self._file: BinaryIO | None = None
+        self.size = 0
 
-    Raises:
-        ScratchError: the disk refuses.
-    """
+    def append(self, data: Any) -> int:
+        """Append bytes, or anything that has a buffer of them; returns where they begin.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        begin, view = self.size, memoryview(data).cast("B")
+        self.size += len(view)
+        if self._file is None and self.size > TAPE_IN_MEMORY_BYTES:
+            self._file = _new_file()
+            self._write(self._early.getbuffer())
+            self._early = io.BytesIO()
+        self._write(view)
+        return begin
+
+    def _write(self, data: memoryview) -> None:
+        try:
+            (self._early if self._file is None else self._file).write(data)
+        except OSError as error:
+            raise _no_room(error) from error
+
+    def finish(self) -> memoryview | mmap.mmap:
+        """All bytes; nothing can be appended any more.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        if self._file is None:
+            return self._early.getbuffer()
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise _no_room(error) from error
+        return _mapped(self._file, mmap.ACCESS_READ)
+
+
+def _new_file(size: int = 0) -> BinaryIO:
     try:
         file = cast(BinaryIO, tempfile.TemporaryFile(dir=folder()))  # noqa: SIM115 (the caller has it)
-        if size:
-            if sys.platform == "darwin":
-                file.truncate(size)
-            else:  # a full disk would otherwise end the process at a later write
-                os.posix_fallocate(file.fileno(), 0, size)
+        if size and sys.platform == "darwin":
+            file.truncate(size)
+        elif size:  # a full disk would otherwise end the process at a later write
+            os.posix_fallocate(file.fileno(), 0, size)
     except OSError as error:
-        raise no_room(error) from error
+        raise _no_room(error) from error
     return file
 
 
-def no_room(error: OSError) -> ScratchError:
-    """The error of a disk that refuses, in words."""
-    return ScratchError(
-        f"{folder()}: no room for the sortie's temporary files: {error.strerror}; set TMPDIR to another"
-    )
+def _no_room(error: OSError) -> ScratchError:
+    what = f"no room for the sortie's temporary files: {error.strerror}"
+    return ScratchError(f"{folder()}: {what}; set TMPDIR to a folder with room")
 
 
-def mapped(file: BinaryIO, *, writable: bool = False) -> mmap.mmap:
-    """A file's bytes; `release` counts them in."""
-    access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+def _mapped(file: BinaryIO, access: int) -> mmap.mmap:
     new = mmap.mmap(file.fileno(), 0, access=access)
     with _lock:
         _maps.add(new)
@@ -84,8 +118,8 @@ def empty(shape: tuple[int, ...]) -> NDArray[np.float64]:
     count = math.prod(shape)
     if count * 8 <= IN_MEMORY_BYTES:
         return np.empty(shape)
-    with new_file(count * 8) as file:
-        return np.frombuffer(mapped(file, writable=True), np.float64, count).reshape(shape)
+    with _new_file(count * 8) as file:
+        return np.frombuffer(_mapped(file, mmap.ACCESS_WRITE), np.float64, count).reshape(shape)
 
 
 def copied(values: NDArray[np.float64]) -> NDArray[np.float64]:

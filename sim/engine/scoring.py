@@ -51,6 +51,8 @@ Job = tuple[Capture, list[Share]]
 
 
 NOBODY = Boxes.empty()
+WAITING_EGOS = 1024
+"""A detector that takes many moments together runs at the latest when so many egos wait."""
 
 
 class Ego(NamedTuple):
@@ -78,7 +80,7 @@ def jobs_of(moment: Moment) -> list[Job]:
 class Scorer:
     """Runs the detector over the fleet at the scored frames' fusion times.
 
-    A detector that takes many moments together runs when `flush` is called. Any other runs at the moment itself. One that
+    A detector that takes many moments together runs when enough of them wait. Any other runs at the moment itself. One that
     works in the background has time until the next moment.
     """
 
@@ -139,7 +141,7 @@ class Scorer:
         if self._ahead is not None:
             self._begun.append(self._ahead.begin(jobs_of(moment)))
             self.flush(but=1)
-        elif self._many is None:
+        elif self._many is None or sum(len(egos) for _, egos in self._waiting) >= WAITING_EGOS:
             self.flush()
 
     def flush(self, but: int = 0) -> None:

@@ -5,29 +5,22 @@ Fusions are matched in blocks, so that memory keeps scores and hits alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Judged, Matched, average_precision, judge
 from sortie.perception.types import Boxes
+from sortie.sim.results.box_rows import BoxRows, Columns, Key, fusion_blocks, fusions_of, kinds_of
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
-from sortie.sim.results.spool import batches, schema_of
 
-Key = tuple[float, int]
-"""A scored fusion: its time and its ego."""
 Both = dict[str, dict[Key, Matched]]
 """Matched fusions, `full_scene` and `mission`."""
 FULL_SCENE, MISSION = "full_scene", "mission"
-BLOCK_FUSIONS = 1024
-"""Fusions matched at once."""
-Columns = dict[str, NDArray[Any]]
 
 
 def matched(
@@ -113,12 +106,12 @@ def score(
     within = (begin_s <= t_s) & (t_s < end_s)
     t_s, drone = t_s[within], drone[within]
     regions = Regions(record.tables["mission"], record.scenario.mission)
-    found, truth = _Rows(record.tables, "detections"), _Rows(record.tables, "truths")
+    found, truth = BoxRows(record.tables, "detections"), BoxRows(record.tables, "truths")
     parts: dict[tuple[TargetClass, str], list[_Part]] = {
         (kind, scope): [] for kind in kinds for scope in (FULL_SCENE, MISSION)
     }
     grounded = dict.fromkeys((FULL_SCENE, MISSION), 0)
-    for here, until_s in _blocks(t_s):
+    for here, until_s in fusion_blocks(t_s):
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         discs = regions.at(t_s[here], drone[here])
         block = _Block(keys, discs, found.before(until_s), truth.before(until_s))
@@ -147,52 +140,13 @@ def _pool(parts: Sequence[_Part]) -> Pool:
     )
 
 
-def _blocks(t_s: NDArray[np.float64]) -> Iterator[tuple[slice, float]]:
-    """Fusions in blocks, and the time before which a block's boxes stand; those of one time stay together."""
-    begin, count = 0, len(t_s)
-    while True:
-        after = begin + BLOCK_FUSIONS
-        if after >= count:
-            yield slice(begin, count), float("inf")
-            return
-        end = int(np.searchsorted(t_s, t_s[after]))
-        if end == begin:  # so many at one time
-            end = int(np.searchsorted(t_s, t_s[after], side="right"))
-        yield slice(begin, end), float(t_s[end]) if end < count else float("inf")
-        if end >= count:
-            return
-        begin = end
-
-
-class _Rows:
-    """A table of boxes in order of time, part after part."""
-
-    def __init__(self, tables: Mapping[str, pa.Table], name: str) -> None:
-        self._pieces = batches(tables, name)
-        empty = schema_of(tables, name).empty_table()
-        self._held: Columns = {column: empty[column].to_numpy() for column in empty.column_names}
-
-    def before(self, end_s: float) -> Columns:
-        """The next rows, of times before this one."""
-        parts = [self._held]
-        while not len(parts[-1]["t_s"]) or parts[-1]["t_s"][-1] < end_s:
-            piece = next(self._pieces, None)
-            if piece is None:
-                break
-            parts.append({name: piece[name].to_numpy() for name in self._held})
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in self._held}
-        end = int(np.searchsorted(whole["t_s"], end_s))
-        self._held = {name: values[end:] for name, values in whole.items()}
-        return {name: values[:end] for name, values in whole.items()}
-
-
 class _Block:
     """Some fusions; overlaps are computed once for all classes, and for the scene and the disc."""
 
     def __init__(self, keys: Sequence[Key], discs: NDArray[np.float64], found: Columns, truth: Columns) -> None:
         self._keys, self._discs, self._rows = keys, discs, truth
         boxes, at = _boxes_of(keys, found)
-        self._at = _fusions_of(keys, truth)
+        self._at = fusions_of(keys, truth)
         self._truth, cars = _boxes_of(keys, truth)
         self._judged: Judged = judge(boxes, at, self._truth, cars, len(keys))
         self._boxes = boxes.take(self._judged.order)
@@ -213,7 +167,7 @@ class _Block:
 
     def grounded(self, regions: Regions) -> dict[str, int]:
         """Cars of drones that have no fusion: they left the air."""
-        blind = (self._at < 0) & (_kinds(self._rows) == CAR)
+        blind = (self._at < 0) & (kinds_of(self._rows) == CAR)
         t_s, drone, x_m, y_m = (self._rows[c][blind] for c in ("t_s", "drone", "x_m", "y_m"))
         disc_x_m, disc_y_m, radius_m = regions.at(t_s, drone).T
         inside = (x_m - disc_x_m) ** 2 + (y_m - disc_y_m) ** 2 <= radius_m**2
@@ -230,23 +184,9 @@ def _within(boxes: Boxes, disc: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(dx * dx + dy * dy <= disc[:, 2] ** 2)
 
 
-def _kinds(rows: Columns) -> NDArray[np.int8]:
-    """The class of each box; cars where the record does not name classes."""
-    return rows["kind"] if "kind" in rows else np.zeros(len(rows["t_s"]), np.int8)
-
-
-def _fusions_of(keys: Sequence[Key], rows: Columns) -> NDArray[np.int64]:
-    """Which of some fusions (time, ego) each row belongs to; −1: none. Rows of one fusion stand together."""
-    t_s, drone = rows["t_s"], rows["drone"]
-    first = np.flatnonzero(np.concatenate([[True], (np.diff(t_s) != 0) | (np.diff(drone) != 0)])[: len(t_s)])
-    number = {key: k for k, key in enumerate(keys)}
-    of = [number.get(key, -1) for key in zip(t_s[first].tolist(), drone[first].tolist(), strict=True)]
-    return np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
-
-
 def _boxes_of(keys: Sequence[Key], rows: Columns) -> tuple[Boxes, NDArray[np.int64]]:
     """The boxes of some fusions (time, ego), and which of them each is of; both in order of time."""
-    at = _fusions_of(keys, rows)
+    at = fusions_of(keys, rows)
     xy, size = (np.column_stack([rows[a], rows[b]]) for a, b in (("x_m", "y_m"), ("length_m", "width_m")))
-    boxes = Boxes(xy, size, rows["yaw_rad"], rows.get("score", np.ones(len(at))), kind=_kinds(rows))
+    boxes = Boxes(xy, size, rows["yaw_rad"], rows.get("score", np.ones(len(at))), kind=kinds_of(rows))
     return (boxes, at) if len(at) == 0 or at.min() >= 0 else (boxes.take(at >= 0), at[at >= 0])

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
@@ -17,6 +18,7 @@ from sortie.sim.folders import RunError, ensure_folder, replacing
 from sortie.sim.results import disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
+from sortie.sim.results.spool import batches, schema_of
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
 PAGE = "report.html"
@@ -31,6 +33,7 @@ WRITTEN = frozenset(
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
+_ROW_GROUP_BYTES = 16 << 20
 _INSTEAD = "choose another folder, or replace it with --replace (replace=True)"
 
 
@@ -137,11 +140,26 @@ def save(
             "wall": dict(record.wall),
         }
         (partial / RECORD).write_text(json.dumps(about, indent=2) + "\n")
-        for name, table in record.tables.items():
-            pq.write_table(table, partial / f"{name}.parquet", compression="zstd")
+        for name in record.tables:
+            _write_table(record.tables, name, partial / f"{name}.parquet")
         if also is not None:
             also(partial)
     return result
+
+
+def _write_table(tables: Mapping[str, pa.Table], name: str, path: Path) -> None:
+    """A table as Parquet, a few megabytes of it at a time."""
+    schema = schema_of(tables, name)
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        held, held_bytes = [], 0
+        for batch in batches(tables, name):
+            held.append(batch)
+            held_bytes += batch.nbytes
+            if held_bytes >= _ROW_GROUP_BYTES:
+                writer.write_table(pa.Table.from_batches(held))
+                held, held_bytes = [], 0
+        if held:
+            writer.write_table(pa.Table.from_batches(held, schema))
 
 
 def beside(path: Path, fingerprint: str) -> Path:

@@ -5,16 +5,13 @@ A short sortie's batches stay in memory. A killed flight leaves nothing that cou
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, BinaryIO
+from typing import Any
 
 import pyarrow as pa
 
 from sortie.scenarios import scratch
 
-IN_MEMORY_BYTES = 16 << 20
-"""So much stays in memory. What is more goes to disk, with all before it."""
 BATCH_BYTES = 512 << 10
 """About the size of a batch: as Python objects its rows are some eight times as large."""
 FIRST_ROWS = 32
@@ -31,9 +28,7 @@ class Spool:
     """Batches of several tables, in the order in which they come."""
 
     def __init__(self) -> None:
-        self._file: BinaryIO = io.BytesIO()
-        self._in_memory = True
-        self._size = 0
+        self._tape = scratch.Tape()
         self._schemas: dict[str, pa.Schema] = {}
         self._places: dict[str, list[tuple[int, int]]] = {}
 
@@ -56,15 +51,8 @@ class Spool:
             ScratchError: the disk refuses.
         """
         message = batch.serialize()
-        padded = len(message) + -len(message) % _ALIGNED
-        if self._in_memory and self._size + padded > IN_MEMORY_BYTES:
-            on_disk = scratch.new_file()
-            self._write(on_disk, self._file.getbuffer())  # type: ignore[attr-defined]
-            self._file, self._in_memory = on_disk, False
-        self._write(self._file, message)
-        self._write(self._file, bytes(padded - len(message)))
-        self._places[name].append((self._size, len(message)))
-        self._size += padded
+        self._places[name].append((self._tape.append(message), len(message)))
+        self._tape.append(bytes(-len(message) % _ALIGNED))
 
     def add_table(self, name: str, table: pa.Table) -> None:
         """A whole table that was not defined before.
@@ -76,26 +64,13 @@ class Spool:
         for batch in table.to_batches():
             self.add(name, batch)
 
-    @staticmethod
-    def _write(file: BinaryIO, data: Any) -> None:
-        try:
-            file.write(data)
-        except OSError as error:
-            raise scratch.no_room(error) from error
-
     def finish(self) -> SpooledTables:
         """The tables; nothing can be added any more.
 
         Raises:
             ScratchError: the disk refuses.
         """
-        if self._in_memory:
-            return SpooledTables(pa.py_buffer(self._file.getbuffer()), self._schemas, self._places)  # type: ignore[attr-defined]
-        try:
-            self._file.flush()
-        except OSError as error:
-            raise scratch.no_room(error) from error
-        return SpooledTables(pa.py_buffer(scratch.mapped(self._file)), self._schemas, self._places)
+        return SpooledTables(pa.py_buffer(self._tape.finish()), self._schemas, self._places)
 
 
 class SpooledTables(Mapping[str, pa.Table]):

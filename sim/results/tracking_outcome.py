@@ -6,76 +6,92 @@ the drone reports then. One drone's flight is one sequence, and all sequences ar
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from sortie.perception.classes import PERSON
-from sortie.perception.metrics.hota import Followed, hota
+from sortie.perception.metrics.hota import Followed, hota_of
 from sortie.perception.motion import Tracks
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes
-from sortie.sim.results.record import SortieRecord, classes_in
+from sortie.sim.results.box_rows import BoxRows, Columns, Key, fusion_blocks, fusions_of, kinds_of
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.spool import batches
 
 
 def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `tracking` of the outcome; null without a detector, a car, or a detector that knows which car is which."""
-    fusions = record.tables["fusions"]
-    truths, detections = (_vehicles(record.tables[name]) for name in ("truths", "detections"))
     nothing: dict[str, float | None] = {"hota": None, "det_a": None, "ass_a": None}
-    if not fusions.num_rows or np.any(truths["car"].to_numpy() < 0):
+    tables = record.tables
+    if not tables["fusions"].num_rows or not _is_known(tables):
         return nothing
-    drones = record.scenario.fleet.drones
-    key = fusions["t_s"].to_numpy() + 1j * fusions["drone"].to_numpy()
-    instants, instant = np.unique(key.real, return_inverse=True)
-    frame_of = dict(zip(key.tolist(), (instant * drones + key.imag.astype(np.int64)).tolist(), strict=True))
-    cars = _followed(truths, truths["car"].to_numpy(), frame_of, drones)
-    value = hota(cars, _tracked(detections, instants, frame_of, drones))
+    value = hota_of(_followed(tables, record.scenario.fleet.drones))
     return nothing if value is None else value._asdict()
 
 
-def _vehicles(table: pa.Table) -> pa.Table:
-    """The boxes of cars and trucks. A person has no useful overlap, by which HOTA judges."""
-    kind = classes_in(table)
-    return table.filter(pa.array(kind != PERSON)) if kind.any() else table
+def _is_known(tables: Mapping[str, pa.Table]) -> bool:
+    """Whether the detector knew which car is which."""
+    for piece in batches(tables, "truths"):
+        own = {name: piece[name].to_numpy() for name in piece.schema.names if name in ("t_s", "car", "kind")}
+        if np.any(own["car"][kinds_of(own) != PERSON] < 0):
+            return False
+    return True
 
 
-def _followed(table: pa.Table, identity: np.ndarray, frame_of: dict[complex, int], drones: int) -> Followed:
-    """The boxes of a table at the fusions that were scored."""
-    frame = _frames(table, frame_of)
-    scored = frame >= 0
-    boxes = np.column_stack([table[c].to_numpy() for c in ("x_m", "y_m", "length_m", "width_m", "yaw_rad")])
-    return Followed(boxes[scored], frame[scored], identity[scored] * drones + frame[scored] % drones)
+def _followed(tables: Mapping[str, pa.Table], drones: int) -> Iterator[tuple[Followed, Followed]]:
+    """What was there at the fusions that were scored, and what every drone's tracker makes of its boxes."""
+    fusions = tables["fusions"]
+    t_s, drone = fusions["t_s"].to_numpy(), fusions["drone"].to_numpy()
+    truths, detections = BoxRows(tables, "truths"), BoxRows(tables, "detections")
+    tracks, next_id, first = Tracks.empty(), np.zeros(drones, np.int64), 0
+    for here, until_s in fusion_blocks(t_s):
+        instants, instant = np.unique(t_s[here], return_inverse=True)
+        keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
+        frames = (first + instant) * drones + drone[here]  # of each fusion
+        there, frame = _vehicles(truths.before(until_s), keys, frames)
+        cars = Followed(_as_rows(there), frame, there["car"].astype(np.int64) * drones + frame % drones)
+        found, frame = _vehicles(detections.before(until_s), keys, frames)
+        told = []
+        for k, now_s in enumerate(instants.tolist(), first):
+            looks_s = np.full(drones, np.nan)
+            looks_s[frames[frames // drones == k] % drones] = now_s
+            tracks, next_id, followed = _step(tracks, next_id, found, frame, looks_s, k)
+            told.append(followed)
+        yield cars, Followed(*(np.concatenate(c) for c in zip(*told, strict=True)))
+        first += len(instants)
 
 
-def _frames(table: pa.Table, frame_of: dict[complex, int]) -> np.ndarray:
-    key = table["t_s"].to_numpy() + 1j * table["drone"].to_numpy()
-    return np.array([frame_of.get(k, -1) for k in key.tolist()], np.int64)
-
-
-def _tracked(table: pa.Table, instants: np.ndarray, frame_of: dict[complex, int], drones: int) -> Followed:
-    """What every drone's tracker makes of its boxes."""
-    column = {c: table[c].to_numpy() for c in table.column_names}
-    frame = _frames(table, frame_of)
+def _vehicles(rows: Columns, keys: Sequence[Key], frames: NDArray[np.int64]) -> tuple[Columns, NDArray[np.int64]]:
+    """The boxes of cars and trucks at some fusions, frame by frame. A person has no useful overlap, by which HOTA judges."""
+    at = fusions_of(keys, rows)
+    wanted = np.flatnonzero((at >= 0) & (kinds_of(rows) != PERSON))
+    frame = frames[at[wanted]]
     order = np.argsort(frame, kind="stable")
-    xy, size = (np.column_stack([column[a], column[b]])[order] for a, b in (("x_m", "y_m"), ("length_m", "width_m")))
-    boxes, frame = (
-        Boxes(xy, size, column["yaw_rad"][order], column["score"][order], kind=classes_in(table)[order]),
-        frame[order],
-    )
-    looked = np.full((len(instants), drones), np.nan)
-    scored = np.array(list(frame_of.values()), np.int64)
-    looked[scored // drones, scored % drones] = instants[scored // drones]
-    first = np.searchsorted(frame, np.arange(len(instants) + 1) * drones)
-    tracks, next_id, told = Tracks.empty(), np.zeros(drones, np.int64), []
-    for k, looks_s in enumerate(looked):
-        here = slice(first[k], first[k + 1])
-        tracks, next_id, _ = step(tracks, boxes.take(here), frame[here] % drones, looks_s, next_id)
-        seen = tracks.take(tracks.confirmed & (tracks.seen_s == instants[k]))
-        told.append(
-            (
-                np.column_stack([seen.xy_m, seen.size_m, seen.yaw_rad]),
-                k * drones + seen.owner,
-                seen.id * drones + seen.owner,
-            )
-        )
-    return Followed(*(np.concatenate(c) for c in zip(*told, strict=True)))
+    return {name: values[wanted[order]] for name, values in rows.items()}, frame[order]
+
+
+def _as_rows(rows: Columns) -> NDArray[np.float64]:
+    return np.column_stack([rows[c] for c in ("x_m", "y_m", "length_m", "width_m", "yaw_rad")])
+
+
+def _step(
+    tracks: Tracks,
+    next_id: NDArray[np.int64],
+    found: Columns,
+    frame: NDArray[np.int64],
+    looks_s: NDArray[np.float64],
+    k: int,
+) -> tuple[Tracks, NDArray[np.int64], Followed]:
+    """The fleet's trackers take in their boxes at instant `k`; what they report then."""
+    drones = len(looks_s)
+    here = slice(*np.searchsorted(frame, [k * drones, (k + 1) * drones]))
+    own = {name: values[here] for name, values in found.items()}
+    xy, size = (np.column_stack([own[a], own[b]]) for a, b in (("x_m", "y_m"), ("length_m", "width_m")))
+    boxes = Boxes(xy, size, own["yaw_rad"], own["score"], kind=kinds_of(own))
+    tracks, next_id, _ = step(tracks, boxes, frame[here] % drones, looks_s, next_id)
+    seen = tracks.take(tracks.confirmed & (tracks.seen_s == np.nanmax(looks_s)))
+    rows = np.column_stack([seen.xy_m, seen.size_m, seen.yaw_rad])
+    return tracks, next_id, Followed(rows, k * drones + seen.owner, seen.id * drones + seen.owner)

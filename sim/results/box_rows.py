@@ -1,0 +1,71 @@
+"""The boxes of scored fusions, block after block in the order of time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from sortie.sim.results.spool import batches, schema_of
+
+Key = tuple[float, int]
+"""A scored fusion: its time and its ego."""
+Columns = dict[str, NDArray[Any]]
+BLOCK_FUSIONS = 1024
+"""Fusions worked out at once."""
+
+
+def fusion_blocks(t_s: NDArray[np.float64]) -> Iterator[tuple[slice, float]]:
+    """Fusions in blocks, and the time before which a block's boxes stand; those of one time stay together."""
+    begin, count = 0, len(t_s)
+    while True:
+        after = begin + BLOCK_FUSIONS
+        if after >= count:
+            yield slice(begin, count), float("inf")
+            return
+        end = int(np.searchsorted(t_s, t_s[after]))
+        if end == begin:  # so many at one time
+            end = int(np.searchsorted(t_s, t_s[after], side="right"))
+        yield slice(begin, end), float(t_s[end]) if end < count else float("inf")
+        if end >= count:
+            return
+        begin = end
+
+
+class BoxRows:
+    """A table of boxes in order of time, part after part."""
+
+    def __init__(self, tables: Mapping[str, pa.Table], name: str) -> None:
+        self._pieces = batches(tables, name)
+        empty = schema_of(tables, name).empty_table()
+        self._held: Columns = {column: empty[column].to_numpy() for column in empty.column_names}
+
+    def before(self, end_s: float) -> Columns:
+        """The next rows, of times before this one."""
+        parts = [self._held]
+        while not len(parts[-1]["t_s"]) or parts[-1]["t_s"][-1] < end_s:
+            piece = next(self._pieces, None)
+            if piece is None:
+                break
+            parts.append({name: piece[name].to_numpy() for name in self._held})
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in self._held}
+        end = int(np.searchsorted(whole["t_s"], end_s))
+        self._held = {name: values[end:] for name, values in whole.items()}
+        return {name: values[:end] for name, values in whole.items()}
+
+
+def kinds_of(rows: Columns) -> NDArray[np.int8]:
+    """The class of each box; cars where the record does not name classes."""
+    return rows["kind"] if "kind" in rows else np.zeros(len(rows["t_s"]), np.int8)
+
+
+def fusions_of(keys: Sequence[Key], rows: Columns) -> NDArray[np.int64]:
+    """Which of some fusions (time, ego) each row belongs to; −1: none. Rows of one fusion stand together."""
+    t_s, drone = rows["t_s"], rows["drone"]
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(t_s) != 0) | (np.diff(drone) != 0)])[: len(t_s)])
+    number = {key: k for k, key in enumerate(keys)}
+    of = [number.get(key, -1) for key in zip(t_s[first].tolist(), drone[first].tolist(), strict=True)]
+    return np.repeat(np.array(of, np.int64), np.diff(first, append=len(t_s)))
