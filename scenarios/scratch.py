@@ -23,6 +23,7 @@ from sortie.scenarios.errors import SortieError
 
 IN_MEMORY_BYTES = 1 << 20
 """Arrays up to this size stay in memory: a short sortie needs no disk."""
+BLOCK_BYTES = 1 << 20
 TAPE_IN_MEMORY_BYTES = 16 << 20
 """So much of a tape stays in memory. What is more goes to disk, with all before it."""
 _LARGE = "/var/tmp"  # noqa: S108 (the convention: /tmp may be a part of the memory, this is not)
@@ -59,6 +60,7 @@ class Tape:
         self.size += len(view)
         if self._file is None and self.size > TAPE_IN_MEMORY_BYTES:
             self._file = _new_file()
+            weakref.finalize(self, self._file.close)
             self._write(self._early.getbuffer())
             self._early = io.BytesIO()
         self._write(view)
@@ -82,7 +84,8 @@ class Tape:
             self._file.flush()
         except OSError as error:
             raise _no_room(error) from error
-        return _mapped(self._file, mmap.ACCESS_READ)
+        with self._file as file:  # the map has a handle of its own
+            return _mapped(file, mmap.ACCESS_READ)
 
 
 def _new_file(size: int = 0) -> BinaryIO:
@@ -136,8 +139,8 @@ def copied(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def blocks(rows: int, row_bytes: int) -> list[slice]:
-    """All rows of an array in blocks of about a megabyte, none of a single row unless there is no other."""
-    each = max(2, (1 << 20) // max(1, row_bytes))
+    """All rows of an array in blocks of about `BLOCK_BYTES`, none of a single row unless there is no other."""
+    each = max(2, BLOCK_BYTES // max(1, row_bytes))
     begins = list(range(0, max(1, rows - 1), each))
     return [slice(a, b) for a, b in zip(begins, [*begins[1:], rows], strict=True)]
 

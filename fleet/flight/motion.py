@@ -138,11 +138,7 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
     n = fleet.drones
     frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
     flight = _Flight(fleet, frame_s, seed, replication)
-    shapes = {
-        "time_s": (), "position_m": (n, 3), "orientation_xyzw": (n, 4), "velocity_mps": (n, 3), "acceleration_mps2": (n, 3),
-        "body_rates_radps": (n, 3), "wind_mps": (n, 3), "yaw_rad": (n,), "est_position_m": (n, 3), "est_yaw_rad": (n,),
-        "frame_position_m": (3,), "frame_yaw_rad": (),
-    }  # fmt: skip
+    shapes = shapes_of(n)
     whole = {name: scratch.empty((frames, *shape)) for name, shape in shapes.items()}
     for rows in scratch.blocks(frames, 8 * sum(math.prod(shape) for shape in shapes.values())):
         block = flight.block(np.arange(rows.start, rows.stop, dtype=np.float64) * frame_s)
@@ -152,6 +148,16 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
         whole["body_rates_radps"][max(0, rows.start - 1) : rows.stop] = body_rates(turned, frame_s)
         scratch.release()
     return Trajectories(**whole)
+
+
+def shapes_of(drones: int) -> dict[str, tuple[int, ...]]:
+    """What `Trajectories` has of each frame, by name."""
+    n = drones
+    return {
+        "time_s": (), "position_m": (n, 3), "orientation_xyzw": (n, 4), "velocity_mps": (n, 3), "acceleration_mps2": (n, 3),
+        "body_rates_radps": (n, 3), "wind_mps": (n, 3), "yaw_rad": (n,), "est_position_m": (n, 3), "est_yaw_rad": (n,),
+        "frame_position_m": (3,), "frame_yaw_rad": (),
+    }  # fmt: skip
 
 
 class _Flight:

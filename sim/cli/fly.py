@@ -15,7 +15,7 @@ from sortie.scenarios.reading.load import ScenarioError, library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, out
+from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
 from sortie.sim.engine.watchers import Watcher, Watchers
@@ -23,6 +23,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.identity import own_files
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results import run_folder
+from sortie.sim.results.needs import ensure_room
 
 
 def fly(
@@ -40,6 +41,9 @@ def fly(
     out_dir: Annotated[Path | None, typer.Option("--out", help="The run's folder; default: below runs/.")] = None,
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace the run in the folder, even if it is another one.")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Fly even if the sortie needs more memory or disk than is free.")
     ] = False,
     live: Annotated[bool, typer.Option("--live", help="Show the sortie in a Rerun viewer while it flies.")] = False,
     view_: Annotated[bool, typer.Option("--view", help="Open the recording in the viewer afterwards.")] = False,
@@ -82,6 +86,8 @@ def fly(
     run_folder.ensure_writable(path)
     if not replace:
         run_folder.ensure_same(path, flown, drawn, number, files)
+    if words := ensure_room(flown, path, force=force):
+        err.print(f"{flown.name}: {words}", soft_wrap=True)
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)

@@ -1,0 +1,147 @@
+"""What a sortie will need of memory and disk, from counts: drones, frames, links and the width of the record's rows.
+
+Some rows are certain: each drone has a state in each frame. Others depend on what drones hear and send, and have an upper
+bound only: each link may carry a payload in each frame.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+import pyarrow as pa
+
+from sortie.fleet.coverage import RANGE_M
+from sortie.fleet.flight.motion import shapes_of
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.policies.contract import COVERAGE_BYTES
+from sortie.scenarios import scratch
+from sortie.scenarios.schema import Scenario
+from sortie.sim.folders import RunError
+from sortie.sim.results.record import TABLES
+from sortie.sim.results.spool import BATCH_BYTES
+
+FLOAT_BYTES = 8
+OFFSET_BYTES = 4
+"""Before each text and each list in an Arrow column."""
+TEXT_BYTES = 8
+"""A word, as in a status or a reason."""
+AIRFRAME_FLOATS = 4
+"""Of a drone in a frame, beside its motion: the airframe's z axis, and what the rotors draw."""
+OBJECT_FACTOR = 8
+"""Rows as Python objects over the same in Arrow."""
+SCORED_FLOATS = 8
+"""Of a detection while all of them are sorted by score."""
+OUTCOME_BYTES = 16
+"""Of a drone in a frame while the mission's figures are computed: whether it flew and looked."""
+
+
+class Needs(NamedTuple):
+    """What a sortie needs, bytes."""
+
+    memory: int
+    """What grows with the duration or with the fleet's rows, beside the program itself."""
+    least_disk: int
+    """Certainly, while it flies and is saved."""
+    most_disk: int
+    """Where every drone hears all others, and every link carries a payload in every frame."""
+
+
+def needs(scenario: Scenario) -> Needs:
+    """Count what a sortie will need."""
+    n, frames = scenario.fleet.drones, scenario.frames
+    width = {name: row_bytes(columns, n) for name, columns in TABLES.items()}
+    groups, people = len(scenario.mission.phases_of), len(scenario.perception.people)
+    certain = {
+        "states": n * frames, "descriptors": n * math.ceil(frames / scenario.context.publish_every), "receptions": frames,
+        "mission": groups * frames, "people": people * frames, "medium": math.ceil(scenario.duration_s),
+    }  # fmt: skip
+    links = n * (n - 1)
+    fusions = 0 if scenario.perception.detector == "none" else n * len(scenario.scored_frames)
+    cars = _cars_in_range(scenario) if fusions else 0
+    possible = {
+        "ages": links * frames, "transmissions": links * frames, "fusions": fusions,
+        "truths": cars * fusions, "detections": 2 * cars * fusions,
+    }  # fmt: skip
+    floats = AIRFRAME_FLOATS * n + sum(math.prod(shape) for shape in shapes_of(n).values())
+    motion = floats * FLOAT_BYTES * frames
+    sure = sum(width[name] * rows for name, rows in certain.items())
+    more = sum(width[name] * rows for name, rows in possible.items())
+    batches = sum(min(BATCH_BYTES, width[name] * rows) for name, rows in (certain | possible).items())
+    memory = (
+        scratch.TAPE_IN_MEMORY_BYTES
+        + OBJECT_FACTOR * batches
+        + OUTCOME_BYTES * n * frames
+        + SCORED_FLOATS * FLOAT_BYTES * possible["detections"]
+    )
+    return Needs(int(memory), int(motion + sure), int(motion + 2 * (sure + more)))
+
+
+def row_bytes(columns: Mapping[str, pa.DataType], drones: int) -> float:
+    """The size of a row; a list has an entry for each peer."""
+    return sum(_bytes(type_, drones) for type_ in columns.values())
+
+
+def _bytes(type_: pa.DataType, drones: int) -> float:
+    if pa.types.is_list(type_):
+        return OFFSET_BYTES + (drones - 1) * _bytes(type_.value_type, drones)
+    if pa.types.is_binary(type_):
+        return OFFSET_BYTES + COVERAGE_BYTES
+    if pa.types.is_string(type_):
+        return OFFSET_BYTES + TEXT_BYTES
+    return float(type_.bit_width) / 8
+
+
+def _cars_in_range(scenario: Scenario) -> int:
+    """The most cars that a drone has about it at a waypoint of the route, at take-off."""
+    waypoints = scenario.fleet.route.waypoints_m
+    x_m, y_m = zip(*waypoints, strict=True)
+    bounds = min(x_m), min(y_m), max(x_m), max(y_m)
+    perception, mission = scenario.perception, scenario.mission
+    scene = SceneModel(perception.scene, mission.target, bounds, mission.more_targets, perception.people)
+    return max(scene.cars_near(0.0, x, y, RANGE_M) for x, y in waypoints)
+
+
+def shortage(need: Needs, run: Path) -> tuple[str, bool]:
+    """What is short for a sortie that is saved in the folder `run`: in words, and whether it is certainly so; empty words
+    where there is enough of all."""
+    free = psutil.virtual_memory().available
+    if need.memory > free:
+        return f"needs {_text(need.memory)} of memory, {_text(free)} are free", True
+    here = next(p for p in (run.absolute(), *run.absolute().parents) if p.exists())
+    for folder in dict.fromkeys((scratch.folder(), str(here))):
+        free = shutil.disk_usage(folder).free
+        if need.least_disk > free:
+            return f"needs at least {_text(need.least_disk)} of disk, {_text(free)} are free in {folder}", True
+        if need.most_disk > free:
+            return f"may need up to {_text(need.most_disk)} of disk, {_text(free)} are free in {folder}", False
+    return "", False
+
+
+def ensure_room(scenario: Scenario, run: Path, *, force: bool = False) -> str:
+    """Refuse a sortie that needs more memory or disk than is free.
+
+    Args:
+        scenario: what will fly.
+        run: the folder that it is saved in.
+        force: fly it all the same.
+
+    Returns:
+        A warning, or nothing.
+
+    Raises:
+        RunError: what is short, and how much is free.
+    """
+    words, sure = shortage(needs(scenario), run)
+    if words and sure and not force:
+        raise RunError(f"{scenario.name}: {words}; make room, set TMPDIR to another disk, or fly it with --force")
+    return words
+
+
+def _text(size: float) -> str:
+    """`1.2 GB`"""
+    return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.0f} MB"
