@@ -255,9 +255,11 @@ def average_precision(frames: Sequence[Matched], convention: Convention = ROTATE
     if convention.sort == "all":
         order = np.argsort(-score, kind="stable")
         score, hit = score[order], hit[order]
+        del order  # a long sortie has millions of detections
         ends = np.flatnonzero(np.append(score[1:] != score[:-1], True)) if len(score) else np.zeros(0, np.int64)
     else:
         ends = np.arange(len(score))
+    del score
     right = np.cumsum(hit)[ends]
     precision = right / (ends + 1.0)
     return float(area(right[None], precision[None], np.array([truths], np.float64), convention.points)[0])

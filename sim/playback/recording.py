@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
@@ -25,8 +26,16 @@ from sortie.sim.playback.scene import Drawing
 from sortie.sim.results.record import Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
+from sortie.sim.results.spool import InTime, batches
 
 APPLICATION = "sortie"
+DRAWN = (
+    "states", "people", "mission", "descriptors", "directives", "transmissions", "fusions", "detections", "truths", "ages",
+    "medium", "receptions", "events",
+)  # fmt: skip
+"""The tables that a playback shows."""
+BLOCK_S = 120.0
+"""So much of a sortie is drawn at once."""
 
 
 class Playback:
@@ -65,7 +74,8 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
     with new_file(path, blueprint(record.scenario)) as recording:
         name = f"{record.scenario.name} · {record.policy} · seed {record.seed}"
         playback = Playback(recording, record.scenario, scene_of(record), name=name)
-        playback.add(record.scenario.duration_s, record.tables)
+        for known_s, new in _in_blocks(record):
+            playback.add(known_s, new)
 
 
 def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> None:
@@ -84,7 +94,19 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
         recording.send_recording_name(f"{scenario.name} · {' and '.join(labels)} · seed {flown[0][1].seed}")
         for root, (_, record) in zip(roots(labels), flown, strict=True):
             playback = Playback(recording, record.scenario, scene_of(record), root)
-            playback.add(record.scenario.duration_s, record.tables)
+            for known_s, new in _in_blocks(record):
+                playback.add(known_s, new)
+
+
+def _in_blocks(record: SortieRecord) -> Iterator[tuple[float, dict[str, pa.Table]]]:
+    """The rows that a playback draws, in blocks of whole seconds, and what is known by then."""
+    end_s = record.scenario.duration_s
+    rows = {name: InTime(record.tables, name, "t_done_s" if name == "transmissions" else "t_s") for name in DRAWN}
+    known_s = 0.0
+    while known_s < end_s:
+        known_s = min(known_s + BLOCK_S, end_s)
+        until_s = known_s if known_s < end_s else float("inf")
+        yield known_s, {name: each.before(until_s) for name, each in rows.items()}
 
 
 @contextmanager
@@ -110,9 +132,12 @@ def new_file(path: Path, layout: rrb.Blueprint, application: str = APPLICATION) 
 
 def scene_of(record: SortieRecord) -> SceneModel:
     """The scene that the sortie flew over, made anew from its scenario and where it flew."""
-    states, scenario = record.tables["states"], record.scenario
-    x, y = states["x_m"].to_numpy(), states["y_m"].to_numpy()
-    bounds = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
+    scenario = record.scenario
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for batch in batches(record.tables, "states", ["x_m", "y_m"]):
+        xy = np.column_stack([column.to_numpy() for column in batch.columns])
+        low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     return SceneModel(
         scenario.perception.scene,
         scenario.mission.target,

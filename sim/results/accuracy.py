@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Judged, Matched, average_precision, judge
 from sortie.perception.types import Boxes
-from sortie.sim.results.box_rows import BoxRows, Columns, Key, fusion_blocks, fusions_of, kinds_of
+from sortie.sim.results.box_rows import Columns, Key, columns_of, fusion_blocks, fusions_of, kinds_of
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
+from sortie.sim.results.spool import InTime
 
 Both = dict[str, dict[Key, Matched]]
 """Matched fusions, `full_scene` and `mission`."""
@@ -106,37 +107,47 @@ def score(
     within = (begin_s <= t_s) & (t_s < end_s)
     t_s, drone = t_s[within], drone[within]
     regions = Regions(record.tables["mission"], record.scenario.mission)
-    found, truth = BoxRows(record.tables, "detections"), BoxRows(record.tables, "truths")
-    parts: dict[tuple[TargetClass, str], list[_Part]] = {
+    found, truth = InTime(record.tables, "detections"), InTime(record.tables, "truths")
+    parts: dict[tuple[TargetClass, str], list[Pool]] = {
         (kind, scope): [] for kind in kinds for scope in (FULL_SCENE, MISSION)
     }
     grounded = dict.fromkeys((FULL_SCENE, MISSION), 0)
     for here, until_s in fusion_blocks(t_s):
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         discs = regions.at(t_s[here], drone[here])
-        block = _Block(keys, discs, found.before(until_s), truth.before(until_s))
+        block = _Block(keys, discs, columns_of(found.before(until_s)), columns_of(truth.before(until_s)))
         for kind in kinds:
             parts[kind, FULL_SCENE].append(block.in_full(kind))
             parts[kind, MISSION].append(block.in_mission(kind))
         for scope, count in block.grounded(regions).items():
             grounded[scope] += count
-    return Scored({key: _pool(each) for key, each in parts.items()}, grounded)
+    return Scored({key: _joined(pools) for key, pools in parts.items()}, grounded)
 
 
-_Part = tuple[list[Key], list[Matched]]
-
-
-def _pool(parts: Sequence[_Part]) -> Pool:
-    """The blocks of a class and scope joined."""
-    keys, all_matched = [key for keys, _ in parts for key in keys], [m for _, each in parts for m in each]
+def _pool(keys: Sequence[Key], each: Sequence[Matched]) -> Pool:
+    """Fusions of one block."""
     t_s, drone = zip(*keys, strict=True) if keys else ((), ())
     return Pool(
         np.array(t_s, np.float64),
         np.array(drone, np.int32),
-        np.concatenate([[0], np.cumsum([len(m.score) for m in all_matched])]).astype(np.int64),
-        np.concatenate([np.zeros(0), *(m.score for m in all_matched)]),
-        np.concatenate([np.zeros(0, bool), *(m.hit for m in all_matched)]),
-        np.array([m.truths for m in all_matched], np.int64),
+        np.concatenate([[0], np.cumsum([len(m.score) for m in each])]).astype(np.int64),
+        np.concatenate([np.zeros(0), *(m.score for m in each)]),
+        np.concatenate([np.zeros(0, bool), *(m.hit for m in each)]),
+        np.array([m.truths for m in each], np.int64),
+    )
+
+
+def _joined(pools: Sequence[Pool]) -> Pool:
+    """The blocks of a class and scope as one."""
+    begins = np.cumsum([0, *(len(pool.score) for pool in pools)])
+    first = [pool.first[:-1] + begin for pool, begin in zip(pools, begins[:-1], strict=True)]
+    return Pool(
+        np.concatenate([pool.t_s for pool in pools]),
+        np.concatenate([pool.drone for pool in pools]),
+        np.concatenate([*first, begins[-1:]]),
+        np.concatenate([pool.score for pool in pools]),
+        np.concatenate([pool.hit for pool in pools]),
+        np.concatenate([pool.truths for pool in pools]),
     )
 
 
@@ -151,11 +162,11 @@ class _Block:
         self._judged: Judged = judge(boxes, at, self._truth, cars, len(keys))
         self._boxes = boxes.take(self._judged.order)
 
-    def in_full(self, kind: TargetClass) -> _Part:
+    def in_full(self, kind: TargetClass) -> Pool:
         """Those of a class in the full scene."""
-        return list(self._keys), self._judged.matched(*self._of(kind))
+        return _pool(self._keys, self._judged.matched(*self._of(kind)))
 
-    def in_mission(self, kind: TargetClass) -> _Part:
+    def in_mission(self, kind: TargetClass) -> Pool:
         """Those of a class in the mission disc, of fusions that have one."""
         disc, (boxes, truth) = self._discs, self._of(kind)
         images, cars = self._judged.image, self._judged.cars
@@ -163,7 +174,7 @@ class _Block:
             boxes & _within(self._boxes, disc[images]), truth & _within(self._truth, disc[cars])
         )
         there = np.flatnonzero(~np.isnan(disc[:, 2])).tolist()
-        return [self._keys[k] for k in there], [inside[k] for k in there]
+        return _pool([self._keys[k] for k in there], [inside[k] for k in there])
 
     def grounded(self, regions: Regions) -> dict[str, int]:
         """Cars of drones that have no fusion: they left the air."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-
-from sortie.sim.results.spool import batches, schema_of
 
 Key = tuple[float, int]
 """A scored fusion: its time and its ego."""
@@ -35,26 +33,9 @@ def fusion_blocks(t_s: NDArray[np.float64]) -> Iterator[tuple[slice, float]]:
         begin = end
 
 
-class BoxRows:
-    """A table of boxes in order of time, part after part."""
-
-    def __init__(self, tables: Mapping[str, pa.Table], name: str) -> None:
-        self._pieces = batches(tables, name)
-        empty = schema_of(tables, name).empty_table()
-        self._held: Columns = {column: empty[column].to_numpy() for column in empty.column_names}
-
-    def before(self, end_s: float) -> Columns:
-        """The next rows, of times before this one."""
-        parts = [self._held]
-        while not len(parts[-1]["t_s"]) or parts[-1]["t_s"][-1] < end_s:
-            piece = next(self._pieces, None)
-            if piece is None:
-                break
-            parts.append({name: piece[name].to_numpy() for name in self._held})
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in self._held}
-        end = int(np.searchsorted(whole["t_s"], end_s))
-        self._held = {name: values[end:] for name, values in whole.items()}
-        return {name: values[:end] for name, values in whole.items()}
+def columns_of(rows: pa.Table) -> Columns:
+    """A table's columns as arrays."""
+    return {name: rows[name].to_numpy() for name in rows.column_names}
 
 
 def kinds_of(rows: Columns) -> NDArray[np.int8]:

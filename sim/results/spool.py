@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from sortie.scenarios import scratch
 
@@ -141,3 +143,28 @@ def in_blocks(tables: Mapping[str, pa.Table], name: str, columns: Sequence[str],
             held = held.slice(rows)
     if held.num_rows:
         yield held
+
+
+class InTime:
+    """A table in order of time, part after part."""
+
+    def __init__(self, tables: Mapping[str, pa.Table], name: str, column: str = "t_s") -> None:
+        """Args: `column` has the time; rows without one are with those before them."""
+        self._pieces, self._column = batches(tables, name), column
+        self._held: pa.Table = schema_of(tables, name).empty_table()
+
+    def before(self, end_s: float) -> pa.Table:
+        """The next rows, up to the first of this time or later."""
+        parts = [self._held]
+        while not (later := self._later(parts[-1], end_s)).any():
+            piece = next(self._pieces, None)
+            if piece is None:
+                break
+            parts.append(pa.Table.from_batches([piece]))
+        whole = pa.concat_tables(parts)
+        end = len(whole) - len(later) + (int(later.argmax()) if later.any() else len(later))
+        self._held = whole.slice(end)
+        return whole.slice(0, end)
+
+    def _later(self, rows: pa.Table, end_s: float) -> NDArray[np.bool_]:
+        return np.asarray(rows[self._column].to_numpy() >= end_s)

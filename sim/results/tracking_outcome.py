@@ -17,9 +17,9 @@ from sortie.perception.metrics.hota import Followed, hota_of
 from sortie.perception.motion import Tracks
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes
-from sortie.sim.results.box_rows import BoxRows, Columns, Key, fusion_blocks, fusions_of, kinds_of
+from sortie.sim.results.box_rows import Columns, Key, columns_of, fusion_blocks, fusions_of, kinds_of
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.results.spool import batches
+from sortie.sim.results.spool import InTime, batches
 
 
 def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
@@ -45,15 +45,15 @@ def _followed(tables: Mapping[str, pa.Table], drones: int) -> Iterator[tuple[Fol
     """What was there at the fusions that were scored, and what every drone's tracker makes of its boxes."""
     fusions = tables["fusions"]
     t_s, drone = fusions["t_s"].to_numpy(), fusions["drone"].to_numpy()
-    truths, detections = BoxRows(tables, "truths"), BoxRows(tables, "detections")
+    truths, detections = InTime(tables, "truths"), InTime(tables, "detections")
     tracks, next_id, first = Tracks.empty(), np.zeros(drones, np.int64), 0
     for here, until_s in fusion_blocks(t_s):
         instants, instant = np.unique(t_s[here], return_inverse=True)
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         frames = (first + instant) * drones + drone[here]  # of each fusion
-        there, frame = _vehicles(truths.before(until_s), keys, frames)
+        there, frame = _vehicles(columns_of(truths.before(until_s)), keys, frames)
         cars = Followed(_as_rows(there), frame, there["car"].astype(np.int64) * drones + frame % drones)
-        found, frame = _vehicles(detections.before(until_s), keys, frames)
+        found, frame = _vehicles(columns_of(detections.before(until_s)), keys, frames)
         told = []
         for k, now_s in enumerate(instants.tolist(), first):
             looks_s = np.full(drones, np.nan)

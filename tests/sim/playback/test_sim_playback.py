@@ -534,7 +534,18 @@ def test_live_draws_what_is_saved(rows: Rows, record: SortieRecord, tmp_path: Pa
     for t_s, new in slices(record):
         viewer.second(t_s, new)
     viewer.close()
-    live = read(tmp_path / "live.rrd")
+    assert_same(read(tmp_path / "live.rrd"), rows)
+
+
+def test_a_long_sortie_is_drawn_in_blocks(
+    rows: Rows, record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "BLOCK_S", 3.0)
+    save_rrd(record, tmp_path / "blocks.rrd")
+    assert_same(read(tmp_path / "blocks.rrd"), rows)
+
+
+def assert_same(live: Rows, rows: Rows) -> None:
     assert set(live) == set(rows)
     for entity, components in rows.items():
         assert set(live[entity]) == set(components), entity
