@@ -346,5 +346,6 @@ class AgentNotes:
         if not self._eval_steps:
             return {}
         steps, counts = np.array(sorted(self._eval_steps.items())).T
-        p50, p99 = steps[np.searchsorted(np.cumsum(counts), np.array([0.50, 0.99]) * self._decisions)]
-        return {"policy_eval_us_p50": p50 * _EVAL_STEP_NS * 1e-3, "policy_eval_us_p99": p99 * _EVAL_STEP_NS * 1e-3}
+        at = np.searchsorted(np.cumsum(counts), np.array([0.50, 0.99]) * self._decisions)
+        p50, p99 = (float(step) * _EVAL_STEP_NS * 1e-3 for step in steps[at])
+        return {"policy_eval_us_p50": p50, "policy_eval_us_p99": p99}
