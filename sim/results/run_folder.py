@@ -33,7 +33,7 @@ WRITTEN = frozenset(
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
-_ROW_GROUP_BYTES = 16 << 20
+_ROW_GROUP_BYTES = 4 << 20
 _INSTEAD = "choose another folder, or replace it with --replace (replace=True)"
 
 
