@@ -47,9 +47,9 @@ NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
     RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
     LOCK, LOCK_LINK, LOCK_AT, CANDIDATE, CANDIDATE_LINK, CANDIDATE_AT, SEGMENTS,
     IS_BUSY, SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
-    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, DEAF,
-) = range(51)  # fmt: skip
-STATION_COLUMNS = 51
+    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, DEAF, LOOKED_AT,
+) = range(52)  # fmt: skip
+STATION_COLUMNS = 52
 
 # columns of a job
 (
@@ -166,17 +166,46 @@ def plan_access(s, S, C):
 
 
 @part
-def sense(s, S, P, F):
-    """Whether the medium is busy; what began while a station itself was sending it notices by its energy alone."""
-    if S[s, TX_END] != FAR:
-        return True
-    return S[s, LOCK] >= 0 or P[s] >= F[F_ENERGY if S[s, DEAF] == 1 else F_SENSED]
+def link_of(s, r, begin, receiver, C):
+    """Where the link stands in the list; −1 where none is listed."""
+    if C[C_SQUARE] == 1:
+        return begin[s] + r
+    low, high = begin[s], begin[s + 1]
+    while low < high:
+        middle = (low + high) // 2
+        if receiver[middle] < r:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < begin[s + 1] and receiver[low] == r else -1
 
 
 @part
-def look(s, t, S, P, W, C, F):
+def sense(s, S, P, W, F, begin, receiver, C):
+    """Whether the medium is busy.
+
+    What began while a station itself was sending it notices by its energy alone. What it had waited for before (LOOKED_AT)
+    goes on to count.
+    """
+    if S[s, TX_END] != FAR or S[s, LOCK] >= 0:
+        return True
+    if P[s] < F[F_SENSED]:
+        return False
+    if S[s, DEAF] == 0 or P[s] >= F[F_ENERGY]:
+        return True
+    known = 0.0
+    for i in range(C[C_STATIONS]):
+        if S[i, TX_END] != FAR and S[i, TX_BEGIN] <= S[s, LOOKED_AT] and i != s:
+            link = link_of(i, s, begin, receiver, C)
+            if link >= 0:
+                known += W[link]
+    return known >= F[F_SENSED]
+
+
+@part
+def look(s, t, S, P, W, C, F, begin, receiver):
     """Bring a station's view of the medium up to now."""
-    busy = sense(s, S, P, F)
+    busy = sense(s, S, P, W, F, begin, receiver, C)
     if busy and S[s, IS_BUSY] == 0:
         freeze(s, t, S)
         S[s, IS_BUSY] = 1
@@ -213,6 +242,8 @@ def begin_access(s, a, t, S, C, keys):
         and not (engaged and S[s, ACCESS] == a)
     ):
         draw_backoff(s, a, S, keys)
+    if not engaged and S[s, DEAF] == 0:
+        S[s, LOOKED_AT] = t
     if engaged or S[s, IS_BUSY] == 1:
         return
     if S[s, SLOTS + a] == 0 and t > S[s, BEGIN + a]:  # operations begin at slot boundaries
@@ -249,11 +280,13 @@ def remove(job, t, S, J):
 
 
 @part
-def release(s, t, S, P, W, C, F):
+def release(s, t, S, P, W, C, F, begin, receiver):
     """An exchange of a station's own is over; the medium is watched again."""
+    if S[s, DEAF] == 0:
+        S[s, LOOKED_AT] = t
     S[s, AWAITS] = NOTHING
     S[s, TIMEOUT_AT] = FAR
-    if sense(s, S, P, F):
+    if sense(s, S, P, W, F, begin, receiver, C):
         S[s, IS_BUSY] = 1
         S[s, GRANT] = S[s, GRANT_LOW] = FAR
     else:
@@ -272,21 +305,6 @@ def log_success(sinr, mcs, curves):
     if x > 36.0:
         return 0.0
     return -curves[mcs, 2] * np.log1p(np.exp(-x)) if x > -200.0 else -700.0
-
-
-@part
-def link_of(s, r, begin, receiver, C):
-    """Where the link stands in the list; −1 where none is listed."""
-    if C[C_SQUARE] == 1:
-        return begin[s] + r
-    low, high = begin[s], begin[s + 1]
-    while low < high:
-        middle = (low + high) // 2
-        if receiver[middle] < r:
-            low = middle + 1
-        else:
-            high = middle
-    return low if low < begin[s + 1] and receiver[low] == r else -1
 
 
 @part
@@ -332,6 +350,8 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
             if S[j, TX_END] != FAR:
                 WHY[k] = HALF_DUPLEX
                 continue
+            if S[j, DEAF] == 0 and S[j, LOCK] < 0:
+                S[j, LOOKED_AT] = t - CCA - 1
             S[j, DEAF] = 0
             if S[j, LOCK] >= 0 and t - S[j, LOCK_AT] > CCA:
                 add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
@@ -339,7 +359,7 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
                     WHY[k] = blame(S[j, LOCK], s, begin, receiver, gain, S, C, F)
                 if S[S[j, LOCK], TX_KIND] == GROUP:
                     WHY[S[j, LOCK_LINK]] = blame(s, S[j, LOCK], begin, receiver, gain, S, C, F)
-                look(j, t, S, P, W, C, F)
+                look(j, t, S, P, W, C, F, begin, receiver)
                 continue
             if S[j, CANDIDATE] < 0 or t - S[j, CANDIDATE_AT] > CCA:
                 S[j, CANDIDATE], S[j, CANDIDATE_LINK], S[j, CANDIDATE_AT] = s, k, t
@@ -376,7 +396,7 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
                             if other >= 0 and i != j and W[other] * 4.0 >= others:
                                 WHY[link] = blame(i, c, begin, receiver, gain, S, C, F)
                                 break
-        look(j, t, S, P, W, C, F)
+        look(j, t, S, P, W, C, F, begin, receiver)
     for x in range(count):
         s = starters[x]
         if S[s, IS_BUSY] == 0:
@@ -509,7 +529,7 @@ def access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
 
 
 @part
-def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys):
+def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver):
     """No answer has come."""
     a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
     fail_window(s, a, S, C)
@@ -527,7 +547,7 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys):
             else:  # ask what has arrived, for as long as it takes
                 S[s, REQUEST] = 1
     draw_backoff(s, a, S, keys)
-    release(s, t, S, P, W, C, F)
+    release(s, t, S, P, W, C, F, begin, receiver)
     return told
 
 
@@ -730,7 +750,7 @@ def finish(
     account(t, G)
     G[G_GROUPS if kind == GROUP else G_OTHERS] -= 1
     for x in range(touched):
-        look(TOUCH[x], t, S, P, W, C, F)
+        look(TOUCH[x], t, S, P, W, C, F, begin, receiver)
     if kind == GROUP:
         S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
         if job >= 0:
@@ -738,15 +758,15 @@ def finish(
             told += 1
             remove(job, t, S, J)
         draw_backoff(s, a, S, keys)
-        release(s, t, S, P, W, C, F)
+        release(s, t, S, P, W, C, F, begin, receiver)
     elif kind == ANSWER or kind == CTS:
         # the sender that waits for it
         if S[to, AWAITS] != NOTHING and S[to, TX_TO] == s and S[to, TX_END] == FAR and S[to, RESPONSE_AT] == FAR:
             if is_meant and is_answered:
-                told = conclude(to, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys)
+                told = conclude(to, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver)
             elif S[to, TIMEOUT_AT] == FAR:
-                told = miss(to, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys)
-        release(s, t, S, P, W, C, F) if S[s, AWAITS] == NOTHING else renew(s, S)
+                told = miss(to, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
+        release(s, t, S, P, W, C, F, begin, receiver) if S[s, AWAITS] == NOTHING else renew(s, S)
     else:
         if job >= 0 and J[job, ARRIVED] == J[job, COUNT] and J[job, IS_TOLD] == 0:
             J[job, IS_TOLD] = 1
@@ -768,7 +788,7 @@ def finish(
 
 
 @part
-def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys):
+def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver):
     """The answer has come."""
     a, what = S[s, ACCESS], S[s, AWAITS]
     S[s, TIMEOUT_AT] = FAR
@@ -788,7 +808,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys):
         S[s, REQUEST] = 0
         told = settle(s, t, job, True, what == DATA, S, J, M, T, OUT, told, DROPS, C)
     draw_backoff(s, a, S, keys)
-    release(s, t, S, P, W, C, F)
+    release(s, t, S, P, W, C, F, begin, receiver)
     return told
 
 
@@ -888,7 +908,7 @@ def run(
                 ):
                     S[s, TIMEOUT_AT] = FAR
                 else:
-                    told = miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys)
+                    told = miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
             if S[s, RESPONSE_AT] <= t:
                 if S[s, RESPONSE_KIND] == DATA:
                     job = S[s, TX_JOB]
@@ -899,11 +919,19 @@ def run(
                         count += 1
                     else:
                         S[s, RESPONSE_AT] = FAR
-                        release(s, t, S, P, W, C, F)
+                        release(s, t, S, P, W, C, F, begin, receiver)
                 else:
                     duration = CONTROL
                     if S[s, RESPONSE_KIND] == ANSWER:
                         duration = S[s, RESPONSE_NS]
+                        for a in range(
+                            2
+                        ):  # a backoff that ends while it answers: it looks, and waits for what is there
+                            turn = S[s, LOCK_AT] + S[s, SLOTS + a] * SLOT
+                            if turn < t - SIFS:
+                                turn = t + (C[C_AIFSN + a] + S[s, SLOTS + a]) * SLOT
+                            if S[s, HEAD + a] >= 0 and turn < t + duration:
+                                S[s, LOOKED_AT] = t
                     transmit(s, t, S[s, RESPONSE_KIND], S[s, RESPONSE_TO], duration, S, G)
                     S[s, TX_NAV] = S[s, RESPONSE_NS] if S[s, RESPONSE_KIND] == CTS else 0
                     starters[count] = s
