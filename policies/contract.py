@@ -393,6 +393,7 @@ DIRECTIVE_BOUNDS: dict[str, DirectiveBound] = {
 }
 """The bounds of a directive's numbers: for policies, for the shield and for what comes in over the wire."""
 _MAX_RUNG, _MAX_RHO, _MAX_RATE_HZ, _MAX_DEADLINE_S, _MAX_WEIGHT, _MAX_DUTY = (b.high for b in DIRECTIVE_BOUNDS.values())
+_PLAIN_NUMBERS = frozenset({float, int})
 _FAR_M = 3.4028234663852886e38
 """The largest 32-bit float. The wire carries a disc in 32-bit floats."""
 MAX_REPOSITION_M = 200.0
@@ -402,11 +403,15 @@ MAX_REPOSITION_M = 200.0
 def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
     """Check a policy's output against the contract, once, where it enters the fleet.
 
+    Only a list or a tuple of exactly `Directive` is accepted. Anything else may read differently the next time.
+
     Raises:
         PolicyError: naming the directive, the field and what it must be.
     """
     if _is_plainly_valid(directives, view):
         return
+    if type(directives) is not list and type(directives) is not tuple:
+        raise PolicyError(f"a policy returns a list or a tuple of directives, got {type(directives).__name__}")
     seen = {view.ego}
     for d in directives:
         fault = _find_fault(d, view, seen)
@@ -419,16 +424,24 @@ def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
     """Whether all is valid and of the plain types that nearly every policy uses. Fast: it runs thousands of times a sortie."""
     ego, peers, seen, sound_roi = view.ego, view.descriptors, {view.ego}, None
     add = seen.add
+    kind = type(directives)
+    if kind is not list and kind is not tuple:
+        return False
     try:
-        links = len(directives)  # a generator has no length, and is not consumed here
+        links = len(directives)
         for d in directives:
+            if type(d) is not Directive:
+                return False
             source, destination, rung, rho, roi, rate_hz, deadline_s, weight, duty_percent, reason = d
             if not (
-                d.__class__ is Directive
-                and source is ego  # ids are small ints, of which Python has one each
+                source is ego  # ids are small ints, of which Python has one each
                 and destination.__class__ is int
                 and destination in peers
                 and (rung.__class__ is Representation or (rung.__class__ is int and 0 <= rung <= _MAX_RUNG))
+                and type(rho) in _PLAIN_NUMBERS  # a type of the user's own may compare as it likes
+                and type(rate_hz) in _PLAIN_NUMBERS
+                and type(deadline_s) in _PLAIN_NUMBERS
+                and type(weight) in _PLAIN_NUMBERS
                 and 0.0 <= rho <= _MAX_RHO
                 and 0.0 <= rate_hz <= _MAX_RATE_HZ
                 and 0.0 <= deadline_s <= _MAX_DEADLINE_S
@@ -443,6 +456,9 @@ def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
                 x_m, y_m, radius_m = roi
                 if not (
                     roi.__class__ is Disc
+                    and type(x_m) in _PLAIN_NUMBERS
+                    and type(y_m) in _PLAIN_NUMBERS
+                    and type(radius_m) in _PLAIN_NUMBERS
                     and -_FAR_M <= x_m <= _FAR_M
                     and -_FAR_M <= y_m <= _FAR_M
                     and 0.0 < radius_m <= _FAR_M
@@ -481,9 +497,28 @@ def check_reposition(request: object, view: FleetView) -> None:
         raise PolicyError(f"{where}: {far_m:.1f} m from the drone, must be at most {MAX_REPOSITION_M:g} m")
 
 
+def find_inexact(answer: object) -> str | None:
+    """Why a policy's answer may read differently each time, as an error text; None if it cannot.
+
+    Example:
+        >>> find_inexact(iter(()))
+        'a policy returns a list or a tuple of directives, got tuple_iterator'
+    """
+    if type(answer) is not list and type(answer) is not tuple:
+        return f"a policy returns a list or a tuple of directives, got {type(answer).__name__}"
+    for d in answer:
+        if type(d) is not Directive:
+            return f"a policy returns Directive, got {type(d).__name__}"
+        for name, value in zip(Directive._fields, d, strict=True):
+            for part in value if type(value) is Disc else (value,):
+                if not _is_honest(part):
+                    return f"directive {d.source!r}→{d.destination!r}: {name} is of the policy's own type {type(part).__name__}"
+    return None
+
+
 def find_wrong_type(d: object) -> str | None:
     """The first field of a directive that is of a wrong type, as an error text; None if all types are right."""
-    if not isinstance(d, Directive):
+    if type(d) is not Directive:
         return f"a policy returns Directive, got {type(d).__name__}"
     where = f"directive {d.source}→{d.destination}"
     for name in ("source", "destination"):
@@ -491,12 +526,12 @@ def find_wrong_type(d: object) -> str | None:
             return f"{where}: {name} is {getattr(d, name)!r}, must be a drone's id, a whole number"
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
-        if not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
+        if not _is_honest(value) or not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
             return f"{where}: {name} is {value!r}, must be in [0, {high:g}], {kind}"
-    if not (d.roi is None or isinstance(d.roi, Disc)):
+    if not (d.roi is None or type(d.roi) is Disc):
         return f"{where}: roi is {d.roi!r}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
-        if not _compares(value, -_FAR_M, _FAR_M):
+        if not _is_honest(value) or not _compares(value, -_FAR_M, _FAR_M):
             return f"{where}: roi.{name} is {value!r}, must be a number"
     fault = _reason_fault(d.reason)
     return f"{where}: {fault}" if fault else None
@@ -534,12 +569,20 @@ def _compares(value: Any, low: float, high: float) -> bool:
     return True
 
 
+_HONEST = frozenset({"builtins", "numpy", "decimal", "fractions", "sortie"})
+
+
+def _is_honest(value: object) -> bool:
+    """Whether a value's type is known to compare the same each time: a type of the user's own may not."""
+    return type(value).__module__.partition(".")[0] in _HONEST
+
+
 _HALF_PAIR = re.compile("[\ud800-\udfff]")
 
 
 def _reason_fault(reason: object) -> str | None:
     """Why a reason cannot stand in the record; None if it can."""
-    if not isinstance(reason, str):
+    if not isinstance(reason, str) or not _is_honest(reason):
         return f"reason is {reason!r}, must be text"
     if _HALF_PAIR.search(reason):
         return f"reason is {reason!r}, must be text that UTF-8 can write"

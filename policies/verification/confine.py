@@ -10,10 +10,7 @@ not stop a hostile policy: C extensions and further methods of a policy's own cl
 from __future__ import annotations
 
 import builtins
-import dis
 import functools
-import inspect
-import sys
 import types
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar, cast
@@ -184,71 +181,6 @@ class _Rebuilding:
 
         kept = {n: _Forbidden(n) if n in _NO_BUILTINS else v for n, v in vars(builtins).items()}
         return kept | {"__import__": importing}
-
-
-_FROZEN = ("__setattr__", "__delattr__")
-"""Methods that `dataclass` adds to a frozen class; they use `type`."""
-
-
-def uses_builtin(policy: Callable[..., Any], builtin: object) -> bool:
-    """Whether a policy's own code, or user code that it refers to, uses a builtin such as `type`."""
-    met: dict[int, object] = {}
-    waiting: list[Any] = [policy]
-    while waiting:
-        value = waiting.pop()
-        if value is builtin:
-            return True
-        if id(value) in met:
-            continue
-        met[id(value)] = value
-        if isinstance(value, Guarded):
-            waiting.append(value.__wrapped__)
-        elif isinstance(value, functools.partial):
-            waiting += [value.func, *value.args, *value.keywords.values()]
-        elif isinstance(value, types.MethodType):
-            waiting += [value.__func__, value.__self__]
-        elif isinstance(value, types.FunctionType):
-            waiting += _references(value) if _is_own(value.__module__) else ()
-        elif isinstance(value, staticmethod | classmethod):
-            waiting.append(value.__func__)
-        elif isinstance(value, property):
-            waiting.append(value.fget)
-        elif isinstance(value, type):
-            held = vars(value) if _is_own(value.__module__) else {}
-            waiting += [v for name, v in held.items() if name not in _FROZEN]
-        elif isinstance(value, dict | list | tuple):
-            waiting += [v for v in (value.values() if isinstance(value, dict) else value) if callable(v)]
-        else:
-            waiting += [getattr(value, "__wrapped__", None), type(value)]
-    return False
-
-
-def _references(found: types.FunctionType) -> list[Any]:
-    """What a function refers to: globals and builtins, attributes of its modules, closure variables, defaults."""
-    names, parts, codes = set(), set(), [found.__code__]
-    for code in codes:  # grows
-        codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
-        for step in dis.get_instructions(code):
-            if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names.add(step.argval)
-            elif step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
-                parts.add(step.argval)
-    space = {**vars(builtins), **found.__globals__}
-    named = [space[name] for name in names if name in space]
-    modules = [m for m in named if isinstance(m, types.ModuleType) and (m is builtins or _is_own(m.__name__))]
-    return [
-        *(v for v in named if not isinstance(v, types.ModuleType)),
-        *(vars(m)[part] for m in modules for part in parts if part in vars(m)),
-        *inspect.getclosurevars(found).nonlocals.values(),
-        *(found.__defaults__ or ()),
-        *(found.__kwdefaults__ or {}).values(),
-    ]
-
-
-def _is_own(home: str | None) -> bool:
-    """Whether a module is user code: neither the standard library's nor an installed package's."""
-    file = getattr(sys.modules.get(home or ""), "__file__", None) or ""
-    return (home or "").split(".")[0] not in sys.stdlib_module_names and "site-packages" not in file
 
 
 def _names(code: types.CodeType) -> set[str]:

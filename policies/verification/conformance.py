@@ -10,6 +10,8 @@ fails has the smallest failing view that was found.
 from __future__ import annotations
 
 import contextlib
+import functools
+import random
 import statistics
 import time
 from collections import Counter
@@ -31,14 +33,20 @@ from sortie.policies.contract import (
     find_wrong_type,
 )
 from sortie.policies.registry import parameters, viewpoint_of
+from sortie.policies.user_calls import Guarded
+from sortie.policies.user_code import load
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import just_heard
+from sortie.policies.verification.subject import searchable
+from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.views import draw_view, draw_views, shrink
 
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)
 DECISION_LIMIT_S = 0.010
 """A tenth of a frame at 10 Hz, at 20 drones. The limit is generous, because machines differ; the time is reported."""
+SHUFFLED = 100
+"""How many of the views are decided twice, in two orders."""
 _STALE_PERIODS = 20.0  # beyond the plane's ten, at which a peer is detached
 _ROUNDING = 1e-9
 
@@ -78,7 +86,7 @@ def conform(
     """
     tried = list(draw_views(seed, count) if views is None else views)
     checks = [_check_rule(name, rule, policy, tried) for name, rule in RULES.items()]
-    return [*checks, _decides_in_time(policy)]
+    return [*checks, _keeps_no_memory(policy, tried), _decides_in_time(policy)]
 
 
 def failing(checks: Sequence[Check]) -> list[Check]:
@@ -124,18 +132,21 @@ def _decide(policy: Policy, view: FleetView) -> list[Directive]:
 def _decide_unchecked(policy: Policy, view: FleetView) -> list[Directive]:
     """The same, without a check of the directives' types."""
     try:
-        return list(policy(_copied(view)))
+        answer = policy(view.frozen)
     except Exception as error:
         raise _Raised from error
+    if type(answer) not in (list, tuple):
+        raise _Raised
+    return list(answer)
 
 
 def _returns_a_sequence(policy: Policy, view: FleetView) -> str | None:
     try:
-        answer = policy(view)
+        answer = policy(view.frozen)
     except Exception as error:
         return f"raises {type(error).__name__}: {error}"
-    if not isinstance(answer, Sequence):
-        return f"returns {type(answer).__name__}, must be a sequence of directives"
+    if type(answer) not in (list, tuple):
+        return f"returns {type(answer).__name__}, must be a list or a tuple of directives"
     return None
 
 
@@ -183,10 +194,51 @@ def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
     usual = _as_tuples(_decide(policy, view))
     try:
-        alone = _as_tuples(_decide(confined(policy), view))
+        alone = _as_tuples(_decide(_alone(policy), view))
     except Reached as error:
         return str(error)
     return None if alone == usual else "decides differently if it can only use its view"
+
+
+@functools.lru_cache(maxsize=4)
+def _alone(policy: Policy) -> Policy:
+    """The policy, able to use nothing but its view: with checks in its source, or by its copied functions."""
+    try:
+        follows, why = searchable(policy)
+        if not why:
+            follows(draw_view(1, 0).frozen)
+            return follows
+    except Refused:  # a search cannot follow it, which is no fault
+        pass
+    except Exception:  # other rules report it
+        pass
+    return confined(policy)
+
+
+def _keeps_no_memory(policy: Policy, views: Sequence[FleetView]) -> Check:
+    """The same answers in another order of the views, and from the file loaded anew."""
+    name = "no memory"
+    few = [v.frozen for v in views[:SHUFFLED]]
+    try:
+        first = [_as_tuples(_decide(policy, v)) for v in few]
+        order = list(range(len(few)))
+        random.Random(len(few)).shuffle(order)  # noqa: S311
+        for instance, what in ((policy, "after other views"), (_loaded_anew(policy), "from the file loaded anew")):
+            for k in order:
+                if _as_tuples(_decide(instance, few[k])) != first[k]:
+                    return Check(name, False, f"the same view gets other directives {what}", few[k])
+    except _Raised:
+        return Check(name, True, "not all views could be checked: see returns directives, bounds kept")
+    return Check(name, True, f"{len(few)} views in two orders, and from the file loaded anew")
+
+
+def _loaded_anew(policy: Policy) -> Policy:
+    if isinstance(policy, partial):
+        return partial(_loaded_anew(policy.func), *policy.args, **policy.keywords)
+    if isinstance(policy, Guarded) and policy.source is not None:
+        fresh: Policy = getattr(load(policy.source.file), policy.source.name)
+        return Guarded(fresh, policy.source)
+    return policy
 
 
 def _order_is_irrelevant(policy: Policy, view: FleetView) -> str | None:
@@ -208,7 +260,7 @@ def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
         view._replace(descriptors={}, age_s={}),
     ):
         try:
-            directives = list(policy(few))
+            directives = list(policy(few.frozen))
         except Exception as error:
             return f"{len(few.descriptors)} drones in the view: raises {type(error).__name__}: {error}"
         if directives:
@@ -219,7 +271,7 @@ def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
 def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
     stale = view._replace(age_s=dict.fromkeys(view.age_s, _STALE_PERIODS * view.period_s))
     try:
-        check_directives(list(policy(stale)), stale)
+        check_directives(policy(stale.frozen), stale)
     except Exception as error:
         return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {error}"
     return None

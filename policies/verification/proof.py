@@ -2,7 +2,7 @@
 
 The policy runs on views whose fields are ranges (`sortie.policies.verification.symbols`). Its comparisons divide the
 ranges into cells. The search visits every cell, for every roster up to `max_drones`, every ego, every subset of peers
-heard, and
+heard, every order of the drones in the view, and
 
 | field | searched over |
 |---|---|
@@ -13,36 +13,44 @@ heard, and
 | novelty flags, target ids | every byte; how many, 0 … 16 |
 | positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |
 
-A policy that uses anything else (the coverage grid's cells, a clock, a comparison of two goodputs) cannot be proved. It
-is then tested on drawn views; if none breaks it, the verdict is "not proved". A counterexample is a view of plain
-numbers on which the policy itself was run again and failed.
+| verdict | what was covered |
+|---|---|
+| `proved` | every view of fleets of up to so many drones, float by float |
+| `proved over the reals` | the same, but sums and products of inputs were followed without rounding |
+| `refuted` | a view of plain numbers on which the policy itself was run and failed |
+| `searched` | cells that the time allowed, or of a policy that cannot be proved; none fails |
+| `drawn` | random views alone, because the policy cannot be followed; none fails |
 
-The proof does not cover fleets larger than `max_drones`, another period than the one given, and NaN. It does not notice
-two things: a comparison of text in which a number stands among other text (`f"charge {soc:.2f}" == "charge 0.12"`:
-Python makes plain text of it), and a policy that inspects its input with `is`, `id`, or code that is not Python. For the
-text of a number alone, `isinstance` and `type`, the policy gets the same result as in flight, or it is not proved.
+Drawn views are tried after every proof too, up to the largest fleet that a scenario may have. A proof covers neither
+rosters (`context.roster`), nor another period than the one given, nor NaN.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from sortie.policies.contract import FleetView, Policy, PolicyError, check_directives, find_wrong_type
-from sortie.policies.verification.confine import uses_builtin
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, check_directives, find_inexact, find_wrong_type
+from sortie.policies.verification.advice import advise
+from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
 from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
-from sortie.policies.verification.ranges import FleetOfRanges
-from sortie.policies.verification.symbols import Path, Refused, explore
-from sortie.policies.verification.views import draw_views, shrink
+from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
+from sortie.policies.verification.solver import solver_paths
+from sortie.policies.verification.subject import searchable
+from sortie.policies.verification.symbols import Combined, Refused
+from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, shrink
 
-MAX_DRONES = 4
-MAX_CELLS = 200_000
+DRONES = 5
+"""The largest fleet that a proof covers if nothing else is asked for."""
+BUDGET_S = 60.0
 TRIED_VIEWS = 1000
+TRIED_LARGE = 4
+"""Drawn views of the largest fleet that a scenario may have."""
 
-Outcome = Literal["proved", "refuted", "not proved"]
+Outcome = Literal["proved", "proved over the reals", "refuted", "searched", "drawn"]
+PROVED = ("proved", "proved over the reals")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +58,7 @@ class Property:
     """A property to prove: a function that returns a complaint about a policy on a view, or None."""
 
     name: str
-    complaint: Callable[[Policy, RepeatableView], str | None]
+    complaint: Callable[[Policy, Any], str | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,43 +74,34 @@ class ProofVerdict:
 
 
 class RepeatableView:
-    """Produces views with the same inputs any number of times: as they are, at age 0, or older."""
+    """Produces a plain view any number of times: as it is, at age 0, or older."""
 
-    def __init__(
-        self,
-        plain: FleetView | None = None,
-        system: FleetOfRanges | None = None,
-        raised: Mapping[int, float] | None = None,
-    ) -> None:
-        self._plain, self._system, self._raised = plain, system, raised
+    def __init__(self, plain: FleetView, raised: Mapping[int, float] | None = None) -> None:
+        self._plain, self._raised = plain.frozen, raised
 
     def now(self) -> FleetView:
-        """The view itself, each time with new mappings."""
-        if self._system is not None:
-            return self._system.view()
-        assert self._plain is not None  # noqa: S101
-        return self._plain._replace(descriptors=dict(self._plain.descriptors), age_s=dict(self._plain.age_s))
+        """The view itself, which can only be read."""
+        return self._plain
 
     def just_heard(self) -> FleetView:
         """The view with every age 0."""
-        return just_heard(self.now())
+        return just_heard(self._plain).frozen
 
     def older(self) -> Iterator[FleetView]:
-        """The view with raised ages: any raise in a search, a few of them for a plain view."""
-        if self._system is not None:
-            yield self._system.older_view()
-            return
+        """The view with raised ages, a few of all raises; in a large fleet of all drones at once alone."""
         if self._raised is not None:
-            yield self.now()._replace(age_s=dict(self._raised))
-        yield from (older for _, _, older in older_views(self.now()))
+            yield self._plain._replace(age_s=dict(self._raised)).frozen
+        for who, _, older in older_views(self._plain):
+            if len(self._plain.age_s) <= MAX_DRONES or len(who) == len(self._plain.age_s):
+                yield older.frozen
 
 
 # --- properties ----------------------------------------------------------------------------------
 
 
-def keeps_contract(policy: Policy, view: RepeatableView) -> str | None:
+def keeps_contract(policy: Policy, view: Any) -> str | None:
     """Bounds, and one directive per link."""
-    directives = list(policy(view.now()))
+    directives = policy(view.now())
     try:
         check_directives(directives, view.now())
     except PolicyError as error:
@@ -110,26 +109,38 @@ def keeps_contract(policy: Policy, view: RepeatableView) -> str | None:
     return missing_links(directives, view.now())
 
 
-def only_falls_with_age(policy: Policy, view: RepeatableView) -> str | None:
+def only_falls_with_age(policy: Policy, view: Any) -> str | None:
     """Raising any ages raises no directive's representation, budget or rate (`conformance.age_monotone`)."""
-    before = list(policy(view.now()))
+    before = _exactly(policy(view.now()))
     for older in view.older():
         after = policy(older)
         if raised_part(before, after) is None:
             continue
         raised = raised_part(before, after, policy(without_detached(view.now(), older)))
         if raised is not None:
-            ages = ", ".join(f"{i}: {a!r}" for i, a in older.age_s.items())
+            ages = ", ".join(f"{i}: {a!r}" for i, a in sorted(older.age_s.items()))
             return f"with ages raised to {ages} s, {raised}"
     return None
+
+
+def _exactly(answer: Any) -> list[Directive]:
+    """An answer whose directives cannot read differently than they are.
+
+    Raises:
+        PolicyError: it is no list or tuple of exactly `Directive`, or a field is of a type of the policy's own.
+    """
+    wrong = find_inexact(answer)
+    if wrong is not None:
+        raise PolicyError(wrong)
+    return list(answer)
 
 
 def property_of(invariant: Invariant) -> Property:
     """An invariant as a property to prove."""
 
-    def complaint(policy: Policy, view: RepeatableView) -> str | None:
-        directives = list(policy(view.now()))
-        fresh = list(policy(view.just_heard())) if invariant.needs_fresh else []
+    def complaint(policy: Policy, view: Any) -> str | None:
+        directives = _exactly(policy(view.now()))
+        fresh = _exactly(policy(view.just_heard())) if invariant.needs_fresh else []
         for broken in violations(invariant, view.now(), directives, fresh):
             return f"decided {describe_directives(directives if broken is None else [broken])}"
         return None
@@ -151,65 +162,150 @@ def prove(
     policy: Policy,
     invariants: Sequence[Invariant] = (),
     *,
-    max_drones: int = MAX_DRONES,
+    max_drones: int = DRONES,
     period_s: float = 0.1,
-    max_cells: int = MAX_CELLS,
+    budget_s: float = BUDGET_S,
     seed: int = 0,
+    views: int = TRIED_VIEWS,
 ) -> list[ProofVerdict]:
     """Prove or refute the plane's properties and a policy's invariants.
 
     Args:
-        policy: the policy.
+        policy: the policy. A proof needs one of Sortie's, or one that `resolve` loaded from a file.
         invariants: what it must keep too.
-        max_drones: rosters of 1 to this many drones are searched; each drone multiplies the cells by about ten.
+        max_drones: fleets of 1 to this many drones are searched; each drone multiplies the cells by about ten.
         period_s: the plane's period.
-        max_cells: a search that would visit more cells stops: not proved.
-        seed: of the drawn views on which a property that cannot be proved is tested.
+        budget_s: wall-clock time for the search of all properties together. What it did not reach is not proved.
+        seed: of the drawn views on which every property is tried that no search refuted.
+        views: how many of them, besides a few of the largest fleet; 0 for none at all.
 
     Returns:
         One verdict for each property, the plane's first.
     """
     properties = [*PLANE, *(property_of(i) for i in invariants)]
-    return [_verdict(policy, p, max_drones, period_s, max_cells, seed) for p in properties]
+    searched = [Searched(p.name) for p in properties]
+    coverage = _search(policy, list(zip(searched, properties, strict=True)), max_drones, period_s, Budget(budget_s))
+    tried = _Drawn(policy, seed, views)
+    verdicts = []
+    for found, prop in zip(searched, properties, strict=True):
+        if found.fault is not None:
+            said = check_property(prop, policy, found.fault.view, found.fault.raised_age_s) or ""
+            verdicts.append(ProofVerdict(prop.name, "refuted", said, found.fault.view, found.fault.raised_age_s))
+            continue
+        view = tried.first_fault(prop)
+        if view is not None:
+            verdicts.append(ProofVerdict(prop.name, "refuted", check_property(prop, policy, view) or "", view))
+            continue
+        outcome, text = coverage.verdict(found)
+        verdicts.append(ProofVerdict(prop.name, outcome, f"{text}; {tried.text}"))
+    return verdicts
 
 
-def _verdict(
-    policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int, seed: int
-) -> ProofVerdict:
-    def fails(view: FleetView) -> bool:
-        return check_property(prop, policy, view) is not None
+class _Coverage:
+    """What the search of a policy covered."""
 
+    def __init__(self, asked: int, budget: Budget) -> None:
+        self.asked, self.drones, self.budget = asked, 0, budget
+        self.exact = True
+        self.cannot = ""
+        """Why no search can follow the policy."""
+        self.unsound = ""
+        """Why a complete search proves nothing."""
+        self.stopped = False
+
+    def verdict(self, found: Searched) -> tuple[Outcome, str]:
+        why = found.unclear or self.cannot
+        if why:
+            return "drawn", advise(why)
+        if self.unsound:
+            return "searched", f"{found.cells} cells; it {self.unsound}"
+        spent = f"the time of {self.budget.budget_s:g} s ended in fleets of {self.drones + 1}" if self.stopped else ""
+        if self.drones < min(2, self.asked):
+            return "searched", f"{found.cells} cells; {spent}"
+        cells = f"all views of up to {self.drones} drones, {found.cells} cells" + (f"; {spent}" if spent else "")
+        return ("proved" if self.exact else "proved over the reals"), cells
+
+
+def _search(
+    policy: Policy, properties: list[tuple[Searched, Property]], max_drones: int, period_s: float, budget: Budget
+) -> _Coverage:
+    """Search fleet by fleet until all is covered, the time is over, or the policy cannot be followed."""
+    coverage = _Coverage(max_drones, budget)
+
+    def confirm(searched: Searched, fault: Found) -> bool:
+        prop = next(p for s, p in properties if s is searched)
+        return check_property(prop, policy, fault.view, fault.raised_age_s) is not None
+
+    looked_for = [(s, p.complaint) for s, p in properties]
+    make = None
     try:
-        cells, system = _search(policy, prop, max_drones, period_s, max_cells)
-    except Refused as refused:
-        reason = str(refused)
-    else:
-        if system is not None:
-            found = system.example()
-            raised = system.raised_example()
-            confirmed = check_property(prop, policy, found, raised)
-            if confirmed is not None:
-                return ProofVerdict(prop.name, "refuted", confirmed, found, raised)
-            reason = "the search finds a fault that no plain view shows"
-        elif uses_builtin(policy, type):
-            reason = "uses type(…), which gives another type in the search"
-        else:
-            return ProofVerdict(prop.name, "proved", f"{cells} cells, fleets of 1 to {max_drones}")
-    for view in draw_views(seed, TRIED_VIEWS):
-        if fails(view):
-            small = shrink(view, fails)
-            return ProofVerdict(prop.name, "refuted", check_property(prop, policy, small) or "", small)
-    return ProofVerdict(prop.name, "not proved", f"{reason}; {TRIED_VIEWS} drawn views keep it")
+        follows, coverage.unsound = searchable(policy)
+        for drones in range(1, max_drones + 1):
+            try:
+                exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
+            except Combined:
+                make = solver_paths()
+                exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
+            coverage.exact = coverage.exact and exact
+            coverage.drones = drones
+    except Stopped:
+        coverage.stopped = True
+    except (Refused, Reached) as refused:
+        coverage.cannot = str(refused)
+    except Exception as error:  # its file does not load with the checks
+        coverage.cannot = f"raises {type(error).__name__}: {error}"
+    return coverage
+
+
+class _Drawn:
+    """Drawn views and what the policy decides on them, each decision made once."""
+
+    def __init__(self, policy: Policy, seed: int, count: int) -> None:
+        self._policy, self._count = policy, count
+        self._large = TRIED_LARGE if count else 0
+        self._views = [
+            *(draw_view(seed, number) for number in range(count)),
+            *(draw_view(seed, count + number, LARGEST) for number in range(self._large)),
+        ]
+        self._answers: dict[int, Any] = {}
+
+    @property
+    def text(self) -> str:
+        """How many views were tried, in words."""
+        return f"{self._count} drawn views of up to {MAX_DRONES} drones and {self._large} of {LARGEST} keep it"
+
+    def first_fault(self, prop: Property) -> FleetView | None:
+        """The first view on which a property fails, made smaller; None if all keep it."""
+        for number, view in enumerate(self._views):
+            shown = RepeatableView(view)
+            now = shown.now()
+
+            def decide(other: FleetView, /, now: FleetView = now, number: int = number) -> Any:
+                if other is not now:
+                    return self._policy(other)
+                if number not in self._answers:
+                    self._answers[number] = self._policy(now)
+                return self._answers[number]
+
+            if _complaint(prop, decide, shown) is not None:
+                if check_property(prop, self._policy, view) is None:
+                    return view.frozen  # it fails only sometimes: it is not the same for the same view
+                return shrink(view, lambda v: check_property(prop, self._policy, v) is not None)
+        return None
 
 
 def check_property(
     prop: Property, policy: Policy, view: FleetView, raised: Mapping[int, float] | None = None
 ) -> str | None:
     """The complaint of a property about a policy on one plain view. An exception is a complaint."""
+    return _complaint(prop, policy, RepeatableView(view, raised))
+
+
+def _complaint(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
     try:
-        return prop.complaint(policy, RepeatableView(plain=view, raised=raised))
+        return prop.complaint(policy, view)
     except Exception as error:
-        return _invalid_directive(policy, view) or f"raises {type(error).__name__}: {error}"
+        return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {error}"
 
 
 def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
@@ -218,38 +314,3 @@ def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
         return next((wrong for d in policy(view) if (wrong := find_wrong_type(d)) is not None), None)
     except Exception:
         return None
-
-
-def _search(
-    policy: Policy, prop: Property, max_drones: int, period_s: float, max_cells: int
-) -> tuple[int, FleetOfRanges | None]:
-    """The number of cells visited, and the first cell on which the property fails."""
-    cells = 0
-    for drones, ego, heard in _rosters(max_drones):
-
-        def run(
-            path: Path, drones: int = drones, ego: int = ego, heard: tuple[int, ...] = heard
-        ) -> tuple[str | None, FleetOfRanges]:
-            system = FleetOfRanges(path, drones, ego, heard, period_s)
-            try:
-                return prop.complaint(policy, RepeatableView(system=system)), system
-            except Exception as error:  # the policy's fault or the ranges': the run on a plain view decides
-                return f"raises {type(error).__name__}", system
-
-        for _, (complaint, system) in explore(run):
-            cells += 1
-            if complaint is not None:
-                return cells, system
-            if cells >= max_cells:
-                raise Refused(f"more than {max_cells} cells")
-    return cells, None
-
-
-def _rosters(max_drones: int) -> Iterator[tuple[int, int, tuple[int, ...]]]:
-    """Every fleet size, ego and subset of drones heard (always with the ego), small fleets first."""
-    for drones in range(1, max_drones + 1):
-        for ego in range(drones):
-            others = [i for i in range(drones) if i != ego]
-            for k in range(drones):
-                for peers in itertools.combinations(others, k):
-                    yield drones, ego, tuple(sorted((ego, *peers)))

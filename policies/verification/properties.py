@@ -12,7 +12,6 @@ PROMISES: dict[str, str] = {
         when human_in_region and peers >= 1: any_link(representation >= detections and rate_hz >= 2)
         count_links(representation > none) <= 2
         representation <= features
-        rate_hz <= fresh.rate_hz
     """,
     "silence": "representation == none",
 }

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NoReturn
 
-from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase, goodput_in
+from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.scenarios.disc import disc_overlap
+from sortie.scenarios.link_state import state_of
+
+Choose = Callable[[str, float, float], float]
+"""Picks a number of an axis between its bounds."""
 
 _FOOTPRINT_M = 42.0
 _FLAGS = 8
@@ -25,12 +30,21 @@ class FleetOfRanges:
     def __init__(self, path: Path, drones: int, ego: int, heard: tuple[int, ...], period_s: float) -> None:
         self.path, self.drones, self.ego, self.heard, self.period_s = path, drones, ego, heard, period_s
         self.peers = tuple(i for i in heard if i != ego)
-        self._older = False
+        self.is_older = False
+        self._descriptors: Mapping[int, Any] | None = None
 
     def view(self) -> FleetView:
-        descriptors: dict[int, Any] = {i: DescriptorOfRanges(self, i) for i in self.heard}
-        ages: Mapping[int, Any] = {i: self._age(i) for i in self.heard}
-        return FleetView(self.ego, self.period_s, descriptors, ages)
+        """The view; its mappings can be read only, as in flight."""
+        return self._view({i: self._age(i) for i in self.heard})
+
+    def just_heard(self) -> FleetView:
+        """The view with every age 0."""
+        return self._view(dict.fromkeys(self.heard, 0.0))
+
+    def _view(self, age_s: dict[int, Any]) -> FleetView:
+        if self._descriptors is None:
+            self._descriptors = _in_any_order(self, {i: DescriptorOfRanges(self, i) for i in self.heard})
+        return ViewOfRanges(self.ego, self.period_s, self._descriptors, _in_any_order(self, age_s))
 
     def _age(self, i: int) -> Ranged:
         return self.path.number(f"age_s of drone {i}", 0.0, _SEARCHED_UP_TO["age"])
@@ -41,24 +55,36 @@ class FleetOfRanges:
         This is exact. Within the cell the policy decides the same, so the lowest age represents the cell, and every
         age above it is a raise of it.
         """
-        self._older = True
+        self.is_older = True
         ages: dict[int, Any] = {}
         for i in self.heard:
             self._age(i)
-            low, _ = self.path.ranges[f"age_s of drone {i}"]
-            ages[i] = self.path.number(f"raised age_s of drone {i}", low, _SEARCHED_UP_TO["age"])
-        return self.view()._replace(age_s=ages)
+            ages[i] = self.path.raised(f"age_s of drone {i}", f"raised age_s of drone {i}", _SEARCHED_UP_TO["age"])
+        return self._view(ages)
 
-    def example(self) -> FleetView:
-        """A plain view of the cell, with usual values if they lie in it, otherwise with round ones."""
+    @property
+    def has_example(self) -> bool:
+        """Whether a plain view of the cell can be placed: the run ranked the peers of one drone at most."""
+        return sum(1 for label in self.path.picks if label.startswith(_ORDER)) <= 1
+
+    def example(self, choose: Choose | None = None) -> FleetView:
+        """A plain view of the cell, with usual values if they lie in it, otherwise with round ones.
+
+        Args:
+            choose: picks a number of an axis from its bounds, in place of the usual value.
+        """
         path = self.path
 
         def number(axis: str, usual: float) -> float:
-            low, high = path.ranges.get(axis, (usual, usual))
+            low, high = path.bounds(axis, usual)
+            if choose is not None and axis in path.ranges:
+                return choose(axis, low, high)
             return usual if low <= usual <= high else _round_within(low, high)
 
-        order = path.picks.get(_order_of(self.ego), self.peers)
-        places = _places(self.ego, order)
+        ranked = next((label for label in path.picks if label.startswith(_ORDER)), _order_of(self.ego))
+        receiver = int(ranked.rpartition(" ")[2])
+        order = path.picks.get(ranked, tuple(i for i in self.heard if i != receiver))
+        places = _places(receiver, order)
         descriptors = {}
         for i in self.heard:
             region = path.picks.get(f"region of drone {i}", False)
@@ -75,7 +101,7 @@ class FleetOfRanges:
                 cpu_headroom=number(f"cpu_headroom of drone {i}", 1.0),
                 gpu_headroom=number(f"gpu_headroom of drone {i}", 1.0),
                 peer_goodput_mbps=tuple(
-                    number(f"goodput of drone {i} to slot {slot}", 100.0) for slot in range(self.drones - 1)
+                    number(goodput_axis(i, other), 100.0) for other in range(self.drones) if other != i
                 ),
                 coverage_grid=bytes(COVERAGE_BYTES),
                 novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
@@ -84,37 +110,57 @@ class FleetOfRanges:
                 priority_target_ids=tuple(range(int(targets))),
                 feature_space="" if path.picks.get(_space_of(i), True) else "other",
             )
-        return FleetView(self.ego, self.period_s, descriptors, self._example_ages())
+        ages_s = self._example_ages(choose)
+        ids = path.picks.get(_ORDER_IN_VIEW, self.heard)
+        return FleetView(self.ego, self.period_s, {i: descriptors[i] for i in ids}, {i: ages_s[i] for i in ids}).frozen
 
-    def _example_ages(self) -> dict[int, float]:
+    def _example_ages(self, choose: Choose | None = None) -> dict[int, float]:
         ages = {}
         for i in self.heard:
-            low, high = self.path.ranges.get(f"age_s of drone {i}", (0.0, 0.0))
+            axis = f"age_s of drone {i}"
+            low, high = self.path.bounds(axis, 0.0)
             # If ages were raised, this is the lowest age of the cell, from which they were raised.
-            ages[i] = low if self._older or low == 0.0 else _round_within(low, high)
+            usual = low if self.is_older or low == 0.0 else _round_within(low, high)
+            ages[i] = usual if choose is None or self.is_older else choose(axis, low, high)
         return ages
 
     def raised_example(self) -> dict[int, float] | None:
         """The raised ages of the example; None if the property raised none."""
-        if not self._older:
+        if not self.is_older:
             return None
         from_s = self._example_ages()
         raised = {}
         for i in self.heard:
-            low, high = self.path.ranges[f"raised age_s of drone {i}"]
+            low, high = self.path.bounds(f"raised age_s of drone {i}", from_s[i])
             raised[i] = from_s[i] if low <= from_s[i] <= high else _round_within(low, high)
         return raised
 
 
-class DescriptorOfRanges:
-    """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched raise `Refused`."""
+class DescriptorOfRanges(Descriptor):
+    """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched raise `Refused`.
 
-    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
-        self._system = system
-        self.agent_id = agent_id
+    It is a `Descriptor`, so indices, patterns, its length and assignments answer as in flight. What is stored in the
+    tuple itself refuses every use; all reading goes through the properties.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, system: FleetOfRanges, agent_id: int) -> DescriptorOfRanges:
+        stored = [Unsearchable(system, agent_id, name) for name in Descriptor._fields]
+        return tuple.__new__(cls, stored)
+
+    @property
+    def _origin(self) -> Unsearchable:
+        found: Unsearchable = tuple.__getitem__(self, 0)
+        return found
 
     def _number(self, name: str, low: float, high: float) -> Any:
-        return self._system.path.number(f"{name} of drone {self.agent_id}", low, high)
+        origin = self._origin
+        return origin.system.path.number(f"{name} of drone {origin.drone}", low, high)
+
+    @property
+    def agent_id(self) -> int:  # type: ignore[override]
+        return self._origin.drone
 
     @property
     def battery_soc(self) -> Any:
@@ -130,32 +176,40 @@ class DescriptorOfRanges:
 
     @property
     def peer_goodput_mbps(self) -> tuple[Any, ...]:
-        path, me, high = self._system.path, self.agent_id, _SEARCHED_UP_TO["goodput"]
-        slots = range(self._system.drones - 1)
-        return tuple(path.number(f"goodput of drone {me} to slot {slot}", 0.0, high) for slot in slots)
+        system, me = self._origin.system, self._origin.drone
+        others = (i for i in range(system.drones) if i != me)
+        return tuple(self._number_to(other) for other in others)
+
+    def _number_to(self, other: int) -> Any:
+        return self._origin.system.path.number(goodput_axis(self._origin.drone, other), 0.0, _SEARCHED_UP_TO["goodput"])
 
     def link_state(self, peer: int) -> LinkState:
-        return Descriptor.link_state(self, peer)  # type: ignore[arg-type]
+        return state_of(self.goodput_to(peer))
 
     def goodput_to(self, peer: int) -> Any:
         # a drone off a roster reads 0, which is in the range too
-        return goodput_in(self.peer_goodput_mbps, self.agent_id, None, peer)
+        if type(peer) is not int or not 0 <= peer < self._origin.system.drones:
+            self._origin._reached()
+        return 0.0 if peer == self._origin.drone else self._number_to(peer)
+
+    def counts(self, drone: int) -> bool:
+        return _refusing(self, "roster")
 
     @property
     def task_phase(self) -> TaskPhase:
-        return self._system.path.pick(f"task_phase of drone {self.agent_id}", tuple(TaskPhase))
+        return self._origin.system.path.pick(f"task_phase of drone {self._origin.drone}", tuple(TaskPhase))
 
     @property
     def feature_space(self) -> Any:
-        return _Space(self._system, self.agent_id)
+        return _Space(self._origin.system, self._origin.drone)
 
     @property
     def novelty_flags(self) -> Any:
-        return _Flags(self._system.path, self.agent_id)
+        return _Flags(self._origin.system.path, self._origin.drone)
 
     @property
     def region(self) -> Disc | None:
-        if not self._system.path.pick(f"region of drone {self.agent_id}", (False, True)):
+        if not self._origin.system.path.pick(f"region of drone {self._origin.drone}", (False, True)):
             return None
         return Disc(
             self._number("region x_m", -1e5, 1e5),
@@ -165,14 +219,15 @@ class DescriptorOfRanges:
 
     @property
     def priority_target_ids(self) -> Any:
-        return _TargetIds(self._number("targets", 0, 16), self._system.path)
+        return _TargetIds(self._number("targets", 0, 16), self._origin.system.path)
 
     @property
     def position_m(self) -> tuple[float, float, float]:
         receiver = self._only_for_order("position_m")
-        peers = tuple(i for i in self._system.heard if i != receiver)
-        order = self._system.path.pick(_order_of(receiver), _orders(peers))
-        return _places(receiver, order)[self.agent_id]
+        system = self._origin.system
+        peers = tuple(i for i in system.heard if i != receiver)
+        order = system.path.pick(_order_of(receiver), _orders(peers))
+        return _places(receiver, order)[self._origin.drone]
 
     @property
     def footprint_radius_m(self) -> float:
@@ -189,19 +244,139 @@ class DescriptorOfRanges:
             if frame.f_code is peers_by_overlap.__code__:
                 return int(frame.f_locals["of"])
             frame = frame.f_back  # type: ignore[assignment]
-        self._system.path.refuse(f"reads {field} without peers_by_overlap")
+        self._origin.system.path.refuse(f"reads {field} without peers_by_overlap")
 
-    def __getattr__(self, name: str) -> NoReturn:
-        self._system.path.refuse(f"reads {name}, which cannot be searched")
+    def __getitem__(self, at: Any) -> Any:
+        return getattr(self, Descriptor._fields[at]) if type(at) is int else self._whole()
+
+    def __iter__(self) -> Any:
+        return (getattr(self, name) for name in Descriptor._fields)
 
     def __eq__(self, other: object) -> bool:
-        return self is other or self.__getattr__("whole descriptors")
+        return self is other or self._whole()
 
-    __hash__ = None  # type: ignore[assignment]
+    def __ne__(self, other: object) -> bool:
+        return not self.__eq__(other)
+
+    def _whole(self, *_: object, **__: object) -> NoReturn:
+        self._origin.system.path.refuse("uses a whole descriptor, which cannot be searched")
+
+    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = _whole  # type: ignore[assignment]
+    __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole  # type: ignore[assignment]
+    _replace = _asdict = _make = with_roster = goodput_by_id = _whole  # type: ignore[assignment]
+
+    @property
+    def coverage_corner(self) -> Any:
+        return self._origin.system.path.refuse("reads coverage_corner, which cannot be searched")
+
+    @property
+    def stamp_ns(self) -> Any:  # type: ignore[override]
+        return _refusing(self, "stamp_ns")
+
+    @property
+    def orientation_xyzw(self) -> Any:  # type: ignore[override]
+        return _refusing(self, "orientation_xyzw")
+
+    @property
+    def velocity_mps(self) -> Any:  # type: ignore[override]
+        return _refusing(self, "velocity_mps")
+
+    @property
+    def coverage_grid(self) -> Any:  # type: ignore[override]
+        return _refusing(self, "coverage_grid")
+
+    @property
+    def roster(self) -> Any:  # type: ignore[override]
+        return _refusing(self, "roster")
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
-        return Descriptor  # so that `isinstance` gives the same result as in flight
+        return Descriptor
+
+
+def _refusing(descriptor: DescriptorOfRanges, name: str) -> NoReturn:
+    descriptor._origin.system.path.refuse(f"reads {name}, which cannot be searched")
+
+
+class Unsearchable:
+    """What stands in a descriptor's tuple. Code in C that reads the tuple directly meets it, and every use refuses."""
+
+    __slots__ = ("drone", "name", "system")
+
+    def __init__(self, system: FleetOfRanges, drone: int, name: str) -> None:
+        self.system, self.drone, self.name = system, drone, name
+
+    def _reached(self, *_: object, **__: object) -> NoReturn:
+        self.system.path.refuse(f"reads {self.name} in a way that cannot be searched")
+
+
+class InAnyOrder(dict[int, Any]):
+    """A mapping by drone, in any order: the run forks as soon as someone sees the order.
+
+    Sortie's own code does not depend on the order, which the kit tests, so it does not fork the run.
+    """
+
+    def __init__(self, path: Path, content: Mapping[int, Any], heard: tuple[int, ...]) -> None:
+        super().__init__(content)
+        self._path, self._heard = path, heard
+
+    def _arranged(self) -> dict[int, Any]:
+        ids = tuple(sorted(dict.keys(self)))
+        if len(ids) > 1 and not _is_blind(sys._getframe(2)):
+            ids = tuple(i for i in self._path.pick(_ORDER_IN_VIEW, _orders(self._heard)) if i in ids)
+        return {i: dict.__getitem__(self, i) for i in ids}
+
+    def __iter__(self) -> Any:
+        return iter(self._arranged())
+
+    def __reversed__(self) -> Any:
+        return reversed(self._arranged())
+
+    def keys(self) -> Any:
+        return self._arranged().keys()
+
+    def values(self) -> Any:
+        return self._arranged().values()
+
+    def items(self) -> Any:
+        return self._arranged().items()
+
+    def copy(self) -> Any:
+        return self._arranged().copy()
+
+    def _whole(self, *_: object) -> NoReturn:
+        self._path.refuse("compares or writes out a whole mapping of drones")
+
+    __eq__ = __ne__ = __or__ = __ror__ = __repr__ = __hash__ = _whole  # type: ignore[assignment]
+    __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = _whole  # type: ignore[assignment]
+
+
+def _is_blind(frame: Any) -> bool:
+    """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
+    return str(frame.f_globals.get("__name__", "")).startswith("sortie.") and frame.f_code.co_name != FOR_USER
+
+
+FOR_USER = "on_behalf_of_the_policy"
+"""The name of the function that calls builtins for a policy's code (`instrument`)."""
+
+
+class ViewOfRanges(FleetView):
+    """A view over ranges. Its mappings can be read only, as in flight, and have any order."""
+
+    __slots__ = ()
+
+    def _replace(self, **fields: Any) -> Any:  # type: ignore[override]
+        if _is_blind(sys._getframe(1)):  # mappings that a user's code made have the order that it gave them
+            system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
+            fields = {
+                name: _in_any_order(system, value) if name in ("descriptors", "age_s") else value
+                for name, value in fields.items()
+            }
+        return FleetView._replace(self, **fields)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return FleetView
 
 
 class _Flags:
@@ -239,8 +414,23 @@ for _method in {n for n, of in vars(int).items() if n.startswith("__") and calla
     setattr(_Flags, _method, _by_value(_method))  # where Python looks for operators
 
 
+_ORDER = "peers by overlap with drone "
+
+
 def _order_of(receiver: int) -> str:
-    return f"peers of drone {receiver} by overlap"
+    return f"{_ORDER}{receiver}"
+
+
+_ORDER_IN_VIEW = "order of drones in the view"
+
+
+def goodput_axis(source: int, destination: int) -> str:
+    """The name of a goodput's axis."""
+    return f"goodput of drone {source} to drone {destination}"
+
+
+def _in_any_order(system: FleetOfRanges, content: Mapping[int, Any]) -> Mapping[int, Any]:
+    return MappingProxyType(InAnyOrder(system.path, content, system.heard))
 
 
 def _flag(bit: int, agent_id: int) -> str:
@@ -262,10 +452,8 @@ class _TargetIds:
                 return n
         return 16
 
-    def _cannot(self, *_: object) -> NoReturn:
+    def _cannot(self, *_: object, **__: object) -> NoReturn:
         self._path.refuse("reads the ids of targets")
-
-    __iter__ = __contains__ = __getitem__ = __eq__ = __hash__ = __getattr__ = _cannot
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -285,12 +473,29 @@ class _Space:
         peer = other._id if self._id == ego else self._id
         return peer == ego or path.pick(_space_of(peer), (True, False))
 
-    def _cannot(self, *_: object) -> NoReturn:
+    def __ne__(self, other: object) -> bool:
+        return not self.__eq__(other)
+
+    def _cannot(self, *_: object, **__: object) -> NoReturn:
         self._system.path.refuse("reads the name of a feature_space")
 
-    __bool__ = __iter__ = __len__ = __contains__ = __getitem__ = __hash__ = __lt__ = __str__ = __format__ = (
-        __getattr__
-    ) = _cannot
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return str
+
+
+_OPERATORS = (
+    "getitem setitem delitem iter reversed len bool eq ne lt le gt ge add radd sub rsub mul rmul mod rmod truediv "
+    "rtruediv floordiv pow neg abs float int index round hash str repr format contains and or xor reduce reduce_ex copy "
+    "deepcopy sizeof dir bytes getattr"
+).split()  # fmt: skip
+for _kind, _refusal in ((Unsearchable, Unsearchable._reached), (_TargetIds, _TargetIds._cannot), (_Space, _Space._cannot)):
+    for _operator in _OPERATORS:
+        if f"__{_operator}__" not in vars(_kind):
+            setattr(_kind, f"__{_operator}__", _refusal)
+    if "__hash__" in vars(_kind) and vars(_kind)["__hash__"] is None:
+        setattr(_kind, "__hash__", _refusal)
+Sequence.register(_TargetIds)  # a pattern of a sequence meets its length
 
 
 def _space_of(peer: int) -> str:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation, check_directives
 from sortie.policies.verification.invariants import (
     Binary,
     Invariant,
@@ -53,16 +53,32 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
         InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change; or
             `every_link`, which means the same as its requirement alone.
     """
-    rules = check_shieldable(invariants)
-    asks_fresh = any(rule.needs_fresh for rule in rules)
+    return Shielded(policy, check_shieldable(invariants))
 
-    def shielded(view: FleetView, /) -> list[Directive]:
-        decided = list(policy(view))
-        fresh = list(policy(just_heard(view))) if asks_fresh else []
-        return enforce(rules, view, decided, fresh)
 
-    shielded.__doc__ = f"{getattr(policy, '__name__', 'a policy')}, shielded."
-    return shielded
+class Shielded:
+    """A shielded policy."""
+
+    def __init__(self, policy: Policy, rules: tuple[Invariant, ...]) -> None:
+        self.policy, self.rules = policy, rules
+        self._asks_fresh = any(rule.needs_fresh for rule in rules)
+        self.__name__ = f"{getattr(policy, '__name__', 'a policy')}, shielded"
+
+    def __call__(self, view: FleetView, /) -> list[Directive]:
+        """The policy's directives, those that break an invariant replaced.
+
+        Raises:
+            PolicyError: the policy returned something else than valid directives.
+        """
+        view = view.frozen  # nothing that the policy does to its view may reach the rules
+        decided = self._checked(view)
+        fresh = self._checked(just_heard(view)) if self._asks_fresh else ()
+        return enforce(self.rules, view, decided, fresh)
+
+    def _checked(self, view: FleetView) -> tuple[Directive, ...]:
+        answer = self.policy(view)
+        check_directives(answer, view)
+        return tuple(answer)
 
 
 def check_shieldable(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:

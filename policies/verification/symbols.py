@@ -6,8 +6,8 @@ own comparisons thus give its decision boundaries. Every run represents a cell o
 same. The search is complete when no side is left.
 
 A range cannot answer everything exactly: a comparison of two axes, a square root, a conversion to int, a use of its text
-raise `Refused`. Arithmetic with constants is stored as steps. Rounding is monotone, so a bisection over the floats finds
-the last float below a boundary.
+raise `Refused`. Arithmetic with constants is stored as steps. Every step is monotone, rounding included, and stays
+finite. So a bisection over the floats finds the last float below a boundary.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 import numbers
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import IntEnum
 from typing import Any, NoReturn, TypeVar
 
 T = TypeVar("T")
@@ -25,6 +26,14 @@ class Refused(BaseException):
     """The search cannot follow the policy; the message says why. An ordinary `except` in the policy does not catch it."""
 
 
+class Combined(Refused):
+    """Two inputs are compared or combined, which an interval of one input cannot follow; the solver may (`solver`)."""
+
+    def __init__(self, path: Path, one: str, other: str) -> None:
+        path.refusal, path.combines = f"combines {one} and {other}", (one, other)
+        super().__init__(path.refusal)
+
+
 class Path:
     """One run: the side that it took at every fork, and the remaining range of each axis."""
 
@@ -32,6 +41,10 @@ class Path:
         self.ranges: dict[str, tuple[float, float]] = {}
         self.picks: dict[str, Any] = {}
         self.refusal: str | None = None
+        self.exact = True
+        """Whether every number was followed as the floats that it can be, not over the reals."""
+        self.combines: tuple[str, str] | None = None
+        """The two inputs that the run combines, if that is why it ended."""
         self.taken: list[tuple[int, int]] = []
         self._script = script
 
@@ -56,30 +69,84 @@ class Path:
         self.ranges.setdefault(axis, (low, high))
         return Ranged(self, axis)
 
+    def bounds(self, axis: str, usual: float) -> tuple[float, float]:
+        """The range that is left of an axis; `usual` alone where the run never read it."""
+        return self.ranges.get(axis, (usual, usual))
+
+    def corner(self, system: Any, choose: Callable[[str, float, float], float]) -> Any:
+        """A plain view of the cell, each number chosen between its bounds; None if there is none."""
+        return system.example(choose)
+
+    def raised(self, axis: str, name: str, high: float) -> Any:
+        """A second number of an axis that is not below the first.
+
+        Within a cell the policy decides the same, so the lowest value stands for the cell, and every value above it is a
+        raise of it.
+        """
+        return self.number(name, self.ranges[axis][0], high)
+
+    def within(self, act: Callable[[], T]) -> Iterator[T]:
+        """Every result of a function whose comparisons divide this run's cell further; afterwards the run is as before."""
+        before = self._save()
+        script: list[int] = []
+        try:
+            while True:
+                self._restore(before)
+                self.taken, self._script = [], script
+                yield act()
+                if self.refusal is not None:
+                    return
+                script = _next_script(self.taken)
+                if not script:
+                    return
+        finally:
+            self._restore(before)
+
+    def _save(self) -> tuple[Any, ...]:
+        return dict(self.ranges), dict(self.picks), self.taken, self._script
+
+    def _restore(self, saved: tuple[Any, ...]) -> None:
+        ranges, picks, self.taken, self._script = saved
+        self.ranges, self.picks = dict(ranges), dict(picks)
+
     def refuse(self, why: str) -> NoReturn:
         """End the run, because the policy cannot be searched."""
         self.refusal = why
         raise Refused(why)
 
 
-def explore(run: Callable[[Path], T]) -> Iterator[tuple[Path, T]]:
-    """Every run of a deterministic function of one path, depth first, each with its result."""
+def explore(run: Callable[[Path], T], make: Callable[[Sequence[int]], Path] | None = None) -> Iterator[tuple[Path, T]]:
+    """Every run of a deterministic function of one path, depth first, each with its result.
+
+    Args:
+        run: the function.
+        make: makes a path from the sides that it is to take; left out, a `Path`.
+    """
     script: list[int] = []
     while True:
-        path = Path(script)
+        path = (make or Path)(script)
         result = run(path)
         if path.refusal is not None:  # a bare `except` may have caught it
+            if path.combines is not None:
+                raise Combined(path, *path.combines)
             raise Refused(path.refusal)
         if len(path.taken) < len(script):
             raise Refused("decides differently on the same view")
         yield path, result
-        left = path.taken
-        while left and left[-1][0] + 1 == left[-1][1]:
-            left.pop()
-        if not left:
+        script = _next_script(path.taken)
+        if not script:
             return
-        script = [choice for choice, _ in left]
+
+
+def _next_script(taken: Sequence[tuple[int, int]]) -> list[int]:
+    """The sides of the next run, depth first; empty where none is left."""
+    left = list(taken)
+    while left and left[-1][0] + 1 == left[-1][1]:
+        left.pop()
+    script = [choice for choice, _ in left]
+    if script:
         script[-1] += 1
+    return script
 
 
 class Ranged:
@@ -109,9 +176,9 @@ class Ranged:
         if at_low == at_high:
             return at_low
         whole = isinstance(low, int) and isinstance(high, int)
-        a, b = _ordinal(low), _ordinal(high)
-        if not self._steps and not whole:  # the boundary is the constant itself
-            a = _ordinal(c if or_at else math.nextafter(c, -math.inf))
+        a, b = (low, high) if whole else (_ordinal(low), _ordinal(high))
+        if not self._steps and not whole and -_EXACT <= c <= _EXACT:  # the boundary is the constant itself
+            a = _ordinal(float(c) if or_at else math.nextafter(c, -math.inf))
             b = a + 1
         while b - a > 1:
             middle = (a + b) // 2
@@ -128,15 +195,18 @@ class Ranged:
 
     def _constant(self, other: object) -> float | None:
         """The other operand as a plain number; None if it is not a number."""
+        kind = type(other)
+        if kind is float or kind is int or kind is bool:
+            return other  # type: ignore[return-value]
         if isinstance(other, Ranged):
             low, high = other._path.ranges[other._axis]
             if low == high:
                 return other._at(low)
-            self._path.refuse(f"compares or combines two inputs, {self._axis} and {other._axis}")
-        if isinstance(other, int | float):
-            return other
-        if isinstance(other, numbers.Number):  # a Decimal or numpy's 32 bits would be rounded in another way
-            self._path.refuse(f"compares or combines {self._axis} with a {type(other).__name__}")
+            raise Combined(self._path, self._axis, other._axis)
+        if isinstance(other, IntEnum):
+            return int(other)
+        if issubclass(kind, int | float) or isinstance(other, numbers.Number):  # rounded, or compared, in another way
+            self._path.refuse(f"compares or combines {self._axis} with a {kind.__name__}")
         return None
 
     def _same(self, other: object) -> bool:
@@ -185,11 +255,18 @@ class Ranged:
         c = self._constant(other)
         if c is None:
             return NotImplemented
-        if not math.isfinite(c):
-            self._path.refuse(f"computes with {c} and {self._axis}")
-        if step == "times" and c == 0:
-            return 0.0
-        return Ranged(self._path, self._axis, (*self._steps, (step, c)))
+        return self._then(step, c)
+
+    def _then(self, step: str, c: float = 0.0) -> Ranged:
+        """The number after one more step, which must be monotone and stay finite."""
+        found = Ranged(self._path, self._axis, (*self._steps, (step, c)))
+        try:
+            sound = all(math.isfinite(found._at(x)) for x in self._path.ranges[self._axis])
+        except (ArithmeticError, ValueError):
+            sound = False
+        if not sound:
+            self._path.refuse(f"computes with {self._axis} beyond what a float can hold")
+        return found
 
     def __add__(self, other: object) -> Any:
         return self._step("plus", other)
@@ -209,8 +286,13 @@ class Ranged:
 
     def __truediv__(self, other: object) -> Any:
         if other == 0:
-            raise ZeroDivisionError("division by zero")
+            return 1.0 / 0  # the error of a plain number
         return self._step("over", other)
+
+    def __floordiv__(self, other: object) -> Any:
+        if other == 0:
+            return 1.0 // 0
+        return self._step("whole times", other)
 
     def __neg__(self) -> Any:
         return self._step("times", -1.0)
@@ -226,10 +308,20 @@ class Ranged:
     def _cannot(self, *_: object) -> NoReturn:
         self._path.refuse(f"uses {self._axis} for more than arithmetic with constants and comparisons")
 
-    __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = _cannot
-    __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = _cannot
+    __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = __complex__ = _cannot
+    __pow__ = __rpow__ = __mod__ = __rmod__ = __rfloordiv__ = __rtruediv__ = __divmod__ = __rdivmod__ = _cannot
+    __and__ = __rand__ = __or__ = __ror__ = __xor__ = __rxor__ = __lshift__ = __rlshift__ = __rshift__ = _cannot
+    __rrshift__ = __invert__ = __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = __sizeof__ = __dir__ = _cannot
+    __array_ufunc__ = __array_function__ = _cannot  # numpy would raise TypeError, which the policy may catch
     __hash__ = _cannot
-    __array_ufunc__ = None  # so that numpy's scalars leave the operation to this class
+
+    def _rounded(self, how: str) -> Ranged:
+        """The number after `int`, `math.floor`, `math.ceil`, `round` or `math.sqrt`: monotone functions of one argument."""
+        return self._then(how)
+
+    def _value_in(self, values: Mapping[str, float]) -> float:
+        """The number's value where `values` gives the value of its axis."""
+        return self._at(values[self._axis])
 
     def __getattr__(self, name: str) -> NoReturn:
         self._cannot()
@@ -303,6 +395,8 @@ for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} -
     setattr(Text, _method, Text._refused)
 
 _MARK = "\ue000"
+_EXACT = 2.0**53
+"""Up to here every whole number is a float."""
 
 _STEPS: dict[str, Callable[[float, float], float]] = {
     "plus": lambda x, c: x + c,
@@ -310,13 +404,18 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "from": lambda x, c: c - x,
     "times": lambda x, c: x * c,
     "over": lambda x, c: x / c,
+    "whole times": lambda x, c: x // c,
+    "int": lambda x, _: int(x),
+    "floor": lambda x, _: math.floor(x),
+    "ceil": lambda x, _: math.ceil(x),
+    "round": lambda x, _: round(x),
+    "sqrt": lambda x, _: math.sqrt(x),
 }
+ROUNDINGS = ("int", "floor", "ceil", "round", "sqrt")
 
 
 def _ordinal(x: float) -> int:
-    """The position of a float in the order of all floats; an int is its own position."""
-    if isinstance(x, int):
-        return x
+    """The position of a float in the order of all floats."""
     bits: int = struct.unpack("<q", struct.pack("<d", x))[0]
     return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF)
 

@@ -22,9 +22,12 @@ from sortie.policies.contract import (
 )
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
+from sortie.scenarios.schema import Fleet
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
+LARGEST: int = next(bound.le for bound in Fleet.model_fields["drones"].metadata if hasattr(bound, "le"))
+"""The largest fleet that a scenario may have."""
 GONE = "detached_after_periods"
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
@@ -40,13 +43,19 @@ class ViewError(SortieError):
 # --- drawing -------------------------------------------------------------------------------------
 
 
-def draw_view(seed: int, number: int) -> FleetView:
+def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
     """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
 
     Half of all numbers are drawn uniformly. The other half are values at which rules often change their decision.
+
+    Args:
+        seed: of all its views.
+        number: which one.
+        drones: the size of the fleet; left out, it is drawn.
     """
     rng = stream(seed, number, (), "verify.view")
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
+    n = n if drones is None else drones
     ego = int(rng.integers(n))
     reach = float(rng.choice([1.0, 0.7]))
     heard = [i for i in range(n) if i == ego or rng.random() < reach]

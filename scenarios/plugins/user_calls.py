@@ -18,10 +18,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 DECISION_S = 10.0
 """The longest time for a decision where no scenario says otherwise."""
@@ -48,20 +48,32 @@ class _Interrupt(BaseException):
     """Sent into a call that is late. An ordinary `except` in the user's code does not catch it."""
 
 
+class Source(NamedTuple):
+    """Where a user's function comes from."""
+
+    file: Path
+    name: str
+    names: Mapping[str, object]
+    """All names of the file that it was loaded from."""
+
+
 class Guarded:
     """A user's function. It raises ProgramExitError in place of SystemExit, and TookTooLongError where it is late."""
 
     __wrapped__: Callable[..., Any]
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], source: Source | None = None) -> None:
         functools.update_wrapper(self, function)
+        self.source = source
+        self._origin = None if source is None else (source.file, source.name)
         self._late = ""  # what it exceeded: it is not called again
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The function's answer."""
-        if self._late:
-            raise TookTooLongError(self._late)
         watch = _WATCHES.get(threading.get_ident())
+        late = self._late or (watch.late.get(self._origin, "") if watch is not None and self._origin else "")
+        if late:
+            raise TookTooLongError(late)
         try:
             if watch is None or watch.calling:
                 return self.__wrapped__(*args, **kwargs)
@@ -74,6 +86,8 @@ class Guarded:
             raise ProgramExitError(f"exit code {stop.code}, must return").with_traceback(stop.__traceback__) from None
         except _Interrupt as late:
             self._late = "no answer" if watch is None else f"no answer within {watch.limit}"
+            if watch is not None and self._origin is not None:
+                watch.late[self._origin] = self._late
             raise TookTooLongError(self._late).with_traceback(late.__traceback__) from None
 
 
@@ -102,6 +116,8 @@ def watched(limit_s: float, limit: str = "") -> Iterator[None]:
     thread = threading.get_ident()
     outer = _WATCHES.get(thread)
     _WATCHES[thread] = watch = _Watch(thread, limit_s, limit or f"{limit_s:g} s")
+    if outer is not None:
+        watch.late = outer.late
     here = Path.cwd() if threading.current_thread() is threading.main_thread() else None
     watch.start()
     try:
@@ -131,6 +147,8 @@ class _Watch:
     def __init__(self, thread: int, limit_s: float, limit: str) -> None:
         self.calling = False
         self.limit = limit
+        self.late: dict[tuple[Path, str], str] = {}
+        """What functions from files exceeded: they are not called again, however often they are loaded."""
         self._limit_s, self._thread = limit_s, thread
         self._longest_s = limit_s + GRACE_S
         self._error = f"a call of the policy does not return within {limit}, and cannot be interrupted"

@@ -19,7 +19,7 @@ import importlib.util
 import sys
 import sysconfig
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
 from pathlib import Path
@@ -33,13 +33,22 @@ _INSTALLED = {"site-packages", "dist-packages"}
 _LOADING = threading.RLock()
 
 
-def load(path: Path) -> ModuleType:
+Compile = Callable[[bytes, str], CodeType]
+"""From a source and its path to the code that runs."""
+
+
+def load(path: Path, compiled: Compile | None = None, own_builtins: Callable[[Any], dict[str, Any]] | None = None) -> ModuleType:
     """Run a file as a new module, with new modules for all that it imports from its folder.
+
+    Args:
+        path: the file.
+        compiled: compiles its source and those of the modules beside it; left out, as Python does.
+        own_builtins: makes their builtins from the function that finds their imports; left out, Python's.
 
     Raises:
         Exception: what the file, or a module that it imports, raises.
     """
-    return _Folder(path.resolve()).load()
+    return _Folder(path.resolve(), compiled, own_builtins).load()
 
 
 def is_users(name: object) -> bool:
@@ -69,15 +78,21 @@ def imported_files(path: Path) -> tuple[Path, ...]:
 class _Folder(MetaPathFinder):
     """The modules of one run of a file, found in the file's folder."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(
+        self,
+        path: Path,
+        compiled: Compile | None = None,
+        own_builtins: Callable[[Any], dict[str, Any]] | None = None,
+    ) -> None:
+        self._path, self._compiled = path, compiled
         self._package = PREFIX + hashlib.sha256(str(path).encode()).hexdigest()[:16]
         self._main = f"{self._package}.{path.stem.replace('.', '_')}"
         package = ModuleType(self._package)
         package.__path__ = [str(path.parent)]
         self._modules = {self._package: package}
         self._beside: dict[str, bool] = {}
-        self._builtins = vars(builtins) | {"__import__": self._import}
+        make = own_builtins or (lambda find: vars(builtins) | {"__import__": find})
+        self._builtins = make(self._import)
 
     def load(self) -> ModuleType:
         self._registered(self._main)
@@ -94,7 +109,7 @@ class _Folder(MetaPathFinder):
             spec = ModuleSpec(name, None, is_package=True)
             spec.submodule_search_locations = [str(where)]
             return spec
-        loader = _Loader(name, where, self._builtins) if where.suffix == ".py" else None
+        loader = _Loader(name, where, self._builtins, self._compiled) if where.suffix == ".py" else None
         return importlib.util.spec_from_file_location(name, where, loader=loader)
 
     def _import(
@@ -145,13 +160,15 @@ class _Folder(MetaPathFinder):
 class _Loader(SourceFileLoader):
     """Runs a source as it is now: it neither reads nor writes compiled files."""
 
-    def __init__(self, name: str, path: Path, users_builtins: dict[str, Any]) -> None:
+    def __init__(
+        self, name: str, path: Path, users_builtins: dict[str, Any], compiled: Compile | None = None
+    ) -> None:
         super().__init__(name, str(path))
-        self._builtins = users_builtins
+        self._builtins, self._compiled = users_builtins, compiled
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
-        code: CodeType = self.source_to_code(self.get_data(path), path)
+        code: CodeType = (self._compiled or self.source_to_code)(self.get_data(path), path)
         return code
 
     def exec_module(self, module: ModuleType) -> None:

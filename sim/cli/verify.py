@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -20,8 +19,9 @@ from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import PLANE, ProofVerdict, prove
+from sortie.policies.verification.proof import BUDGET_S, DRONES, PLANE, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.plugins.user_calls import DECISION_S, watched
 from sortie.scenarios.reading.load import dump, loads
@@ -33,9 +33,10 @@ from sortie.sim.folders import RunError, write_text
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
 from sortie.sim.studies.plane_cost import machine
 
-COLOURS = {"holds": "green", "proved": "green", "fails": "red", "refuted": "red", "not proved": "yellow"}
-OWN_INVARIANTS = "INVARIANTS"
-"""The name under which a policy's file keeps its own invariants, as text."""
+COLOURS = {
+    "holds": "green", "fails": "red", "proved": "green", "proved over the reals": "green", "refuted": "red",
+    "searched": "yellow", "drawn": "yellow",
+}  # fmt: skip
 
 
 def verify(
@@ -46,13 +47,17 @@ def verify(
             help="A file of invariants, one per line; default: those in the policy's file, or those that a registered policy promises."
         ),
     ] = None,
-    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=5)] = 3,
+    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=8)] = DRONES,
+    budget: Annotated[
+        float, typer.Option(help="Time for the search of all properties together, s; what it covered is printed.", min=0)
+    ] = BUDGET_S,
     views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for counterexamples.")] = Path("runs/verify"),
 ) -> None:
     """Try a policy on random views, prove its properties, and save a counterexample of each that fails.
 
-    Exit code 1 if a rule fails or a property is refuted. A counterexample is a view as JSON, and a scenario that
+    Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*,
+    or *drawn* views alone. Exit code 1 if a rule fails or a property is refuted. A counterexample is a view as JSON, and a scenario that
     shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
     """
     section = _section(policy)
@@ -60,7 +65,7 @@ def verify(
     rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
     with watched(DECISION_S):
-        broken = _try(policy, section, decide, rules, drones, views, out_dir)
+        broken = _try(policy, section, decide, rules, drones, budget, views, out_dir)
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
         raise typer.Exit(1)
@@ -103,7 +108,14 @@ def overhead(
 
 
 def _try(
-    policy: str, section: PolicySection, decide: Policy, rules: Sequence[Invariant], drones: int, views: int, kept: Path
+    policy: str,
+    section: PolicySection,
+    decide: Policy,
+    rules: Sequence[Invariant],
+    drones: int,
+    budget: float,
+    views: int,
+    kept: Path,
 ) -> int:
     """Print and keep what the kit and the proofs say; how many rules and properties are broken."""
     table = Table("rule", "verdict", "what", title=f"{escape(policy)}: the conformance kit, {views} drawn views")
@@ -112,11 +124,13 @@ def _try(
         table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
     out.print(table)
     table = Table("property", "verdict", "what", title=f"{escape(policy)}: proofs")
-    verdicts = prove(decide, rules, max_drones=drones)
+    verdicts = prove(decide, rules, max_drones=drones, budget_s=budget)
     for verdict in verdicts:
         table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
     out.print(table)
-    if rules:
+    if not rules:
+        out.print("No invariants: the plane's rules alone were checked. --invariants FILE names some.", soft_wrap=True)
+    else:
         out.print(
             "This judges what the policy decides. Staleness rules and damping come after it; a flight with the same lines in "
             "`policy.invariants` judges what the gates enforce.",
@@ -141,12 +155,12 @@ def _section(policy: str) -> PolicySection:
 
 def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant, ...]:
     """From the file named, or the policy's own file, or what a registered policy promises."""
-    inner: Any = decide.func if isinstance(decide, functools.partial) else decide
-    own = getattr(inspect.unwrap(inner), "__globals__", {}).get(OWN_INVARIANTS) if ":" in name else PROMISES.get(name)
+    own = own_invariants(decide) if ":" in name else PROMISES.get(name)
     source = f"{name}: {OWN_INVARIANTS}" if file is None else str(file)
+    if file is None and not isinstance(own, str | None):
+        raise RunError(f"{source} is of type {type(own).__name__}, must be text")
     try:
-        text = (own or "") if file is None else file.read_text("utf-8")
-        return parse(str(text))
+        return parse((own or "") if file is None else file.read_text("utf-8"))
     except OSError as error:
         raise RunError(f"{file}: {error.strerror}") from error
     except InvariantError as error:

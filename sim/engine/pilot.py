@@ -148,7 +148,7 @@ def ask(policy: NamedPolicy, view: FleetView) -> Sequence[Directive]:
     if type(answer) is not list and (isinstance(answer, Directive) or not isinstance(answer, Sequence)):
         what = f"returns {type(answer).__name__}, must be a sequence of directives"
         raise PolicyError(f"policy {policy.name!r} on drone {view.ego} {what}")
-    return answer
+    return tuple(answer) if type(answer) is list else answer  # a policy that keeps its list cannot change it later
 
 
 def ask_viewpoint(policy: NamedPolicy, viewpoint: Viewpoint, view: FleetView) -> Reposition | None:

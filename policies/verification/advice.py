@@ -1,0 +1,24 @@
+"""Why a policy cannot be proved, in words that help: what combines what, and how to make it provable."""
+
+from __future__ import annotations
+
+_ADVICE = (
+    ("combines", "compare each input with constants, or install the extra `verify` (z3)"),
+    ("compares or combines", "use plain numbers of Python in thresholds"),
+    ("without peers_by_overlap", "rank the peers with peers_by_overlap"),
+    ("uses the text of", "put numbers into the reason alone"),
+    ("is not a policy of Sortie", "verify it as file.py:function"),
+    ("remembers", "decide from the view alone; damping keeps what was decided before"),
+    ("identity", "compare values with =="),
+    ("keeps results", "leave the cache away"),
+    ("for more than arithmetic", "use comparisons, + - * / with constants, min, max, int, floor, ceil or sqrt"),
+    ("not in its view", "decide from the view alone"),
+    ("calls ", "use Python's own functions on the numbers of the view"),
+    ("cannot be searched", "decide by the fields that a proof covers"),
+)  # fmt: skip
+
+
+def advise(why: str) -> str:
+    """What a search met, and what would make the policy provable."""
+    hint = next((f". To make it provable: {text}" for part, text in _ADVICE if part in why), "")
+    return f"Cannot analyse: it {why}{hint}"

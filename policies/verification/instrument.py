@@ -1,0 +1,492 @@
+"""A user's policy loaded so that the search sees everything that could tell its stand-ins from real objects.
+
+The source is compiled with a check at each place where plain Python would answer for a stand-in without asking it: calls,
+`is`, text with numbers in it, private attributes, assignments to attributes. The checks let pure code through. Clocks,
+dice, files, identity and hashes raise `Reached`. What a search cannot follow raises `Refused`. Both are also recorded, so
+that no `except` in the policy hides them. What the policy keeps from one decision to the next is compared after every one.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import math
+import sys
+import types
+from collections.abc import Callable, Sequence
+from enum import Enum
+from pathlib import Path as File
+from typing import Any, NoReturn
+
+from sortie.policies.user_code import is_users, load
+from sortie.policies.verification.confine import Reached
+from sortie.policies.verification.kept import Kept, kept_by
+from sortie.policies.verification.pure import IMPURE, PURE_MODULES, cannot_call, is_seeded, is_trusted, takes_ranges
+from sortie.policies.verification.ranges import FOR_USER
+from sortie.policies.verification.symbols import Ranged, Refused, Text
+
+STAND_INS = ("sortie.policies.verification.symbols", "sortie.policies.verification.ranges", "sortie.policies.verification.solver")
+
+
+class Watch:
+    """What one decision of an instrumented policy did that it may not do, or that cannot be searched."""
+
+    def __init__(self) -> None:
+        self.stopped: Reached | Refused | None = None
+
+    def stop(self, why: Reached | Refused) -> NoReturn:
+        self.stopped = self.stopped or why
+        raise why
+
+
+_WATCH = Watch()
+"""Of the decision that runs now; a process verifies one policy at a time."""
+
+
+class Remembers(Reached):
+    """A policy that changes something that lasts until its next decision."""
+
+    def __init__(self, what: str) -> None:
+        BaseException.__init__(self, f"remembers: {what}, which lasts until the next decision")
+
+
+class Instrumented:
+    """An instrumented policy: as the plain one, but what it may not do raises, and so does what it keeps."""
+
+    def __init__(self, function: Callable[..., Any], module: types.ModuleType) -> None:
+        self.function, self.module = function, module
+        self._kept: Kept | None = None
+
+    def __call__(self, view: Any, /) -> Any:
+        """The policy's answer.
+
+        Raises:
+            Reached: it used something that is not in its view, or it remembers something.
+            Refused: it did something that cannot be followed.
+        """
+        if self._kept is None:
+            self._kept = kept_by(self.function, self.module)
+        _WATCH.stopped = None
+        try:
+            return self.function(view)
+        finally:
+            if _WATCH.stopped is not None:
+                raise _WATCH.stopped
+            changed = self._kept.changed()
+            if changed:
+                raise Remembers(changed)
+
+
+def instrumented(path: File, attribute: str) -> Instrumented:
+    """Load a user's file anew, with the checks.
+
+    Raises:
+        Reached: loading it used a clock, a file or the like.
+        Refused: it has something that cannot be checked.
+        Exception: what the file raises.
+    """
+    _WATCH.stopped = None
+    try:
+        module = load(path, _compiled, _builtins)
+    except SyntaxError as error:
+        raise Refused(str(error)) from None
+    finally:
+        if _WATCH.stopped is not None:
+            raise _WATCH.stopped
+    return Instrumented(getattr(module, attribute), module)
+
+
+# --- the source ----------------------------------------------------------------------------------
+
+
+def _compiled(source: bytes, path: str) -> types.CodeType:
+    tree = _Checks().visit(ast.parse(source, path))
+    code: types.CodeType = compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True)
+    return code
+
+
+class _Checks(ast.NodeTransformer):
+    """Puts the checks into a source."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        if isinstance(node.func, ast.Name) and node.func.id == "super":
+            return node
+        return ast.copy_location(ast.Call(_name("__called__"), [node.func, *node.args], node.keywords), node)
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        if not any(isinstance(op, ast.Is | ast.IsNot) for op in node.ops):
+            return node
+        if len(node.ops) > 1:
+            raise SyntaxError("has `is` in a chain of comparisons")
+        same: ast.expr = ast.Call(_name("__same__"), [node.left, node.comparators[0]], [])
+        return ast.copy_location(
+            ast.UnaryOp(ast.Not(), same) if isinstance(node.ops[0], ast.IsNot) else same, node
+        )
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        return ast.copy_location(ast.Call(_name("__text__"), [self._part(v) for v in node.values], []), node)
+
+    def _part(self, value: ast.expr) -> ast.expr:
+        if not isinstance(value, ast.FormattedValue):
+            return value
+        spec = value.format_spec or ast.Constant("")
+        return ast.Call(_name("__written__"), [value.value, ast.Constant(value.conversion), spec], [])
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        if not isinstance(node.op, ast.Mod):
+            return node
+        return ast.copy_location(ast.Call(_name("__percent__"), [node.left, node.right], []), node)
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        if isinstance(node.op, ast.Mod):
+            raise SyntaxError("has `%=`")
+        return node
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        if not isinstance(node.ctx, ast.Load):
+            node.value = ast.Call(_name("__own__"), [node.value, ast.Constant(node.attr)], [])
+            return node
+        return ast.copy_location(
+            ast.Call(_name("__attribute__"), [node.value, ast.Constant(node.attr)], []), node
+        )
+
+    def _decorated(self, node: Any) -> Any:
+        returns, node.returns = getattr(node, "returns", None), None
+        self.generic_visit(node)
+        node.returns = returns
+        node.decorator_list = [ast.Call(_name("__decorator__"), [d], []) for d in node.decorator_list]
+        return node
+
+    visit_FunctionDef = visit_ClassDef = visit_AsyncFunctionDef = _decorated  # noqa: N815
+
+    def visit_For(self, node: ast.For) -> ast.AST:  # noqa: N802
+        self.generic_visit(node)
+        node.iter = ast.Call(_name("__each__"), [node.iter], [])
+        return node
+
+    def visit_comprehension(self, node: ast.comprehension) -> ast.AST:
+        self.generic_visit(node)
+        node.iter = ast.Call(_name("__each__"), [node.iter], [])
+        return node
+
+    def visit_MatchValue(self, node: ast.MatchValue) -> ast.AST:  # noqa: N802
+        return node  # a pattern has names alone
+
+    def visit_MatchClass(self, node: ast.MatchClass) -> ast.AST:  # noqa: N802
+        for pattern in (*node.patterns, *node.kwd_patterns):
+            self.visit(pattern)
+        return node
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:  # noqa: N802
+        node.target = self.visit(node.target)
+        node.value = None if node.value is None else self.visit(node.value)
+        return node
+
+    def visit_arg(self, node: ast.arg) -> ast.AST:
+        return node
+
+    def visit_Global(self, node: ast.Global) -> ast.AST:  # noqa: N802
+        raise SyntaxError(f"changes the global {node.names[0]}")
+
+    def visit_AsyncFor(self, node: ast.AsyncFor) -> ast.AST:  # noqa: N802
+        raise SyntaxError("has asynchronous code")
+
+
+def _name(text: str) -> ast.Name:
+    return ast.Name(text, ast.Load())
+
+
+# --- the checks ----------------------------------------------------------------------------------
+
+
+def _stop(why: str) -> NoReturn:
+    _WATCH.stop(Refused(why))
+
+
+def _reach(what: str) -> NoReturn:
+    _WATCH.stop(Reached(what))
+
+
+def _is_stand_in(value: object) -> bool:
+    return type(value).__module__ in STAND_INS
+
+
+def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
+    """A call of the policy's code."""
+    if isinstance(function, Outside):
+        function._used()
+    why = cannot_call(function)
+    if why is not None:
+        _reach(why[1:]) if why.startswith("!") else _stop(why)
+    if type(function) is types.FunctionType and is_users(function.__module__):
+        return function(*args, **kwargs)
+    return on_behalf_of_the_policy(function, args, kwargs)
+
+
+def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Call something that is not the policy's own code, with arguments that it treats as it would treat real ones."""
+    for value in (*args, *kwargs.values()):
+        if isinstance(value, Outside):
+            value._used()
+        if callable(value) and function not in (isinstance, issubclass) and (why := cannot_call(value)) is not None:
+            _reach(why[1:]) if why.startswith("!") else _stop(why)
+        if type(value) in (set, frozenset) and function not in _BLIND_TO_SETS:
+            _each(value)
+    if not takes_ranges(function) and any(map(_has_text, (*args, *kwargs.values()))):
+        _stop(f"gives a range to {getattr(function, '__qualname__', function)}")
+    if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
+        _stop(why)
+    first = args[0] if args else None
+    special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
+    if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
+        return found
+    owner = getattr(function, "__self__", None)
+    if type(owner) is str:
+        if any(map(_has_text, (*args, *kwargs.values()))):
+            return _stands_for_text(owner, first, args, kwargs)
+    elif type(owner) in (set, frozenset) and function.__name__ in ("pop", "__iter__"):
+        _each(owner)
+    return function(*args, **kwargs)
+
+
+assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
+
+
+def _cannot_ask(kinds: Any) -> str | None:
+    """Why a search cannot ask whether something is an instance of these."""
+    if isinstance(kinds, tuple):
+        return next((why for kind in kinds if (why := _cannot_ask(kind))), None)
+    if isinstance(kinds, types.UnionType) or getattr(kinds, "__module__", "") in ("numbers", "collections.abc"):
+        return None
+    return cannot_call(kinds)
+
+
+def _has_text(value: Any) -> bool:
+    if type(value) in (list, tuple):
+        return any(map(_has_text, value))
+    return _is_stand_in(value) or isinstance(value, types.GeneratorType | map | filter)
+
+
+def _stands_for_text(owner: str, first: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """A method of a plain text that is given the text of a range, or a range."""
+    parts = list(first) if len(args) == 1 and not isinstance(first, str) and not _is_stand_in(first) else [*args, *kwargs.values()]
+    found = next((part for part in parts if _is_stand_in(part)), None)
+    if found is None:
+        return owner.join(parts) if parts is not args else _stop("makes text of a sequence")
+    if isinstance(found, Text | Ranged):
+        return Text(found._path, found._axis, "text with a number")
+    return _stop("makes text of what is known as a range alone")
+
+
+def _same(a: Any, b: Any) -> bool:
+    for one in (a, b):
+        if one is None or one is NotImplemented or one is Ellipsis or isinstance(one, bool | Enum | type):
+            return a is b
+    if _is_stand_in(a) or _is_stand_in(b) or isinstance(a, _VALUES) or isinstance(b, _VALUES):
+        _reach("the identity of a value (`is`)")
+    return a is b
+
+
+_VALUES = (int, float, str, bytes, tuple, frozenset)
+
+
+def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
+    def act(*args: Any) -> Any:
+        if len(args) != 1 or _is_stand_in(args[0]):
+            return NotImplemented
+        return _without_address(write(args[0]))
+
+    return act
+
+
+def _without_address(text: str) -> str:
+    if " at 0x" in text:
+        _reach(f"the address in {text!r}")
+    return text
+
+
+def _written(value: Any, conversion: int, spec: str) -> Any:
+    if conversion != -1:
+        value = {115: str, 114: repr, 97: ascii}[conversion](value)
+    if isinstance(value, Outside):
+        value._used()
+    return format(value, spec) if _is_stand_in(value) else _without_address(format(value, spec))
+
+
+def _text(*parts: Any) -> Any:
+    tainted = next((p for p in parts if isinstance(p, Text)), None)
+    return "".join(parts) if tainted is None else Text(tainted._path, tainted._axis, "".join(str.__str__(p) for p in parts))
+
+
+def _percent(left: Any, right: Any) -> Any:
+    if type(left) in (str, bytes) and any(map(_has_text, right if type(right) is tuple else (right,))):
+        found = next((p for p in (right if type(right) is tuple else (right,)) if isinstance(p, Text | Ranged)), None)
+        return _stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
+    return left % right
+
+
+def _own(owner: Any, name: str) -> Any:
+    """What an attribute may be assigned to: an object of the policy's own classes."""
+    if isinstance(owner, type) or not is_users(type(owner).__module__):
+        if _is_stand_in(owner) or isinstance(owner, tuple):
+            return owner  # raises what the real object raises
+        _stop(f"assigns to {name} of a {type(owner).__name__}")
+    return owner
+
+
+_PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__name__", "__doc__", "__class__", "__init__", "__post_init__"}
+
+
+def _attribute(owner: Any, name: str) -> Any:
+    if isinstance(owner, Outside):
+        return Outside(f"{owner._path}.{name}")
+    if name[0] == "_" and name not in _PLAIN_PRIVATE and not (_is_users_own(owner) and name[:2] != "__"):
+        _stop(f"reads {name}")
+    if name == "__class__" and _is_stand_in(owner):
+        return owner.__class__
+    if isinstance(owner, types.ModuleType) and not is_users(owner.__name__):
+        found = getattr(owner, name)
+        if isinstance(found, types.ModuleType) and found.__name__.partition(".")[0] not in PURE_MODULES and not is_trusted(found.__name__):
+            return Outside(found.__name__)
+        if f"{owner.__name__}.{name}" in IMPURE:
+            return Outside(f"{owner.__name__}.{name}")
+        return found
+    return getattr(owner, name)
+
+
+def _is_users_own(owner: Any) -> bool:
+    home = owner.__name__ if isinstance(owner, types.ModuleType) else owner.__module__ if isinstance(owner, type) else type(owner).__module__
+    return is_users(home)
+
+
+def _decorator(found: Any) -> Any:
+    why = cannot_call(found)
+    if why is not None:
+        _reach(why[1:]) if why.startswith("!") else _stop(why)
+    return found
+
+
+def _each(iterable: Any) -> Any:
+    if type(iterable) in (set, frozenset) and len(iterable) > 1 and not all(type(x) in (int, bool) or isinstance(x, Enum) for x in iterable):
+        _reach("the order of a set, which hashes decide")
+    if isinstance(iterable, Outside):
+        iterable._used()
+    return iterable
+
+
+def _type_of(*args: Any, **kwargs: Any) -> Any:
+    return args[0].__class__ if len(args) == 1 and _is_stand_in(args[0]) else NotImplemented
+
+
+def _rounding(how: str) -> Callable[..., Any]:
+    def act(*args: Any, **kwargs: Any) -> Any:
+        if len(args) == 1 and not kwargs and isinstance(args[0], Ranged) and type(args[0]).__name__ == "Ranged":
+            return args[0]._rounded(how)
+        return NotImplemented
+
+    return act
+
+
+def _float(*args: Any) -> Any:
+    x = args[0] if len(args) == 1 else None
+    return x if type(x).__module__ in STAND_INS[::2] and isinstance(x, float) and not isinstance(x, str) else NotImplemented
+
+
+def _sum(items: Any, /, start: Any = 0) -> Any:
+    listed = list(_each(items))
+    if sys.version_info >= (3, 12) and any(isinstance(x, Ranged) and type(x).__name__ == "Ranged" for x in listed):
+        _stop("adds up floats with sum(…), which compensates rounding")
+    return sum(listed, start)
+
+
+def _plain_sorted(*args: Any, **kwargs: Any) -> Any:
+    if len(args) == 1 and not kwargs and isinstance(args[0], types.MappingProxyType):
+        ids = _sorted_ids(args[0])
+        return NotImplemented if ids is None else ids
+    return NotImplemented
+
+
+def _sorted_ids(mapping: Any) -> Any:
+    """Ids in ascending order, whatever order the mapping has them in."""
+    return sorted(mapping)
+
+
+def _finite(answer: bool) -> Callable[..., Any]:
+    return lambda *args: answer if len(args) == 1 and isinstance(args[0], Ranged) else NotImplemented
+
+
+_SPECIAL: dict[Any, Callable[..., Any]] = {
+    type: _type_of, float: _float, int: _rounding("int"), round: _rounding("round"), math.floor: _rounding("floor"),
+    math.ceil: _rounding("ceil"), math.trunc: _rounding("int"), math.sqrt: _rounding("sqrt"), sum: _sum,
+    str: _text_of(str), repr: _text_of(repr), ascii: _text_of(ascii), sorted: _plain_sorted, math.isfinite: _finite(True), math.isnan: _finite(False), math.isinf: _finite(False),
+}  # fmt: skip
+_BLIND_TO_SETS = (len, sorted, min, max, any, all, set, frozenset, isinstance, bool, set.union, type)
+
+
+# --- what the sources see ------------------------------------------------------------------------
+
+
+class Outside:
+    """A module that is not pure, or a part of it. It may be imported and named; every use is recorded and raises."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __getattr__(self, name: str) -> Outside:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Outside(f"{self._path}.{name}")
+
+    def __mro_entries__(self, _: object) -> NoReturn:
+        self._used()
+
+    def _used(self, *_: object, **__: object) -> NoReturn:
+        if is_seeded(self._path):
+            _stop(f"draws from {self._path}")
+        _reach(self._path)
+
+
+for _operator in "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash".split():
+    setattr(Outside, f"__{_operator}__", Outside._used)
+
+CHECKS: dict[str, Any] = {
+    "__called__": _called, "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent,
+    "__own__": _own, "__attribute__": _attribute, "__decorator__": _decorator, "__each__": _each,
+}  # fmt: skip
+
+
+def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
+    """The builtins of an instrumented module, whose imports find what they find otherwise."""
+
+    def importing(name: str, *rest: Any) -> Any:
+        module = find(name, *rest)
+        wanted: Sequence[str] = (rest[2] or ()) if len(rest) > 2 else ()
+        home = module.__name__
+        if is_users(home) or is_trusted(home):
+            return _Names(module, wanted) if wanted and not is_users(home) else module
+        if home.partition(".")[0] in PURE_MODULES:
+            return _Names(module, wanted) if wanted else module
+        return Outside(home)
+
+    return vars(builtins) | CHECKS | {"__import__": importing}
+
+
+class _Names(types.ModuleType):
+    """The names that a `from … import` takes from a module, each as `_attribute` gives it."""
+
+    def __init__(self, module: types.ModuleType, wanted: Sequence[str]) -> None:
+        super().__init__(module.__name__)
+        if "*" in wanted:
+            raise SyntaxError(f"imports all names of {module.__name__}")
+        for name in wanted:
+            try:
+                setattr(self, name, _attribute(module, name))
+            except AttributeError:
+                __import__(f"{module.__name__}.{name}")
+                setattr(self, name, getattr(module, name))

@@ -1,0 +1,129 @@
+"""What a policy keeps from one decision to the next: everything that its functions can reach and change."""
+
+from __future__ import annotations
+
+import collections
+import functools
+import inspect
+import re
+import types
+from collections.abc import Callable
+from decimal import Decimal
+from enum import Enum
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from sortie.policies.user_code import is_users
+from sortie.policies.verification.symbols import Refused
+
+_LEAVES = (
+    int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Decimal, Fraction, range, complex,
+    types.BuiltinFunctionType, types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias,
+    types.UnionType, types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
+)  # fmt: skip
+
+
+class Kept:
+    """A policy's lasting objects as they were before its first decision."""
+
+    def __init__(self, roots: dict[str, Any]) -> None:
+        self._roots = roots
+        self._before = self._now()
+
+    def _now(self) -> dict[str, Any]:
+        return {name: _fingerprint(value, {}) for name, value in self._roots.items()}
+
+    def changed(self) -> str:
+        """What has changed since, in words; empty if nothing has."""
+        now = self._now()
+        if now == self._before:
+            return ""
+        return next(f"changes {name}" for name in now if now[name] != self._before[name])
+
+
+def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
+    """The lasting objects of a policy: its modules' names, its defaults, its closure, its object's attributes.
+
+    Raises:
+        Refused: one of them is of a kind that cannot be compared, such as an iterator.
+    """
+    roots = {name: value for name, value in vars(module).items() if not name.startswith("__")}
+    return Kept({**roots, "the policy itself": function})
+
+
+def _fingerprint(value: Any, met: dict[int, int]) -> Any:
+    kind = type(value)
+    if kind is float:
+        return "float", value.hex()
+    if isinstance(value, Enum):
+        return kind.__name__, value.name
+    if kind in _LEAVES or isinstance(value, np.generic | np.ufunc):
+        return kind.__name__, value if not isinstance(value, np.generic) else value.tobytes()
+    if id(value) in met:
+        return "again", met[id(value)]
+    met[id(value)] = len(met)
+    if kind in (list, tuple) or isinstance(value, tuple):
+        return kind.__name__, tuple([_fingerprint(v, met) for v in value])
+    if kind in (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter):
+        return kind.__name__, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
+    if kind in (set, frozenset):
+        return kind.__name__, frozenset([_fingerprint(v, met) for v in value])
+    if kind in (collections.deque, bytearray):
+        return kind.__name__, tuple([_fingerprint(v, met) for v in value])
+    if kind is np.ndarray:
+        return "array", value.dtype.str, value.shape, value.tobytes()
+    return kind.__name__, id(value), _parts(value, met)
+
+
+def _parts(value: Any, met: dict[int, int]) -> Any:
+    """The changeable parts of a function, a class, a module or an object."""
+    found: list[Any]
+    if isinstance(value, types.FunctionType):
+        if not is_users(value.__module__) and not value.__dict__ and value.__closure__ is None:
+            return ()
+        cells = [c.cell_contents for c in value.__closure__ or () if _is_full(c)]
+        found = [*cells, *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature))]
+    elif isinstance(value, types.ModuleType):
+        found = [v for n, v in vars(value).items() if not n.startswith("__")] if is_users(value.__name__) else []
+    elif isinstance(value, type):
+        own = {n: v for n, v in vars(value).items() if n[:2] != "__"} if is_users(value.__module__) else {}
+        found = [x for item in own.items() for x in item]
+    elif isinstance(value, functools.partial):
+        found = [value.func, *value.args, *value.keywords.values()]
+    elif isinstance(value, types.MethodType):
+        found = [value.__func__, value.__self__]
+    elif isinstance(value, staticmethod | classmethod):
+        found = [value.__func__]
+    elif isinstance(value, property):
+        found = [value.fget, value.fset]
+    elif is_users(type(value).__module__):
+        found = [x for item in _attributes(value).items() for x in item]
+        if isinstance(value, list | set | dict):
+            found += [*value, *(value.values() if isinstance(value, dict) else ())]
+    elif type(value).__module__ in ("typing", "__future__", "operator", "sortie.policies.verification.instrument"):
+        found = []
+    elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
+        raise Refused("keeps results from one decision to the next (functools)")
+    else:
+        raise Refused(f"keeps a {type(value).__name__} from one decision to the next")
+    return tuple([_fingerprint(v, met) for v in found])
+
+
+def _attributes(value: Any) -> dict[str, Any]:
+    slots = {s for c in type(value).__mro__ for s in _slots(c) if hasattr(value, s)}
+    return {**getattr(value, "__dict__", {}), **{s: getattr(value, s) for s in slots}}
+
+
+def _slots(kind: type) -> tuple[str, ...]:
+    found = vars(kind).get("__slots__", ())
+    return (found,) if isinstance(found, str) else tuple(found)
+
+
+def _is_full(cell: types.CellType) -> bool:
+    try:
+        cell.cell_contents  # noqa: B018
+    except ValueError:
+        return False
+    return True

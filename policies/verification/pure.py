@@ -1,0 +1,187 @@
+"""What a policy's code may call while it is searched: functions whose results depend on their arguments alone."""
+
+from __future__ import annotations
+
+import bisect
+import builtins
+import collections
+import functools
+import heapq
+import itertools
+import math
+import operator
+import random
+import re
+import statistics
+import types
+from enum import Enum
+from typing import Any
+
+from sortie.policies.user_code import is_users
+
+PURE_MODULES = frozenset({
+    "__future__", "abc", "bisect", "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions",
+    "functools", "hashlib", "heapq", "itertools", "math", "numbers", "numpy", "operator", "re", "statistics", "string",
+    "types", "typing", "zlib",
+})  # fmt: skip
+"""Modules that may be imported. What is called is judged one by one."""
+IMPURE = frozenset({
+    "numpy.random", "numpy.datetime64", "numpy.load", "numpy.fromfile", "numpy.loadtxt", "numpy.genfromtxt",
+    "numpy.memmap", "numpy.save", "numpy.empty", "statistics.random",
+})  # fmt: skip
+_TRUSTED = (
+    "sortie.policies.contract", "sortie.policies.geometry", "sortie.policies.catalogue", "sortie.scenarios.disc",
+    "sortie.scenarios.link_state", "sortie.scenarios.representation",
+)  # fmt: skip
+_SEEDED = frozenset({"random.Random", "sortie.scenarios.streams.stream"})
+"""Random draws that depend on their seed alone: allowed, but no search follows them."""
+_OUTSIDE = {"print", "open", "input", "id", "hash", "breakpoint", "exit", "quit", "help"}
+_BUILTINS = {
+    getattr(builtins, name)
+    for name in (
+        "abs all any ascii bool bytes callable chr complex dict divmod enumerate filter float format frozenset int "
+        "isinstance issubclass iter len list map max min next object ord pow property range repr reversed round set "
+        "slice sorted staticmethod classmethod str sum super tuple type zip bytearray"
+    ).split()
+}
+_PLAIN = (
+    list, dict, set, frozenset, str, bytes, bytearray, tuple, int, float, bool, complex, range, types.MappingProxyType,
+    collections.deque, collections.Counter, collections.OrderedDict, collections.defaultdict, re.Pattern, re.Match,
+    type({}.keys()), type({}.values()), type({}.items()),
+)  # fmt: skip
+_C_MODULES = frozenset({
+    "math", "cmath", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections", "zlib",
+    "_hashlib", "_statistics", "_sha1", "_sha2", "_md5", "_blake2", "_sha256", "_sha512",
+})  # fmt: skip
+_PYTHON_MODULES = frozenset({"statistics", "dataclasses", "functools", "enum", "heapq", "typing", "fractions", "re", "hashlib"})
+_TYPE_MODULES = frozenset({"itertools", "collections", "enum", "typing", "decimal", "fractions", "abc", "numbers"})
+_NOT = {
+    operator.attrgetter: "operator.attrgetter", operator.methodcaller: "operator.methodcaller",
+    operator.is_: "operator.is_", operator.is_not: "operator.is_not", functools.lru_cache: "functools.lru_cache",
+    functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
+    statistics.NormalDist: "statistics.NormalDist",
+}  # fmt: skip
+_OPEN_MODULES = frozenset({"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"})
+
+
+def is_trusted(home: str) -> bool:
+    """Whether a module is one of Sortie's that policies are made of."""
+    return home == "sortie" or home.startswith(_TRUSTED)
+
+
+def is_seeded(path: str) -> bool:
+    """Whether this is a random generator with a seed of its own."""
+    return path in _SEEDED
+
+
+def takes_ranges(function: Any) -> bool:
+    """Whether a function asks its arguments by their methods alone, so that a stand-in can answer for a real object."""
+    if isinstance(function, types.FunctionType | types.MethodType):
+        home = str(function.__module__)
+        return is_users(home) or home.startswith("sortie.") or home in ("functools", "heapq", "enum") or _is_tuple_method(function)
+    if isinstance(function, type):
+        return (
+            function in _BUILTINS or is_users(function.__module__) or is_trusted(function.__module__)
+            or function.__module__ in ("itertools", "collections", "functools") or issubclass(function, BaseException)
+        )  # fmt: skip
+    if isinstance(function, functools.partial):
+        return takes_ranges(function.func)
+    owner = getattr(function, "__self__", None)
+    if owner is None or isinstance(owner, types.ModuleType):
+        return getattr(function, "__module__", None) in _OPEN_MODULES or isinstance(function, types.MethodDescriptorType)
+    return not isinstance(owner, re.Pattern) and (isinstance(owner, _PLAIN) or owner in _PLAIN)
+
+
+def cannot_call(function: Any) -> str | None:
+    """Why a search cannot follow a call; None if it can. It begins with `!` if the call is against the rules of the plane."""
+    kind = type(function)
+    if kind is types.FunctionType:
+        return _python_function(function)
+    if kind is types.BuiltinFunctionType or kind is types.MethodWrapperType:
+        return _compiled_function(function)
+    if kind is types.MethodType:
+        if isinstance(function.__self__, random.Random):
+            return "!random"
+        return None if _is_tuple_method(function) else cannot_call(function.__func__)
+    if kind is types.MethodDescriptorType or kind is types.ClassMethodDescriptorType:
+        return None if function.__objclass__ in _PLAIN else f"calls {function.__qualname__}"
+    if isinstance(function, type):
+        return _class(function)
+    if isinstance(function, functools.partial):
+        return cannot_call(function.func)
+    if hasattr(function, "cache_info"):
+        return "keeps results (functools.cache)"
+    if is_users(kind.__module__) or kind is operator.itemgetter or isinstance(function, Enum):
+        return None
+    if kind.__module__.startswith("sortie.policies.verification"):
+        return None  # a stand-in that is called raises what the real object raises
+    if kind.__module__ == "typing" or kind in (types.GenericAlias, types.UnionType):
+        return None
+    return f"calls {kind.__module__}.{kind.__name__}" if callable(function) else None
+
+
+def _python_function(function: Any) -> str | None:
+    home = str(function.__module__)
+    if is_users(home) or is_trusted(home):
+        return None
+    if function in _NOT:
+        return f"calls {_NOT[function]}"
+    path = f"{home}.{function.__name__}"
+    if is_seeded(path):
+        return f"draws from {path}"
+    if home.startswith("sortie.policies.verification"):
+        return None  # a method of a stand-in, which refuses what it cannot answer
+    if home.startswith("sortie."):
+        return f"!{path}"
+    if home in _PYTHON_MODULES or home.startswith("collections") or function.__code__.co_filename == "<string>":
+        return None
+    return f"calls {path}" if home.partition(".")[0] in PURE_MODULES else f"!{path}"
+
+
+def _compiled_function(function: Any) -> str | None:
+    owner, name = function.__self__, function.__name__
+    if owner is builtins:
+        if function in _BUILTINS:
+            return None
+        return f"!{name}(…)" if name in _OUTSIDE else f"calls {name}(…)"
+    if owner is None or isinstance(owner, types.ModuleType):
+        home = str(function.__module__)
+        if function in _NOT:
+            return f"calls {_NOT[function]}"
+        if home in _C_MODULES:
+            return None
+        return f"calls {home}.{name}" if home.partition(".")[0] in PURE_MODULES else f"!{home}.{name}"
+    if isinstance(owner, _PLAIN) or (isinstance(owner, type) and owner in _PLAIN) or isinstance(owner, type(iter(()))):
+        return None
+    home = type(owner).__module__
+    if home in _C_MODULES or home in ("decimal", "fractions"):
+        return None
+    if is_users(home) or home.startswith("sortie.") or (isinstance(owner, type) and is_users(owner.__module__)):
+        return None
+    return f"!{home}.{type(owner).__name__}.{name}" if home in ("random", "_random") else f"calls {home}.{type(owner).__name__}.{name}"
+
+
+def _class(kind: type) -> str | None:
+    home = kind.__module__
+    if kind in _BUILTINS or kind in _PLAIN or is_users(home) or is_trusted(home) or issubclass(kind, BaseException):
+        return None
+    path = f"{home}.{kind.__name__}"
+    if kind in _NOT:
+        return f"calls {_NOT[kind]}"
+    if path in _SEEDED:
+        return f"draws from {path}"
+    if home in _TYPE_MODULES or kind in (functools.partial, functools.reduce, operator.itemgetter):
+        return None
+    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+        return None
+    return f"calls {path}" if home.partition(".")[0] in PURE_MODULES else f"!{path}"
+
+
+def _is_tuple_method(function: Any) -> bool:
+    """Whether this is `_replace`, `_make` or `_asdict` of a named tuple."""
+    owner = getattr(function, "__self__", None)
+    kind = owner if isinstance(owner, type) else type(owner)
+    return issubclass(kind, tuple) and hasattr(kind, "_fields") and function.__name__ in ("_replace", "_make", "_asdict")
+
+
+_KEEP = (bisect, heapq, itertools, math)  # loaded before any policy runs

@@ -1,0 +1,59 @@
+"""A policy as verification needs it: the plain one, one that runs on stand-ins with checks, and its own invariants."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from sortie.policies.contract import Policy
+from sortie.policies.user_calls import Guarded, Source
+from sortie.policies.verification.instrument import instrumented
+from sortie.policies.verification.shield import Shielded
+
+OWN_INVARIANTS = "INVARIANTS"
+"""The name under which a policy's file keeps its own invariants, as text."""
+NO_FILE = "is not a policy of Sortie's nor a function in a file that was named as file.py:function"
+
+
+def searchable(policy: Policy) -> tuple[Policy, str]:
+    """The policy that runs on stand-ins, and why a search of it cannot prove anything (empty: it can).
+
+    Raises:
+        Reached: loading its file used something that is not in a view.
+        Refused: its file cannot be checked.
+    """
+    found: Any = policy
+    if isinstance(found, functools.partial):
+        inner, why = searchable(found.func)
+        return functools.partial(inner, *found.args, **found.keywords), why
+    if isinstance(found, Guarded):
+        return (policy, NO_FILE) if found.source is None else (_with_checks(found.source), "")
+    if isinstance(found, Shielded):
+        inner, why = searchable(found.policy)
+        return Shielded(inner, found.rules), why
+    return policy, "" if _is_sorties(found) else NO_FILE
+
+
+def _with_checks(source: Source) -> Policy:
+    found: Policy = Guarded(instrumented(source.file, source.name), source)
+    return found
+
+
+def own_invariants(policy: Policy) -> object:
+    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; None for a policy without a file."""
+    found: Any = policy
+    while isinstance(found, functools.partial):
+        found = found.func
+    return None if not isinstance(found, Guarded) or found.source is None else found.source.names.get(OWN_INVARIANTS)
+
+
+def _is_sorties(function: Callable[..., Any]) -> bool:
+    """Whether a function, and all that it wraps, is at home in Sortie's policies."""
+    found: Any = function
+    while found is not None:
+        space = getattr(found, "__globals__", {})
+        if not str(space.get("__name__")).startswith("sortie.policies."):
+            return False
+        found = getattr(found, "__wrapped__", None)
+    return True
