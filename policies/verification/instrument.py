@@ -8,7 +8,6 @@ that no `except` in the policy hides them. What the policy keeps from one decisi
 
 from __future__ import annotations
 
-import ast
 import builtins
 import math
 import sys
@@ -22,10 +21,16 @@ from sortie.policies.user_code import is_users, load
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.pure import IMPURE, PURE_MODULES, cannot_call, is_seeded, is_trusted, takes_ranges
-from sortie.policies.verification.ranges import FOR_USER
+from sortie.policies.verification.source_checks import compiled
+from sortie.policies.verification.stand_ins import FOR_USER
 from sortie.policies.verification.symbols import Ranged, Refused, Text
 
-STAND_INS = ("sortie.policies.verification.symbols", "sortie.policies.verification.ranges", "sortie.policies.verification.solver")
+STAND_INS = (
+    "sortie.policies.verification.symbols",
+    "sortie.policies.verification.ranges",
+    "sortie.policies.verification.stand_ins",
+    "sortie.policies.verification.solver",
+)
 
 
 class Watch:
@@ -57,7 +62,7 @@ class Instrumented:
         self.function, self.module = function, module
         self._kept: Kept | None = None
 
-    def __call__(self, view: Any, /) -> Any:
+    def __call__(self, view: Any, /, **params: Any) -> Any:
         """The policy's answer.
 
         Raises:
@@ -68,7 +73,7 @@ class Instrumented:
             self._kept = kept_by(self.function, self.module)
         _WATCH.stopped = None
         try:
-            return self.function(view)
+            return self.function(view, **params)
         finally:
             if _WATCH.stopped is not None:
                 raise _WATCH.stopped
@@ -87,119 +92,13 @@ def instrumented(path: File, attribute: str) -> Instrumented:
     """
     _WATCH.stopped = None
     try:
-        module = load(path, _compiled, _builtins)
+        module = load(path, compiled, _builtins)
     except SyntaxError as error:
         raise Refused(str(error)) from None
     finally:
         if _WATCH.stopped is not None:
             raise _WATCH.stopped
     return Instrumented(getattr(module, attribute), module)
-
-
-# --- the source ----------------------------------------------------------------------------------
-
-
-def _compiled(source: bytes, path: str) -> types.CodeType:
-    tree = _Checks().visit(ast.parse(source, path))
-    code: types.CodeType = compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True)
-    return code
-
-
-class _Checks(ast.NodeTransformer):
-    """Puts the checks into a source."""
-
-    def visit_Call(self, node: ast.Call) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        if isinstance(node.func, ast.Name) and node.func.id == "super":
-            return node
-        return ast.copy_location(ast.Call(_name("__called__"), [node.func, *node.args], node.keywords), node)
-
-    def visit_Compare(self, node: ast.Compare) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        if not any(isinstance(op, ast.Is | ast.IsNot) for op in node.ops):
-            return node
-        if len(node.ops) > 1:
-            raise SyntaxError("has `is` in a chain of comparisons")
-        same: ast.expr = ast.Call(_name("__same__"), [node.left, node.comparators[0]], [])
-        return ast.copy_location(
-            ast.UnaryOp(ast.Not(), same) if isinstance(node.ops[0], ast.IsNot) else same, node
-        )
-
-    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        return ast.copy_location(ast.Call(_name("__text__"), [self._part(v) for v in node.values], []), node)
-
-    def _part(self, value: ast.expr) -> ast.expr:
-        if not isinstance(value, ast.FormattedValue):
-            return value
-        spec = value.format_spec or ast.Constant("")
-        return ast.Call(_name("__written__"), [value.value, ast.Constant(value.conversion), spec], [])
-
-    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        if not isinstance(node.op, ast.Mod):
-            return node
-        return ast.copy_location(ast.Call(_name("__percent__"), [node.left, node.right], []), node)
-
-    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        if isinstance(node.op, ast.Mod):
-            raise SyntaxError("has `%=`")
-        return node
-
-    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        if not isinstance(node.ctx, ast.Load):
-            node.value = ast.Call(_name("__own__"), [node.value, ast.Constant(node.attr)], [])
-            return node
-        return ast.copy_location(
-            ast.Call(_name("__attribute__"), [node.value, ast.Constant(node.attr)], []), node
-        )
-
-    def _decorated(self, node: Any) -> Any:
-        returns, node.returns = getattr(node, "returns", None), None
-        self.generic_visit(node)
-        node.returns = returns
-        node.decorator_list = [ast.Call(_name("__decorator__"), [d], []) for d in node.decorator_list]
-        return node
-
-    visit_FunctionDef = visit_ClassDef = visit_AsyncFunctionDef = _decorated  # noqa: N815
-
-    def visit_For(self, node: ast.For) -> ast.AST:  # noqa: N802
-        self.generic_visit(node)
-        node.iter = ast.Call(_name("__each__"), [node.iter], [])
-        return node
-
-    def visit_comprehension(self, node: ast.comprehension) -> ast.AST:
-        self.generic_visit(node)
-        node.iter = ast.Call(_name("__each__"), [node.iter], [])
-        return node
-
-    def visit_MatchValue(self, node: ast.MatchValue) -> ast.AST:  # noqa: N802
-        return node  # a pattern has names alone
-
-    def visit_MatchClass(self, node: ast.MatchClass) -> ast.AST:  # noqa: N802
-        for pattern in (*node.patterns, *node.kwd_patterns):
-            self.visit(pattern)
-        return node
-
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:  # noqa: N802
-        node.target = self.visit(node.target)
-        node.value = None if node.value is None else self.visit(node.value)
-        return node
-
-    def visit_arg(self, node: ast.arg) -> ast.AST:
-        return node
-
-    def visit_Global(self, node: ast.Global) -> ast.AST:  # noqa: N802
-        raise SyntaxError(f"changes the global {node.names[0]}")
-
-    def visit_AsyncFor(self, node: ast.AsyncFor) -> ast.AST:  # noqa: N802
-        raise SyntaxError("has asynchronous code")
-
-
-def _name(text: str) -> ast.Name:
-    return ast.Name(text, ast.Load())
 
 
 # --- the checks ----------------------------------------------------------------------------------
@@ -275,7 +174,11 @@ def _has_text(value: Any) -> bool:
 
 def _stands_for_text(owner: str, first: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """A method of a plain text that is given the text of a range, or a range."""
-    parts = list(first) if len(args) == 1 and not isinstance(first, str) and not _is_stand_in(first) else [*args, *kwargs.values()]
+    parts = (
+        list(first)
+        if len(args) == 1 and not isinstance(first, str) and not _is_stand_in(first)
+        else [*args, *kwargs.values()]
+    )
     found = next((part for part in parts if _is_stand_in(part)), None)
     if found is None:
         return owner.join(parts) if parts is not args else _stop("makes text of a sequence")
@@ -321,7 +224,11 @@ def _written(value: Any, conversion: int, spec: str) -> Any:
 
 def _text(*parts: Any) -> Any:
     tainted = next((p for p in parts if isinstance(p, Text)), None)
-    return "".join(parts) if tainted is None else Text(tainted._path, tainted._axis, "".join(str.__str__(p) for p in parts))
+    return (
+        "".join(parts)
+        if tainted is None
+        else Text(tainted._path, tainted._axis, "".join(str.__str__(p) for p in parts))
+    )
 
 
 def _percent(left: Any, right: Any) -> Any:
@@ -352,7 +259,11 @@ def _attribute(owner: Any, name: str) -> Any:
         return owner.__class__
     if isinstance(owner, types.ModuleType) and not is_users(owner.__name__):
         found = getattr(owner, name)
-        if isinstance(found, types.ModuleType) and found.__name__.partition(".")[0] not in PURE_MODULES and not is_trusted(found.__name__):
+        if (
+            isinstance(found, types.ModuleType)
+            and found.__name__.partition(".")[0] not in PURE_MODULES
+            and not is_trusted(found.__name__)
+        ):
             return Outside(found.__name__)
         if f"{owner.__name__}.{name}" in IMPURE:
             return Outside(f"{owner.__name__}.{name}")
@@ -361,7 +272,13 @@ def _attribute(owner: Any, name: str) -> Any:
 
 
 def _is_users_own(owner: Any) -> bool:
-    home = owner.__name__ if isinstance(owner, types.ModuleType) else owner.__module__ if isinstance(owner, type) else type(owner).__module__
+    home = (
+        owner.__name__
+        if isinstance(owner, types.ModuleType)
+        else owner.__module__
+        if isinstance(owner, type)
+        else type(owner).__module__
+    )
     return is_users(home)
 
 
@@ -373,7 +290,11 @@ def _decorator(found: Any) -> Any:
 
 
 def _each(iterable: Any) -> Any:
-    if type(iterable) in (set, frozenset) and len(iterable) > 1 and not all(type(x) in (int, bool) or isinstance(x, Enum) for x in iterable):
+    if (
+        type(iterable) in (set, frozenset)
+        and len(iterable) > 1
+        and not all(type(x) in (int, bool) or isinstance(x, Enum) for x in iterable)
+    ):
         _reach("the order of a set, which hashes decide")
     if isinstance(iterable, Outside):
         iterable._used()
@@ -395,7 +316,7 @@ def _rounding(how: str) -> Callable[..., Any]:
 
 def _float(*args: Any) -> Any:
     x = args[0] if len(args) == 1 else None
-    return x if type(x).__module__ in STAND_INS[::2] and isinstance(x, float) and not isinstance(x, str) else NotImplemented
+    return x if isinstance(x, Ranged) and isinstance(x, float) else NotImplemented
 
 
 def _sum(items: Any, /, start: Any = 0) -> Any:
@@ -452,7 +373,8 @@ class Outside:
         _reach(self._path)
 
 
-for _operator in "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash".split():
+_OPERATORS = "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash"
+for _operator in _OPERATORS.split():
     setattr(Outside, f"__{_operator}__", Outside._used)
 
 CHECKS: dict[str, Any] = {

@@ -84,7 +84,12 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         if not is_users(value.__module__) and not value.__dict__ and value.__closure__ is None:
             return ()
         cells = [c.cell_contents for c in value.__closure__ or () if _is_full(c)]
-        found = [*cells, *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature))]
+        found = [
+            *cells,
+            *(value.__defaults__ or ()),
+            *(value.__kwdefaults__ or {}).values(),
+            *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature)),
+        ]
     elif isinstance(value, types.ModuleType):
         found = [v for n, v in vars(value).items() if not n.startswith("__")] if is_users(value.__name__) else []
     elif isinstance(value, type):

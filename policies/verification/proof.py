@@ -31,7 +31,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, check_directives, find_inexact, find_wrong_type
+from sortie.policies.contract import (
+    Directive,
+    FleetView,
+    Policy,
+    PolicyError,
+    check_directives,
+    find_inexact,
+    find_wrong_type,
+)
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
@@ -46,7 +54,7 @@ DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
 BUDGET_S = 60.0
 TRIED_VIEWS = 1000
-TRIED_LARGE = 4
+TRIED_LARGE = 2
 """Drawn views of the largest fleet that a scenario may have."""
 
 Outcome = Literal["proved", "proved over the reals", "refuted", "searched", "drawn"]

@@ -38,11 +38,54 @@ _SEEDED = frozenset({"random.Random", "sortie.scenarios.streams.stream"})
 _OUTSIDE = {"print", "open", "input", "id", "hash", "breakpoint", "exit", "quit", "help"}
 _BUILTINS = {
     getattr(builtins, name)
-    for name in (
-        "abs all any ascii bool bytes callable chr complex dict divmod enumerate filter float format frozenset int "
-        "isinstance issubclass iter len list map max min next object ord pow property range repr reversed round set "
-        "slice sorted staticmethod classmethod str sum super tuple type zip bytearray"
-    ).split()
+    for name in [
+        "abs",
+        "all",
+        "any",
+        "ascii",
+        "bool",
+        "bytes",
+        "callable",
+        "chr",
+        "complex",
+        "dict",
+        "divmod",
+        "enumerate",
+        "filter",
+        "float",
+        "format",
+        "frozenset",
+        "int",
+        "isinstance",
+        "issubclass",
+        "iter",
+        "len",
+        "list",
+        "map",
+        "max",
+        "min",
+        "next",
+        "object",
+        "ord",
+        "pow",
+        "property",
+        "range",
+        "repr",
+        "reversed",
+        "round",
+        "set",
+        "slice",
+        "sorted",
+        "staticmethod",
+        "classmethod",
+        "str",
+        "sum",
+        "super",
+        "tuple",
+        "type",
+        "zip",
+        "bytearray",
+    ]
 }
 _PLAIN = (
     list, dict, set, frozenset, str, bytes, bytearray, tuple, int, float, bool, complex, range, types.MappingProxyType,
@@ -53,7 +96,9 @@ _C_MODULES = frozenset({
     "math", "cmath", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections", "zlib",
     "_hashlib", "_statistics", "_sha1", "_sha2", "_md5", "_blake2", "_sha256", "_sha512",
 })  # fmt: skip
-_PYTHON_MODULES = frozenset({"statistics", "dataclasses", "functools", "enum", "heapq", "typing", "fractions", "re", "hashlib"})
+_PYTHON_MODULES = frozenset(
+    {"statistics", "dataclasses", "functools", "enum", "heapq", "typing", "fractions", "re", "hashlib"}
+)
 _TYPE_MODULES = frozenset({"itertools", "collections", "enum", "typing", "decimal", "fractions", "abc", "numbers"})
 _NOT = {
     operator.attrgetter: "operator.attrgetter", operator.methodcaller: "operator.methodcaller",
@@ -61,7 +106,9 @@ _NOT = {
     functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
     statistics.NormalDist: "statistics.NormalDist",
 }  # fmt: skip
-_OPEN_MODULES = frozenset({"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"})
+_OPEN_MODULES = frozenset(
+    {"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"}
+)
 
 
 def is_trusted(home: str) -> bool:
@@ -78,7 +125,12 @@ def takes_ranges(function: Any) -> bool:
     """Whether a function asks its arguments by their methods alone, so that a stand-in can answer for a real object."""
     if isinstance(function, types.FunctionType | types.MethodType):
         home = str(function.__module__)
-        return is_users(home) or home.startswith("sortie.") or home in ("functools", "heapq", "enum") or _is_tuple_method(function)
+        return (
+            is_users(home)
+            or home.startswith("sortie.")
+            or home in ("functools", "heapq", "enum")
+            or _is_tuple_method(function)
+        )
     if isinstance(function, type):
         return (
             function in _BUILTINS or is_users(function.__module__) or is_trusted(function.__module__)
@@ -88,7 +140,9 @@ def takes_ranges(function: Any) -> bool:
         return takes_ranges(function.func)
     owner = getattr(function, "__self__", None)
     if owner is None or isinstance(owner, types.ModuleType):
-        return getattr(function, "__module__", None) in _OPEN_MODULES or isinstance(function, types.MethodDescriptorType)
+        return getattr(function, "__module__", None) in _OPEN_MODULES or isinstance(
+            function, types.MethodDescriptorType
+        )
     return not isinstance(owner, re.Pattern) and (isinstance(owner, _PLAIN) or owner in _PLAIN)
 
 
@@ -158,7 +212,11 @@ def _compiled_function(function: Any) -> str | None:
         return None
     if is_users(home) or home.startswith("sortie.") or (isinstance(owner, type) and is_users(owner.__module__)):
         return None
-    return f"!{home}.{type(owner).__name__}.{name}" if home in ("random", "_random") else f"calls {home}.{type(owner).__name__}.{name}"
+    return (
+        f"!{home}.{type(owner).__name__}.{name}"
+        if home in ("random", "_random")
+        else f"calls {home}.{type(owner).__name__}.{name}"
+    )
 
 
 def _class(kind: type) -> str | None:
@@ -181,7 +239,9 @@ def _is_tuple_method(function: Any) -> bool:
     """Whether this is `_replace`, `_make` or `_asdict` of a named tuple."""
     owner = getattr(function, "__self__", None)
     kind = owner if isinstance(owner, type) else type(owner)
-    return issubclass(kind, tuple) and hasattr(kind, "_fields") and function.__name__ in ("_replace", "_make", "_asdict")
+    return (
+        issubclass(kind, tuple) and hasattr(kind, "_fields") and function.__name__ in ("_replace", "_make", "_asdict")
+    )
 
 
 _KEEP = (bisect, heapq, itertools, math)  # loaded before any policy runs

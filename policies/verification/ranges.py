@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, NoReturn
 
 from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
+from sortie.policies.verification.stand_ins import (
+    FLAGS,
+    ORDER_IN_VIEW,
+    Flags,
+    InAnyOrder,
+    Space,
+    TargetIds,
+    Unsearchable,
+    flag_axis,
+    is_blind,
+    orders,
+    space_of,
+)
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
@@ -19,8 +31,6 @@ Choose = Callable[[str, float, float], float]
 """Picks a number of an axis between its bounds."""
 
 _FOOTPRINT_M = 42.0
-_FLAGS = 8
-"""The bits of a descriptor's novelty flags; the plane uses three of them."""
 _SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
 
@@ -104,14 +114,14 @@ class FleetOfRanges:
                     number(goodput_axis(i, other), 100.0) for other in range(self.drones) if other != i
                 ),
                 coverage_grid=bytes(COVERAGE_BYTES),
-                novelty_flags=sum(path.picks.get(_flag(bit, i), 0) for bit in range(_FLAGS)),
+                novelty_flags=sum(path.picks.get(flag_axis(bit, i), 0) for bit in range(FLAGS)),
                 task_phase=path.picks.get(f"task_phase of drone {i}", TaskPhase.SEARCH),
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
                 priority_target_ids=tuple(range(int(targets))),
-                feature_space="" if path.picks.get(_space_of(i), True) else "other",
+                feature_space="" if path.picks.get(space_of(i), True) else "other",
             )
         ages_s = self._example_ages(choose)
-        ids = path.picks.get(_ORDER_IN_VIEW, self.heard)
+        ids = path.picks.get(ORDER_IN_VIEW, self.heard)
         return FleetView(self.ego, self.period_s, {i: descriptors[i] for i in ids}, {i: ages_s[i] for i in ids}).frozen
 
     def _example_ages(self, choose: Choose | None = None) -> dict[int, float]:
@@ -201,11 +211,11 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def feature_space(self) -> Any:
-        return _Space(self._origin.system, self._origin.drone)
+        return Space(self._origin.system, self._origin.drone)
 
     @property
     def novelty_flags(self) -> Any:
-        return _Flags(self._origin.system.path, self._origin.drone)
+        return Flags(self._origin.system.path, self._origin.drone)
 
     @property
     def region(self) -> Disc | None:
@@ -219,14 +229,14 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def priority_target_ids(self) -> Any:
-        return _TargetIds(self._number("targets", 0, 16), self._origin.system.path)
+        return TargetIds(self._number("targets", 0, 16), self._origin.system.path)
 
     @property
     def position_m(self) -> tuple[float, float, float]:
         receiver = self._only_for_order("position_m")
         system = self._origin.system
         peers = tuple(i for i in system.heard if i != receiver)
-        order = system.path.pick(_order_of(receiver), _orders(peers))
+        order = system.path.pick(_order_of(receiver), orders(peers))
         return _places(receiver, order)[self._origin.drone]
 
     @property
@@ -298,75 +308,13 @@ def _refusing(descriptor: DescriptorOfRanges, name: str) -> NoReturn:
     descriptor._origin.system.path.refuse(f"reads {name}, which cannot be searched")
 
 
-class Unsearchable:
-    """What stands in a descriptor's tuple. Code in C that reads the tuple directly meets it, and every use refuses."""
-
-    __slots__ = ("drone", "name", "system")
-
-    def __init__(self, system: FleetOfRanges, drone: int, name: str) -> None:
-        self.system, self.drone, self.name = system, drone, name
-
-    def _reached(self, *_: object, **__: object) -> NoReturn:
-        self.system.path.refuse(f"reads {self.name} in a way that cannot be searched")
-
-
-class InAnyOrder(dict[int, Any]):
-    """A mapping by drone, in any order: the run forks as soon as someone sees the order.
-
-    Sortie's own code does not depend on the order, which the kit tests, so it does not fork the run.
-    """
-
-    def __init__(self, path: Path, content: Mapping[int, Any], heard: tuple[int, ...]) -> None:
-        super().__init__(content)
-        self._path, self._heard = path, heard
-
-    def _arranged(self) -> dict[int, Any]:
-        ids = tuple(sorted(dict.keys(self)))
-        if len(ids) > 1 and not _is_blind(sys._getframe(2)):
-            ids = tuple(i for i in self._path.pick(_ORDER_IN_VIEW, _orders(self._heard)) if i in ids)
-        return {i: dict.__getitem__(self, i) for i in ids}
-
-    def __iter__(self) -> Any:
-        return iter(self._arranged())
-
-    def __reversed__(self) -> Any:
-        return reversed(self._arranged())
-
-    def keys(self) -> Any:
-        return self._arranged().keys()
-
-    def values(self) -> Any:
-        return self._arranged().values()
-
-    def items(self) -> Any:
-        return self._arranged().items()
-
-    def copy(self) -> Any:
-        return self._arranged().copy()
-
-    def _whole(self, *_: object) -> NoReturn:
-        self._path.refuse("compares or writes out a whole mapping of drones")
-
-    __eq__ = __ne__ = __or__ = __ror__ = __repr__ = __hash__ = _whole  # type: ignore[assignment]
-    __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = _whole  # type: ignore[assignment]
-
-
-def _is_blind(frame: Any) -> bool:
-    """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
-    return str(frame.f_globals.get("__name__", "")).startswith("sortie.") and frame.f_code.co_name != FOR_USER
-
-
-FOR_USER = "on_behalf_of_the_policy"
-"""The name of the function that calls builtins for a policy's code (`instrument`)."""
-
-
 class ViewOfRanges(FleetView):
     """A view over ranges. Its mappings can be read only, as in flight, and have any order."""
 
     __slots__ = ()
 
     def _replace(self, **fields: Any) -> Any:  # type: ignore[override]
-        if _is_blind(sys._getframe(1)):  # mappings that a user's code made have the order that it gave them
+        if is_blind(sys._getframe(1)):  # mappings that a user's code made have the order that it gave them
             system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
             fields = {
                 name: _in_any_order(system, value) if name in ("descriptors", "age_s") else value
@@ -379,49 +327,11 @@ class ViewOfRanges(FleetView):
         return FleetView
 
 
-class _Flags:
-    """A byte of flags. A mask forks the run for the bits that it reads; any other use forks it for all bits."""
-
-    def __init__(self, path: Path, agent_id: int) -> None:
-        self._path, self._id = path, agent_id
-
-    def _bits(self, mask: int) -> int:
-        read = [bit for bit in range(_FLAGS) if mask >> bit & 1]
-        return sum(self._path.pick(_flag(bit, self._id), (0, 1 << bit)) for bit in read)
-
-    def __and__(self, mask: object) -> Any:
-        return self._bits(mask) if isinstance(mask, int) else NotImplemented
-
-    __rand__ = __and__
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._bits(-1), name)
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return int
-
-
-def _by_value(name: str) -> Callable[..., Any]:
-    def operator(*operands: Any) -> Any:
-        return getattr(int, name)(*(x._bits(-1) if type(x) is _Flags else x for x in operands))
-
-    return operator
-
-
-_OWN_METHODS = {*vars(_Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}
-for _method in {n for n, of in vars(int).items() if n.startswith("__") and callable(of)} - _OWN_METHODS:
-    setattr(_Flags, _method, _by_value(_method))  # where Python looks for operators
-
-
 _ORDER = "peers by overlap with drone "
 
 
 def _order_of(receiver: int) -> str:
     return f"{_ORDER}{receiver}"
-
-
-_ORDER_IN_VIEW = "order of drones in the view"
 
 
 def goodput_axis(source: int, destination: int) -> str:
@@ -431,79 +341,6 @@ def goodput_axis(source: int, destination: int) -> str:
 
 def _in_any_order(system: FleetOfRanges, content: Mapping[int, Any]) -> Mapping[int, Any]:
     return MappingProxyType(InAnyOrder(system.path, content, system.heard))
-
-
-def _flag(bit: int, agent_id: int) -> str:
-    return f"novelty flag {bit} of drone {agent_id}"
-
-
-class _TargetIds:
-    """Target ids with a known range of their number. The ids themselves are not known."""
-
-    def __init__(self, count: Any, path: Path) -> None:
-        self._count, self._path = count, path
-
-    def __bool__(self) -> bool:
-        return bool(self._count > 0)
-
-    def __len__(self) -> int:
-        for n in range(16):
-            if self._count <= n:
-                return n
-        return 16
-
-    def _cannot(self, *_: object, **__: object) -> NoReturn:
-        self._path.refuse("reads the ids of targets")
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return tuple
-
-
-class _Space:
-    """A drone's feature space, known only by whether it is the ego's."""
-
-    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
-        self._system, self._id = system, agent_id
-
-    def __eq__(self, other: object) -> bool:
-        path, ego = self._system.path, self._system.ego
-        if not isinstance(other, _Space) or ego not in (self._id, other._id):
-            path.refuse("compares feature_space with anything but the ego's")
-        peer = other._id if self._id == ego else self._id
-        return peer == ego or path.pick(_space_of(peer), (True, False))
-
-    def __ne__(self, other: object) -> bool:
-        return not self.__eq__(other)
-
-    def _cannot(self, *_: object, **__: object) -> NoReturn:
-        self._system.path.refuse("reads the name of a feature_space")
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return str
-
-
-_OPERATORS = (
-    "getitem setitem delitem iter reversed len bool eq ne lt le gt ge add radd sub rsub mul rmul mod rmod truediv "
-    "rtruediv floordiv pow neg abs float int index round hash str repr format contains and or xor reduce reduce_ex copy "
-    "deepcopy sizeof dir bytes getattr"
-).split()  # fmt: skip
-for _kind, _refusal in ((Unsearchable, Unsearchable._reached), (_TargetIds, _TargetIds._cannot), (_Space, _Space._cannot)):
-    for _operator in _OPERATORS:
-        if f"__{_operator}__" not in vars(_kind):
-            setattr(_kind, f"__{_operator}__", _refusal)
-    if "__hash__" in vars(_kind) and vars(_kind)["__hash__"] is None:
-        setattr(_kind, "__hash__", _refusal)
-Sequence.register(_TargetIds)  # a pattern of a sequence meets its length
-
-
-def _space_of(peer: int) -> str:
-    return f"drone {peer} has the ego's feature_space"
-
-
-def _orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-    return tuple(itertools.permutations(peers))
 
 
 @lru_cache(maxsize=4096)

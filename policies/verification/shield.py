@@ -17,7 +17,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation, check_directives
+from sortie.policies.contract import (
+    DIRECTIVE_BOUNDS,
+    Directive,
+    Disc,
+    FleetView,
+    Policy,
+    Representation,
+    check_directives,
+)
 from sortie.policies.verification.invariants import (
     Binary,
     Invariant,

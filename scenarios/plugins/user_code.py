@@ -37,7 +37,9 @@ Compile = Callable[[bytes, str], CodeType]
 """From a source and its path to the code that runs."""
 
 
-def load(path: Path, compiled: Compile | None = None, own_builtins: Callable[[Any], dict[str, Any]] | None = None) -> ModuleType:
+def load(
+    path: Path, compiled: Compile | None = None, own_builtins: Callable[[Any], dict[str, Any]] | None = None
+) -> ModuleType:
     """Run a file as a new module, with new modules for all that it imports from its folder.
 
     Args:
@@ -160,9 +162,7 @@ class _Folder(MetaPathFinder):
 class _Loader(SourceFileLoader):
     """Runs a source as it is now: it neither reads nor writes compiled files."""
 
-    def __init__(
-        self, name: str, path: Path, users_builtins: dict[str, Any], compiled: Compile | None = None
-    ) -> None:
+    def __init__(self, name: str, path: Path, users_builtins: dict[str, Any], compiled: Compile | None = None) -> None:
         super().__init__(name, str(path))
         self._builtins, self._compiled = users_builtins, compiled
 

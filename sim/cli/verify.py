@@ -49,7 +49,8 @@ def verify(
     ] = None,
     drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=8)] = DRONES,
     budget: Annotated[
-        float, typer.Option(help="Time for the search of all properties together, s; what it covered is printed.", min=0)
+        float,
+        typer.Option(help="Time for the search of all properties together, s; what it covered is printed.", min=0),
     ] = BUDGET_S,
     views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for counterexamples.")] = Path("runs/verify"),

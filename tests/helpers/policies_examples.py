@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from sortie.policies.contract import Descriptor, Disc, FleetView, TaskPhase
+from pathlib import Path
+
+from sortie.policies.contract import Descriptor, Disc, FleetView, Policy, TaskPhase
+from sortie.policies.registry import resolve
 
 
 def fleet_of(n: int, *, soc: float = 0.9, goodput: float = 100.0, phase: TaskPhase = TaskPhase.SEARCH) -> FleetView:
@@ -15,3 +18,8 @@ def fleet_of(n: int, *, soc: float = 0.9, goodput: float = 100.0, phase: TaskPha
         for i in range(n)
     }  # fmt: skip
     return FleetView(0, 0.1, descriptors, dict.fromkeys(descriptors, 0.1))
+
+
+def planted(name: str) -> Policy:
+    """A policy of `policies_planted.py`, loaded as a user's file is."""
+    return resolve(f"{Path(__file__).with_name('policies_planted.py')}:{name}")

@@ -158,9 +158,9 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (silent, "gives reasons", "no reason given for"),
     (needs_a_peer, "one drone and empty views", "raises ValueError"),
     (needs_youth, "stale views", "every descriptor 20 periods old: RuntimeError: nobody there"),
-    (gives_a_generator, "returns directives", "returns generator, must be a sequence of directives"),
-    (gives_nothing, "returns directives", "returns NoneType, must be a sequence of directives"),
-    (gives_text, "bounds kept", "a policy returns Directive, got str"),
+    (gives_a_generator, "returns directives", "returns generator, must be a list or a tuple of directives"),
+    (gives_nothing, "returns directives", "returns NoneType, must be a list or a tuple of directives"),
+    (gives_text, "bounds kept", "a policy returns a list or a tuple of directives, got str"),
     (rate_as_text, "bounds kept", "rate_hz is '10', must be in [0, 30], a number"),
     (rung_as_text, "bounds kept", "representation is 'features', must be in [0, 4], a Representation"),
     (weighs_by_none, "bounds kept", "fusion_weight is None, must be in [0, 1], a number"),
@@ -197,7 +197,7 @@ def test_a_slow_policy_is_told_its_time(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_sound_policy_passes_with_every_rule_named_once() -> None:
     checks = conform(share, count=25)
     assert failing(checks) == []
-    assert [c.name for c in checks] == [*RULES, "time per decision"]
+    assert [c.name for c in checks] == [*RULES, "no memory", "time per decision"]
 
 
 def test_a_policy_that_always_raises_holds_no_rule() -> None:

@@ -132,7 +132,9 @@ def test_isinstance_and_match_answer_as_in_flight() -> None:
 @pytest.mark.parametrize("other", [Decimal("0.5"), np.float32(0.3), np.int64(1), 1j])
 @pytest.mark.parametrize("act", [operator.eq, operator.ne, lambda a, b: b == a, operator.mul, lambda a, b: b * a])
 def test_a_number_that_rounds_otherwise_is_refused(act: Callable[[object, object], object], other: object) -> None:
-    with pytest.raises(Refused, match=f"compares or combines charge with a {type(other).__name__}"):
+    with pytest.raises(
+        Refused, match=f"compares or combines charge with a {type(other).__name__}|uses charge for more than arithmetic"
+    ):
         list(explore(lambda p: act(p.number("charge", 0.0, 1.0), other)))
 
 
@@ -178,7 +180,7 @@ def test_flags_of_two_drones_are_compared() -> None:
 
 
 def test_two_axes_are_not_compared() -> None:
-    with pytest.raises(Refused, match="compares or combines two inputs, a and b"):
+    with pytest.raises(Refused, match="combines a and b"):
         list(explore(lambda p: p.number("a", 0.0, 1.0) < p.number("b", 0.0, 1.0)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import pytest
-from policies_examples import fleet_of
+from policies_examples import fleet_of, planted
 
 from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.worked import worked
@@ -128,9 +128,10 @@ def test_a_shielded_policy_conforms(rules: str) -> None:
 
 def test_the_shielded_fault_is_proved_harmless() -> None:
     """The proof explores the shield together with the policy: it holds on every view, not on drawn ones alone."""
-    bare = prove(drops, parse(HUMANE), max_drones=2)[-1]
+    faulty = planted("drops")
+    bare = prove(faulty, parse(HUMANE), max_drones=2, views=0)[-1]
     assert bare.outcome == "refuted"
-    verdicts = prove(shield(drops, parse(HUMANE)), parse(HUMANE), max_drones=2)
+    verdicts = prove(shield(faulty, parse(HUMANE)), parse(HUMANE), max_drones=2, views=20)
     assert [v.outcome for v in verdicts] == ["proved", "proved", "proved"]
 
 

@@ -15,6 +15,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.thermal import people_boxes
 from sortie.perception.types import Capture, Share
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import prove
 from sortie.scenarios.reading.load import load
@@ -65,12 +66,12 @@ def test_a_planted_policy_breaks_the_property_and_its_proof(tmp_path: Path) -> N
     assert shielded["invariant_violations"] == 0, "the shield keeps it over any policy"
 
 
-@pytest.mark.parametrize(("body", "outcome_"), [("worked(view)", "proved"), ("tired(view)", "refuted")])
-def test_sortie_verify_can_prove_the_property(body: str, outcome_: str) -> None:
-    space: dict[str, object] = {}
-    exec(FAULT, space)  # noqa: S102 (the planted policy above)
-    policy = space[body.partition("(")[0]]
-    (verdict,) = [v for v in prove(policy, parse(PROPERTY), max_drones=2) if v.name == PROPERTY]  # type: ignore[arg-type]
+@pytest.mark.parametrize(("name", "outcome_"), [("worked", "proved"), ("tired", "refuted")])
+def test_sortie_verify_can_prove_the_property(name: str, outcome_: str, tmp_path: Path) -> None:
+    path = tmp_path / "tired.py"
+    path.write_text(FAULT)
+    policy = resolve("worked" if name == "worked" else f"{path}:{name}")
+    (verdict,) = [v for v in prove(policy, parse(PROPERTY), max_drones=2, views=50) if v.name == PROPERTY]
     assert verdict.outcome == outcome_
 
 
