@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 _ADVICE = (
-    ("combines", "compare each input with constants, or install the extra `verify` (z3)"),
+    ("combines", "compare each input with constants, or let z3 follow sums, products and comparisons"),
     ("compares or combines", "use plain numbers of Python in thresholds"),
     ("without peers_by_overlap", "rank the peers with peers_by_overlap"),
     ("uses the text of", "put numbers into the reason alone"),

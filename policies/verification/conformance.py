@@ -33,13 +33,13 @@ from sortie.policies.contract import (
     find_wrong_type,
 )
 from sortie.policies.registry import parameters, viewpoint_of
-from sortie.policies.user_calls import Guarded
-from sortie.policies.user_code import load
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import just_heard
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.views import draw_view, draw_views, shrink
+from sortie.scenarios.plugins.user_calls import Guarded
+from sortie.scenarios.plugins.user_code import load
 
 VIEWS = 300
 BUDGETS = (0.02, 0.25, 1.0)
@@ -198,7 +198,7 @@ def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
     usual = _as_tuples(_decide(policy, view))
     try:
-        alone = _as_tuples(_decide(_alone(policy), view))
+        alone = _as_tuples(_decide(_alone(policy), view))  # type: ignore[arg-type]
     except Reached as error:
         return str(error)
     return None if alone == usual else "decides differently if it can only use its view"

@@ -17,13 +17,13 @@ from enum import Enum
 from pathlib import Path as File
 from typing import Any, NoReturn
 
-from sortie.policies.user_code import is_users, load
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.pure import IMPURE, PURE_MODULES, cannot_call, is_seeded, is_trusted, takes_ranges
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.stand_ins import FOR_USER
 from sortie.policies.verification.symbols import Ranged, Refused, Text
+from sortie.scenarios.plugins.user_code import is_users, load
 
 STAND_INS = (
     "sortie.policies.verification.symbols",
@@ -141,14 +141,13 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         _stop(f"gives a range to {getattr(function, '__qualname__', function)}")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
         _stop(why)
-    first = args[0] if args else None
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
     owner = getattr(function, "__self__", None)
     if type(owner) is str:
         if any(map(_has_text, (*args, *kwargs.values()))):
-            return _stands_for_text(owner, first, args, kwargs)
+            return _stands_for_text(function, args, kwargs)
     elif type(owner) in (set, frozenset) and function.__name__ in ("pop", "__iter__"):
         _each(owner)
     return function(*args, **kwargs)
@@ -172,16 +171,18 @@ def _has_text(value: Any) -> bool:
     return _is_stand_in(value) or isinstance(value, types.GeneratorType | map | filter)
 
 
-def _stands_for_text(owner: str, first: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """A method of a plain text that is given the text of a range, or a range."""
-    parts = (
-        list(first)
-        if len(args) == 1 and not isinstance(first, str) and not _is_stand_in(first)
-        else [*args, *kwargs.values()]
-    )
+def _stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """A method of a plain text that is given the text of a range, or something that may yield one."""
+    if function.__name__ == "join" and len(args) == 1:
+        parts = args[0] if isinstance(args[0], Text) else list(args[0])
+        args = (parts,)
+    else:
+        parts = [*args, *kwargs.values()]
+        if any(isinstance(part, types.GeneratorType | map | filter) for part in parts):
+            _stop("makes text of an iterator")
     found = next((part for part in parts if _is_stand_in(part)), None)
     if found is None:
-        return owner.join(parts) if parts is not args else _stop("makes text of a sequence")
+        return function(*args, **kwargs)
     if isinstance(found, Text | Ranged):
         return Text(found._path, found._axis, "text with a number")
     return _stop("makes text of what is known as a range alone")
@@ -216,7 +217,8 @@ def _without_address(text: str) -> str:
 
 def _written(value: Any, conversion: int, spec: str) -> Any:
     if conversion != -1:
-        value = {115: str, 114: repr, 97: ascii}[conversion](value)
+        write: Callable[[Any], str] = {115: str, 114: repr, 97: ascii}[conversion]
+        value = write(value)
     if isinstance(value, Outside):
         value._used()
     return format(value, spec) if _is_stand_in(value) else _without_address(format(value, spec))

@@ -50,6 +50,8 @@ class Word(NamedTuple):
     kind: Kind
     of_link: bool
     value: Callable[[Scope], Any]
+    raw: Callable[..., Any] | None = None
+    """Of a directive's field: from the directive. Of a peer: from the scope and the peer's id."""
 
 
 def _view_word(about: str, value: Callable[[Scope], Any], kind: Kind = "number") -> Word:
@@ -57,11 +59,11 @@ def _view_word(about: str, value: Callable[[Scope], Any], kind: Kind = "number")
 
 
 def _decided(about: str, value: Callable[[Directive], Any], kind: Kind = "number") -> Word:
-    return Word(about, kind, True, lambda s: value(_link(s)))
+    return Word(about, kind, True, lambda s: value(_link(s)), value)
 
 
 def _of_peer(about: str, value: Callable[[Scope, int], Any]) -> Word:
-    return Word(about, "number", True, lambda s: value(s, _link(s).destination))
+    return Word(about, "number", True, lambda s: value(s, _link(s).destination), value)
 
 
 def _link(scope: Scope) -> Directive:

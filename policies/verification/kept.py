@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.user_code import is_users
 from sortie.policies.verification.symbols import Refused
+from sortie.scenarios.plugins.user_code import is_users
 
 _LEAVES = (
     int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Decimal, Fraction, range, complex,

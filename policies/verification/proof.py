@@ -251,8 +251,8 @@ def _search(
         for drones in range(1, max_drones + 1):
             try:
                 exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
-            except Combined:
-                make = solver_paths()
+            except Combined as combined:
+                make = solver_paths(str(combined))
                 exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
             coverage.exact = coverage.exact and exact
             coverage.drones = drones

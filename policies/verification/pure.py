@@ -17,7 +17,7 @@ import types
 from enum import Enum
 from typing import Any
 
-from sortie.policies.user_code import is_users
+from sortie.scenarios.plugins.user_code import is_users
 
 PURE_MODULES = frozenset({
     "__future__", "abc", "bisect", "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions",
@@ -87,7 +87,7 @@ _BUILTINS = {
         "bytearray",
     ]
 }
-_PLAIN = (
+_PLAIN: tuple[Any, ...] = (
     list, dict, set, frozenset, str, bytes, bytearray, tuple, int, float, bool, complex, range, types.MappingProxyType,
     collections.deque, collections.Counter, collections.OrderedDict, collections.defaultdict, re.Pattern, re.Match,
     type({}.keys()), type({}.values()), type({}.items()),

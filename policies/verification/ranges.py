@@ -161,7 +161,7 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def _origin(self) -> Unsearchable:
-        found: Unsearchable = tuple.__getitem__(self, 0)
+        found: Unsearchable = tuple.__getitem__(self, 0)  # type: ignore[assignment]
         return found
 
     def _number(self, name: str, low: float, high: float) -> Any:
@@ -169,7 +169,7 @@ class DescriptorOfRanges(Descriptor):
         return origin.system.path.number(f"{name} of drone {origin.drone}", low, high)
 
     @property
-    def agent_id(self) -> int:  # type: ignore[override]
+    def agent_id(self) -> int:
         return self._origin.drone
 
     @property
@@ -271,32 +271,32 @@ class DescriptorOfRanges(Descriptor):
     def _whole(self, *_: object, **__: object) -> NoReturn:
         self._origin.system.path.refuse("uses a whole descriptor, which cannot be searched")
 
-    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = _whole  # type: ignore[assignment]
-    __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole  # type: ignore[assignment]
-    _replace = _asdict = _make = with_roster = goodput_by_id = _whole  # type: ignore[assignment]
+    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = _whole
+    __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole
+    _replace = _asdict = _make = with_roster = goodput_by_id = _whole
 
     @property
     def coverage_corner(self) -> Any:
         return self._origin.system.path.refuse("reads coverage_corner, which cannot be searched")
 
     @property
-    def stamp_ns(self) -> Any:  # type: ignore[override]
+    def stamp_ns(self) -> Any:
         return _refusing(self, "stamp_ns")
 
     @property
-    def orientation_xyzw(self) -> Any:  # type: ignore[override]
+    def orientation_xyzw(self) -> Any:
         return _refusing(self, "orientation_xyzw")
 
     @property
-    def velocity_mps(self) -> Any:  # type: ignore[override]
+    def velocity_mps(self) -> Any:
         return _refusing(self, "velocity_mps")
 
     @property
-    def coverage_grid(self) -> Any:  # type: ignore[override]
+    def coverage_grid(self) -> Any:
         return _refusing(self, "coverage_grid")
 
     @property
-    def roster(self) -> Any:  # type: ignore[override]
+    def roster(self) -> Any:
         return _refusing(self, "roster")
 
     @property  # type: ignore[misc]
@@ -313,7 +313,7 @@ class ViewOfRanges(FleetView):
 
     __slots__ = ()
 
-    def _replace(self, **fields: Any) -> Any:  # type: ignore[override]
+    def _replace(self, **fields: Any) -> Any:
         if is_blind(sys._getframe(1)):  # mappings that a user's code made have the order that it gave them
             system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
             fields = {

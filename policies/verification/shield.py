@@ -12,42 +12,16 @@ left of it (`policies.verification.enforced`). There a limit keeps it from givin
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from sortie.policies.contract import (
-    DIRECTIVE_BOUNDS,
-    Directive,
-    Disc,
-    FleetView,
-    Policy,
-    Representation,
-    check_directives,
-)
-from sortie.policies.verification.invariants import (
-    Binary,
-    Invariant,
-    InvariantError,
-    LinksTerm,
-    Name,
-    Node,
-    Scope,
-    evaluate,
-    just_heard,
-    walk,
-)
+from sortie.policies.contract import Directive, FleetView, Policy, Representation, check_directives
+from sortie.policies.verification.compiled import Context, Part, Rule, compiled
+from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, just_heard, walk
+from sortie.policies.verification.nearest import distance, least_distance, nearest
 from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
-LEAST_RATE_HZ = 2.0
-"""The rate of a link that a shield makes carry something, if no line names a rate: the bottom rung of the paper's table."""
-_HIGHEST: dict[str, float] = {
-    **{name: bound.high for name, bound in DIRECTIVE_BOUNDS.items() if name != "duty_percent"},
-    "duty": 1.0,
-    "roi": 1.0,
-}
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
@@ -128,73 +102,123 @@ def enforce(
         allowed: which directives may replace others.
     """
     me, directives = view.me, list(decided)
-    if me is None:
+    if me is None or not rules:
         return directives
-    of_link = [rule for rule in rules if rule.of_link]
-    scope = Scope(view, me, directives, {d.destination: d for d in fresh})
+    context = Context(view, me, directives, {d.destination: d for d in fresh})
+    lines = [compiled(rule) for rule in rules]
+    of_link = _in_force([line for line in lines if line.invariant.of_link], context)
+    # Links with equal directives under the same lines get the same correction, unless a line names the peer.
+    shared = _is_shared(of_link)
+    solved: dict[Any, tuple[Directive | None, list[Invariant]]] = {}
     for k, directive in enumerate(directives):
-        broken = [r for r in of_link if not _satisfies(r, scope, directive)]
-        if broken:
-            directives[k] = _nearest_valid(scope, k, of_link, broken, allowed)
-    for rule in rules:
-        if not rule.of_link and not _satisfies(rule, scope, None):
-            _replace_one_link(scope, directives, rule, of_link, allowed)
+        if all(r.holds(context, directive) for r in of_link):
+            continue
+        applies = [r for r in of_link if r.when is None or r.when(context, directive)]
+        key = _key(directive, applies) if shared else None
+        if key is None or key not in solved:
+            parts = [part for r in applies for part in r.parts]
+            lost = [r.invariant for r in applies if not r.holds(context, directive)]
+            found = nearest(directive, parts, of_link, context, allowed), lost
+            if key is not None:
+                solved[key] = found
+        else:
+            found = solved[key]
+        after, lost = found
+        if after is None:
+            directives[k] = _not_replaced(directive, lost)
+        else:
+            directives[k] = _replaced(directive, after._replace(destination=directive.destination), lost)
+    for line in lines:
+        if not line.invariant.of_link and directives and not line.holds(context, directives[0]):
+            _replace_one_link(context, directives, line, of_link, allowed)
     return directives
 
 
-def _satisfies(rule: Invariant, scope: Scope, link: Directive | None) -> bool:
-    here = scope._replace(link=link)
-    return (rule.when is not None and not evaluate(rule.when, here)) or bool(evaluate(rule.then, here))
+def _is_shared(lines: Sequence[Rule], more: Sequence[Part] = ()) -> bool:
+    """Whether links with equal directives, to which the same lines apply, get the same correction."""
+    parts = [*more, *(part for rule in lines for part in rule.parts if rule.invariant.of_link)]
+    return not any(rule.when_mixed for rule in lines) and not any(part.of_peer for part in parts)
 
 
-def _nearest_valid(
-    scope: Scope,
-    k: int,
-    rules: Sequence[Invariant],
-    broken: Sequence[Invariant],
-    allowed: Callable[[Directive], bool],
-) -> Directive:
-    """The nearest directive for this link that keeps every rule about links."""
-    before = scope.directives[k]
-    for _, after in _candidates(before, rules, scope):
-        if allowed(after) and all(_satisfies(r, scope, after) for r in rules):
-            return _replaced(before, after, broken)
-    return _not_replaced(before, broken)
+def _key(directive: Directive, applies: Sequence[Rule] = ()) -> Any:
+    """What two directives have in common if a shield corrects them alike; None if a number is not a plain one."""
+    _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
+    numbers = (rung, rho, rate_hz, deadline_s, weight, duty)
+    return (*numbers, id(roi), *map(id, applies)) if all(type(x) in _PLAIN for x in numbers) else None
+
+
+_PLAIN = (float, int, Representation)
+
+
+def _in_force(lines: Sequence[Rule], context: Context) -> list[Rule]:
+    """The lines about links, without those that do not apply to any link now."""
+    some = Directive(context.view.ego, context.view.ego)
+    return [r for r in lines if r.when is None or r.when_of_link or r.when(context, some)]
 
 
 def _replace_one_link(
-    scope: Scope,
+    context: Context,
     directives: list[Directive],
-    rule: Invariant,
-    of_link: Sequence[Invariant],
+    rule: Rule,
+    of_link: Sequence[Rule],
     allowed: Callable[[Directive], bool],
 ) -> None:
     """Change one link, by the smallest change of any, so that a rule about all links holds.
 
     Args:
-        scope: has these same directives.
+        context: has these same directives.
     """
     best: tuple[tuple[int, float], int, Directive] | None = None
+    shared = bool(rule.any_link) and _is_shared([*of_link, rule], rule.any_link)
+    seen = set()
     for k, before in enumerate(list(directives)):
-        for far, after in _candidates(before, [*of_link, rule], scope):
-            if best is not None and far >= best[0]:
-                break
-            if not allowed(after):
+        applies = [r for r in of_link if r.when is None or r.when(context, before)]
+        key = _key(before, applies) if shared else None
+        if key is not None:
+            if key in seen or (best is not None and least_distance(before, rule.any_link, context) >= best[0]):
                 continue
-            directives[k] = after
-            if _satisfies(rule, scope, None) and all(_satisfies(r, scope, after) for r in of_link):
-                best = (far, k, after)
-                break
-        directives[k] = before
+            seen.add(key)
+        after = _one_link(context, directives, k, rule, applies, of_link, allowed)
+        if after is None:
+            continue
+        changed, far = distance(before, after)
+        if (
+            best is None or (changed, round(far, 2)) < best[0]
+        ):  # a hundredth of the bounds is no reason for another link
+            best = (changed, round(far, 2)), k, after
     if best is None:
-        directives[:] = [_not_replaced(d, [rule]) for d in directives]
+        directives[:] = [_not_replaced(d, [rule.invariant]) for d in directives]
     else:
         _, k, after = best
-        directives[k] = _replaced(directives[k], after, [rule])
+        directives[k] = _replaced(directives[k], after, [rule.invariant])
+
+
+def _one_link(
+    context: Context,
+    directives: list[Directive],
+    k: int,
+    rule: Rule,
+    applies: Sequence[Rule],
+    of_link: Sequence[Rule],
+    allowed: Callable[[Directive], bool],
+) -> Directive | None:
+    """The nearest directive for one link with which a rule about all links holds, and the rules about links too."""
+    before = directives[k]
+    parts = [part for r in applies for part in r.parts]
+    if rule.any_link:
+        return nearest(before, [*parts, *rule.any_link], of_link, context, allowed)
+
+    def holds(after: Directive) -> bool:
+        directives[k] = after
+        kept = rule.holds(context, after)
+        directives[k] = before
+        return kept and allowed(after)
+
+    return nearest(before, [*parts, *rule.parts], of_link, context, holds, only_all=rule)
 
 
 def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
-    because = "; ".join(rule.text for rule in broken)
+    because = "; ".join([rule.text for rule in broken])
     was = f"{NAME_OF[Representation(before.representation)]} at {before.rate_hz:g} Hz"
     return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
 
@@ -202,85 +226,3 @@ def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) 
 def _not_replaced(before: Directive, broken: Sequence[Invariant]) -> Directive:
     note = f"{MARK}cannot keep {'; '.join(rule.text for rule in broken)} "
     return before if before.reason.startswith(note) else before._replace(reason=f"{note}({before.reason})")
-
-
-# --- candidates ----------------------------------------------------------------------------------
-
-
-def _candidates(
-    before: Directive, rules: Sequence[Invariant], scope: Scope
-) -> Iterator[tuple[tuple[int, float], Directive]]:
-    """Directives that differ in the fields that the rules name, nearest first, each with its distance."""
-    here = scope._replace(link=before)
-    values: dict[str, set[float]] = {}
-    for rule in rules:
-        for top in (rule.when, rule.then):
-            if top is not None:
-                _collect_boundaries(top, here, values)
-    now = {word: _value(before, word) for word in values}
-    steps = {w: sorted(({0.0, _HIGHEST[w]} | values[w]) - {now[w]}) for w in sorted(values)}
-    waiting: list[tuple[tuple[int, float], Directive]] = []
-    # A change of this many names changes as many fields, or one more where a lower representation loses its budget.
-    for changes in range(1, len(steps) + 2):
-        for words in itertools.combinations(steps, changes):
-            for pick in itertools.product(*(steps[w] for w in words)):
-                found = _changed(before, dict(zip(words, pick, strict=True)), scope.me.region)
-                if found is not None:
-                    waiting.append((_distance(before, found), found))
-        near = [w for w in waiting if w[0][0] <= changes]
-        waiting = [w for w in waiting if w[0][0] > changes]
-        yield from sorted(near, key=lambda w: w[0])
-
-
-def _collect_boundaries(top: Node, scope: Scope, values: dict[str, set[float]]) -> None:
-    """Add to `values`, for each field that is named, the values at which the comparisons with it change their result."""
-    for node in walk(top):
-        if isinstance(node, Name) and node.word in _HIGHEST:
-            values.setdefault(node.word, set())
-        if not isinstance(node, Binary) or node.sign not in ("<", "<=", ">", ">=", "==", "!="):
-            continue
-        for side, other in ((node.left, node.right), (node.right, node.left)):
-            if isinstance(side, Name) and side.word in _HIGHEST and not isinstance(other, LinksTerm):
-                edge = evaluate(other, scope)
-                near = (edge - 1, edge, edge + 1) if side.word == "representation" else _around(edge)
-                values.setdefault(side.word, set()).update(v for v in near if 0 <= v <= _HIGHEST[side.word])
-
-
-def _around(edge: float) -> tuple[float, ...]:
-    """The edge, and a step to each side that is large enough to survive the wire's rounding."""
-    step = max(abs(edge), 0.01) * 0.01
-    return (edge - step, edge, edge + step) if math.isfinite(edge) else ()
-
-
-def _value(d: Directive, word: str) -> float:
-    if word == "duty":
-        return d.duty_percent / 100
-    return float(d.roi is not None) if word == "roi" else float(getattr(d, word))
-
-
-def _changed(before: Directive, wanted: dict[str, float], region: Disc | None) -> Directive | None:
-    """The directive with changed fields; None if there is no such directive."""
-    changed: dict[str, Any] = {}
-    for word, value in wanted.items():
-        if word == "representation":
-            if value != int(value):
-                return None
-            changed[word] = Representation(int(value))
-        elif word == "duty":
-            changed["duty_percent"] = round(value * 100)
-        elif word == "roi":
-            if value and region is None:
-                return None
-            changed["roi"] = region if value else None
-        else:
-            changed[word] = value
-    if changed.get("representation", Representation.FEATURES) < Representation.FEATURES and "rho" not in changed:
-        changed["rho"] = 0.0  # only features have cells
-    if changed.get("representation", 0) > 0 and before.rate_hz <= 0 and "rate_hz" not in changed:
-        changed["rate_hz"] = LEAST_RATE_HZ  # a link at 0 Hz carries nothing
-    return before._replace(**changed)
-
-
-def _distance(a: Directive, b: Directive) -> tuple[int, float]:
-    parts = [abs(_value(a, word) - _value(b, word)) / high for word, high in _HIGHEST.items()]
-    return sum(p > 0 for p in parts), sum(parts)

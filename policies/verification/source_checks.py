@@ -67,10 +67,10 @@ class Checks(ast.NodeTransformer):
         node.decorator_list = [ast.Call(_name("__decorator__"), [d], []) for d in node.decorator_list]
         return node
 
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> Any:
         return self._decorated(node)
 
-    def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
+    def visit_ClassDef(self, node: ast.ClassDef) -> Any:
         return self._decorated(node)
 
     def visit_For(self, node: ast.For) -> ast.AST:

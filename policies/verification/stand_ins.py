@@ -66,7 +66,7 @@ class InAnyOrder(dict[int, Any]):
         self._path.refuse("compares or writes out a whole mapping of drones")
 
     __eq__ = __ne__ = __or__ = __ror__ = __repr__ = __hash__ = _whole  # type: ignore[assignment]
-    __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = _whole  # type: ignore[assignment]
+    __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = _whole
 
 
 def is_blind(frame: Any) -> bool:
@@ -162,6 +162,8 @@ class Space:
     def _cannot(self, *_: object, **__: object) -> NoReturn:
         self._system.path.refuse("reads the name of a feature_space")
 
+    __hash__ = _cannot
+
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return str
@@ -180,8 +182,6 @@ for _kind, _refusal in (
     for _operator in _OPERATORS.split():
         if f"__{_operator}__" not in vars(_kind):
             setattr(_kind, f"__{_operator}__", _refusal)
-    if "__hash__" in vars(_kind) and vars(_kind)["__hash__"] is None:
-        _kind.__hash__ = _refusal
 Sequence.register(TargetIds)  # a pattern of a sequence meets its length
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 from sortie.policies.contract import Policy
-from sortie.policies.user_calls import Guarded, Source
 from sortie.policies.verification.instrument import instrumented
 from sortie.policies.verification.shield import Shielded
+from sortie.scenarios.plugins.user_calls import Guarded, Source
 
 OWN_INVARIANTS = "INVARIANTS"
 """The name under which a policy's file keeps its own invariants, as text."""

@@ -176,7 +176,7 @@ class Ranged:
         if at_low == at_high:
             return at_low
         whole = isinstance(low, int) and isinstance(high, int)
-        a, b = (low, high) if whole else (_ordinal(low), _ordinal(high))
+        a, b = (int(low), int(high)) if whole else (_ordinal(low), _ordinal(high))
         if not self._steps and not whole and -_EXACT <= c <= _EXACT:  # the boundary is the constant itself
             a = _ordinal(float(c) if or_at else math.nextafter(c, -math.inf))
             b = a + 1
@@ -331,6 +331,10 @@ class Ranged:
         low, high = self._path.ranges[self._axis]
         written = format(self._at(low), spec)  # also for a wide range, because a wrong spec must raise
         return written if low == high else Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
+
+    def _text(self, spec: str) -> str:
+        format(0.0 if isinstance(self, float) else 0, spec)
+        return Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
 
     def __str__(self) -> str:
         return self.__format__("")

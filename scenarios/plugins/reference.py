@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.errors import SortieError
-from sortie.scenarios.plugins.user_calls import LOAD_S, Guarded, guarded, watched
+from sortie.scenarios.plugins.user_calls import LOAD_S, Guarded, Source, guarded, watched
 from sortie.scenarios.plugins.user_code import imported_files, is_users, load
 
 FILE = re.compile(r".+\.py:[^\W\d]\w*")
@@ -141,7 +141,7 @@ def from_file(kind: str, reference: str, error: type[SortieError] = PluginError)
         inspect.signature(function)
     except (TypeError, ValueError) as failure:  # some of those written in C
         raise error(f"{kind} file {file!r}: {attribute!r} names no parameters, must be a Python function") from failure
-    return guarded(function)
+    return function if isinstance(function, Guarded) else Guarded(function, Source(path, attribute, vars(module)))
 
 
 def _from_package(kind: str, entry: EntryPoint, error: type[SortieError]) -> Callable[..., Any]:

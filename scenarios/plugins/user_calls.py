@@ -71,9 +71,9 @@ class Guarded:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The function's answer."""
         watch = _WATCHES.get(threading.get_ident())
-        late = self._late or (watch.late.get(self._origin, "") if watch is not None and self._origin else "")
-        if late:
-            raise TookTooLongError(late)
+        known = self._late or (watch.late.get(self._origin, "") if watch is not None and self._origin else "")
+        if known:
+            raise TookTooLongError(known)
         try:
             if watch is None or watch.calling:
                 return self.__wrapped__(*args, **kwargs)

@@ -161,7 +161,7 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
     if file is None and not isinstance(own, str | None):
         raise RunError(f"{source} is of type {type(own).__name__}, must be text")
     try:
-        return parse((own or "") if file is None else file.read_text("utf-8"))
+        return parse(str(own or "") if file is None else file.read_text("utf-8"))
     except OSError as error:
         raise RunError(f"{file}: {error.strerror}") from error
     except InvariantError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -167,3 +168,13 @@ def test_a_line_that_larger_fleets_break_is_not_proved_for_them() -> None:
 def test_a_proof_says_how_large_the_fleets_are() -> None:
     verdict = quick(everyone, "count_links(representation > none) <= 2", views=0)[-1]
     assert (verdict.outcome, verdict.what.partition(",")[0]) == ("proved", "all views of up to 2 drones")
+
+
+def test_without_the_solver_the_verdict_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "z3", None)
+    verdict = quick(planted("best_goodput"), drones=3)[0]
+    assert verdict.outcome == "drawn"
+    assert verdict.what.startswith(
+        "Cannot analyse: it combines goodput of drone 0 to drone 2 and goodput of drone 0 to drone 1, and z3 is not "
+        "installed (pip install sortie-sim[verify])"
+    )
