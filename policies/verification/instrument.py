@@ -217,8 +217,7 @@ def _without_address(text: str) -> str:
 
 def _written(value: Any, conversion: int, spec: str) -> Any:
     if conversion != -1:
-        write: Callable[[Any], str] = {115: str, 114: repr, 97: ascii}[conversion]
-        value = write(value)
+        value = repr(value) if conversion == 114 else ascii(value) if conversion == 97 else str(value)
     if isinstance(value, Outside):
         value._used()
     return format(value, spec) if _is_stand_in(value) else _without_address(format(value, spec))

@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from sortie.policies.contract import Directive, FleetView, Policy, Representation, check_directives
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation, check_directives
 from sortie.policies.verification.compiled import Context, Part, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, just_heard, walk
-from sortie.policies.verification.nearest import distance, least_distance, nearest
+from sortie.policies.verification.nearest import LEAST_RATE_HZ, distance, least_distance, nearest
 from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
@@ -114,7 +114,7 @@ def enforce(
         if all(r.holds(context, directive) for r in of_link):
             continue
         applies = [r for r in of_link if r.when is None or r.when(context, directive)]
-        key = _key(directive, applies) if shared else None
+        key = _key(directive, applies, allowed) if shared else None
         if key is None or key not in solved:
             parts = [part for r in applies for part in r.parts]
             lost = [r.invariant for r in applies if not r.holds(context, directive)]
@@ -140,13 +140,24 @@ def _is_shared(lines: Sequence[Rule], more: Sequence[Part] = ()) -> bool:
     return not any(rule.when_mixed for rule in lines) and not any(part.of_peer for part in parts)
 
 
-def _key(directive: Directive, applies: Sequence[Rule] = ()) -> Any:
-    """What two directives have in common if a shield corrects them alike; None if a number is not a plain one."""
+def _key(directive: Directive, applies: Sequence[Rule], allowed: Callable[[Directive], bool]) -> Any:
+    """What two directives have in common if a shield corrects them alike; None if a number is not a plain one.
+
+    What a link is allowed depends on the age of its peer: it is asked for the highest directive and for the lowest rung.
+    """
     _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
     numbers = (rung, rho, rate_hz, deadline_s, weight, duty)
-    return (*numbers, id(roi), *map(id, applies)) if all(type(x) in _PLAIN for x in numbers) else None
+    if not all(type(x) in _PLAIN for x in numbers):
+        return None
+    caps = [allowed(directive._replace(representation=r, rate_hz=hz, rho=0.0)) for r, hz in _PROBES]
+    return (*numbers, id(roi), *map(id, applies), *caps)
 
 
+_PROBES = (
+    (Representation.RAW, DIRECTIVE_BOUNDS["rate_hz"].high),
+    (Representation.DETECTIONS, LEAST_RATE_HZ),
+    (Representation.NONE, 0.0),
+)
 _PLAIN = (float, int, Representation)
 
 
@@ -173,7 +184,7 @@ def _replace_one_link(
     seen = set()
     for k, before in enumerate(list(directives)):
         applies = [r for r in of_link if r.when is None or r.when(context, before)]
-        key = _key(before, applies) if shared else None
+        key = _key(before, applies, allowed) if shared else None
         if key is not None:
             if key in seen or (best is not None and least_distance(before, rule.any_link, context) >= best[0]):
                 continue

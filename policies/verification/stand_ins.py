@@ -5,12 +5,9 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from sortie.policies.verification.symbols import Path
-
-if TYPE_CHECKING:
-    from sortie.policies.verification.ranges import FleetOfRanges
 
 FLAGS = 8
 """The bits of a descriptor's novelty flags; the plane uses three of them."""
@@ -21,7 +18,7 @@ class Unsearchable:
 
     __slots__ = ("drone", "name", "system")
 
-    def __init__(self, system: FleetOfRanges, drone: int, name: str) -> None:
+    def __init__(self, system: Any, drone: int, name: str) -> None:
         self.system, self.drone, self.name = system, drone, name
 
     def _reached(self, *_: object, **__: object) -> NoReturn:
@@ -146,7 +143,7 @@ class TargetIds:
 class Space:
     """A drone's feature space, known only by whether it is the ego's."""
 
-    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
+    def __init__(self, system: Any, agent_id: int) -> None:
         self._system, self._id = system, agent_id
 
     def __eq__(self, other: object) -> bool:
