@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
+from sortie.policies.contract import PERSON_FLAG, Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.representation import NAME_OF
 
@@ -62,8 +62,8 @@ def _decided(about: str, value: Callable[[Directive], Any], kind: Kind = "number
     return Word(about, kind, True, lambda s: value(_link(s)), value)
 
 
-def _of_peer(about: str, value: Callable[[Scope, int], Any]) -> Word:
-    return Word(about, "number", True, lambda s: value(s, _link(s).destination), value)
+def _of_peer(about: str, value: Callable[[Scope, int], Any], kind: Kind = "number") -> Word:
+    return Word(about, kind, True, lambda s: value(s, _link(s).destination), value)
 
 
 def _link(scope: Scope) -> Directive:
@@ -104,6 +104,22 @@ WORDS: dict[str, Word] = {
     "age_s": _of_peer("age of the peer's descriptor", lambda s, p: s.view.age_s[p]),
     "age_periods": _of_peer("the same in periods", lambda s, p: s.view.age_s[p] / s.view.period_s),
     "peer_battery": _of_peer("the peer's state of charge, 0 … 1", lambda s, p: s.view.descriptors[p].battery_soc),
+    "human": _view_word(
+        "the ego's own thermal camera found a person in its region",
+        lambda s: s.me.novelty_flags & PERSON_FLAG != 0,
+        "truth",
+    ),
+    "peer_human": _of_peer(
+        "the peer's thermal camera found a person in the peer's region",
+        lambda s, p: s.view.descriptors[p].novelty_flags & PERSON_FLAG != 0,
+        "truth",
+    ),
+    "peer_phase": _of_peer("the peer's phase", lambda s, p: s.view.descriptors[p].task_phase),
+    "same_network": _of_peer(
+        "the peer has the ego's network, so it can fuse the ego's maps",
+        lambda s, p: s.view.shares_features_with(p),
+        "truth",
+    ),
     **DECISIONS,
 }
 """Every name that an invariant may use."""

@@ -207,7 +207,8 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def task_phase(self) -> TaskPhase:
-        return self._origin.system.path.pick(f"task_phase of drone {self._origin.drone}", tuple(TaskPhase))
+        path: Path = self._origin.system.path
+        return path.pick(f"task_phase of drone {self._origin.drone}", tuple(TaskPhase))
 
     @property
     def feature_space(self) -> Any:
@@ -269,7 +270,8 @@ class DescriptorOfRanges(Descriptor):
         return not self.__eq__(other)
 
     def _whole(self, *_: object, **__: object) -> NoReturn:
-        self._origin.system.path.refuse("uses a whole descriptor, which cannot be searched")
+        path: Path = self._origin.system.path
+        path.refuse("uses a whole descriptor, which cannot be searched")
 
     __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = _whole
     __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole
@@ -277,7 +279,7 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def coverage_corner(self) -> Any:
-        return self._origin.system.path.refuse("reads coverage_corner, which cannot be searched")
+        return _refusing(self, "coverage_corner")
 
     @property
     def stamp_ns(self) -> Any:
@@ -305,7 +307,8 @@ class DescriptorOfRanges(Descriptor):
 
 
 def _refusing(descriptor: DescriptorOfRanges, name: str) -> NoReturn:
-    descriptor._origin.system.path.refuse(f"reads {name}, which cannot be searched")
+    path: Path = descriptor._origin.system.path
+    path.refuse(f"reads {name}, which cannot be searched")
 
 
 class ViewOfRanges(FleetView):

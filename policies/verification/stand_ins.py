@@ -22,7 +22,8 @@ class Unsearchable:
         self.system, self.drone, self.name = system, drone, name
 
     def _reached(self, *_: object, **__: object) -> NoReturn:
-        self.system.path.refuse(f"reads {self.name} in a way that cannot be searched")
+        path: Path = self.system.path
+        path.refuse(f"reads {self.name} in a way that cannot be searched")
 
 
 class InAnyOrder(dict[int, Any]):
@@ -147,7 +148,8 @@ class Space:
         self._system, self._id = system, agent_id
 
     def __eq__(self, other: object) -> bool:
-        path, ego = self._system.path, self._system.ego
+        path: Path = self._system.path
+        ego: int = self._system.ego
         if not isinstance(other, Space) or ego not in (self._id, other._id):
             path.refuse("compares feature_space with anything but the ego's")
         peer = other._id if self._id == ego else self._id
@@ -157,7 +159,8 @@ class Space:
         return not self.__eq__(other)
 
     def _cannot(self, *_: object, **__: object) -> NoReturn:
-        self._system.path.refuse("reads the name of a feature_space")
+        path: Path = self._system.path
+        path.refuse("reads the name of a feature_space")
 
     __hash__ = _cannot
 

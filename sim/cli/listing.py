@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from sortie.perception.detectors import DETECTORS
 from sortie.policies.registry import POLICIES, missing_parts, parameters
+from sortie.policies.verification.invariants import CONSTANTS, LINK_FUNCTIONS, WORDS
 from sortie.scenarios.plugins.reference import installed
 from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load
@@ -18,7 +19,7 @@ from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import out
 
-WHAT = "policies, scenarios, campaigns, detectors, fusions, path_loss, link, power, event"
+WHAT = "policies, scenarios, campaigns, detectors, fusions, invariants, path_loss, link, power, event"
 
 
 SCHEMAS: dict[str, type[BaseModel]] = {
@@ -65,6 +66,12 @@ def list_(
 
         for name, fusion in FUSIONS.items():
             out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)
+    elif what == "invariants":
+        for name, word in WORDS.items():
+            scope = " (of each link)" if word.of_link else ""
+            out.print(f"[bold]{name}[/bold]  {escape(word.about)}{scope}", soft_wrap=True)
+        out.print(f"functions over all links: {', '.join(LINK_FUNCTIONS)}", soft_wrap=True)
+        out.print(f"names of values: {', '.join(CONSTANTS)}", soft_wrap=True)
     elif what in SCHEMAS:
         out.print_json(data=SCHEMAS[what].model_json_schema())
     else:

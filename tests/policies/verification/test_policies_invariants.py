@@ -82,7 +82,7 @@ def test_a_text_has_a_line_each_and_comments() -> None:
     ("line", "message"),
     [
         ("rate_hz", "'rate_hz' is a number, must be true or false"),
-        ("when human: roi", "unknown word 'human', known: battery, cpu"),
+        ("when humans: roi", "unknown word 'humans', known: battery, cpu"),
         ("when battery < 0.3 rate_hz <= 2", "a condition ends with a colon"),
         ("rate_hz <=", "'rate_hz <=' is not an expression"),
         ("roi < 3", "'roi' must be a number"),
