@@ -421,7 +421,10 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
         ("policies", ["worked", "random-2", "silence", "when2com-style", "Missing: learned keys and queries"]),
         ("scenarios", ["track_target", "paper_replay", "person_crossing", "search_grid", "two_makes"]),
         ("detectors", ["torch", "none"]),
-        ("invariants", ["human_in_region", "same_network", "rate_hz  rate, Hz (of each link)", "any_link", "detections"]),
+        (
+            "invariants",
+            ["human_in_region", "same_network", "rate_hz  rate, Hz (of each link)", "any_link", "detections"],
+        ),
     ],
 )
 def test_list(what: str, words: list[str]) -> None:
