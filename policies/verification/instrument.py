@@ -22,7 +22,7 @@ from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.pure import IMPURE, PURE_MODULES, cannot_call, is_seeded, is_trusted, takes_ranges
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.stand_ins import FOR_USER
-from sortie.policies.verification.symbols import Ranged, Refused, Text
+from sortie.policies.verification.symbols import MARK, Ranged, Refused, Text
 from sortie.scenarios.plugins.user_code import is_users, load
 
 STAND_INS = (
@@ -133,6 +133,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     for value in (*args, *kwargs.values()):
         if isinstance(value, Outside):
             value._used()
+        if type(value) is types.BuiltinFunctionType and type(value.__self__) is str:
+            _stop("hands on a method of a text")
         if callable(value) and function not in (isinstance, issubclass) and (why := cannot_call(value)) is not None:
             _reach(why[1:]) if why.startswith("!") else _stop(why)
         if type(value) in (set, frozenset) and function not in _BLIND_TO_SETS:
@@ -146,11 +148,19 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         return found
     owner = getattr(function, "__self__", None)
     if type(owner) is str:
-        if any(map(_has_text, (*args, *kwargs.values()))):
+        if function.__name__ in ("format", "format_map") or any(map(_has_text, (*args, *kwargs.values()))):
             return _stands_for_text(function, args, kwargs)
     elif type(owner) in (set, frozenset) and function.__name__ in ("pop", "__iter__"):
         _each(owner)
-    return function(*args, **kwargs)
+    return _without_mark(function(*args, **kwargs))
+
+
+def _without_mark(found: Any) -> Any:
+    """What a call returned; plain text into which a number was written is refused, because its use is not noticed."""
+    parts = found if type(found) in (list, tuple) else (found,)
+    if any(type(part) is str and MARK in part for part in parts):
+        _stop("uses the text of a number inside other text for more than a reason")
+    return found
 
 
 assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
@@ -182,7 +192,7 @@ def _stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any
             _stop("makes text of an iterator")
     found = next((part for part in parts if _is_stand_in(part)), None)
     if found is None:
-        return function(*args, **kwargs)
+        return _without_mark(function(*args, **kwargs))
     if isinstance(found, Text | Ranged):
         return Text(found._path, found._axis, "text with a number")
     return _stop("makes text of what is known as a range alone")
@@ -204,7 +214,7 @@ def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
     def act(*args: Any) -> Any:
         if len(args) != 1 or _is_stand_in(args[0]):
             return NotImplemented
-        return _without_address(write(args[0]))
+        return _without_mark(_without_address(write(args[0])))
 
     return act
 
@@ -220,7 +230,7 @@ def _written(value: Any, conversion: int, spec: str) -> Any:
         value = repr(value) if conversion == 114 else ascii(value) if conversion == 97 else str(value)
     if isinstance(value, Outside):
         value._used()
-    return format(value, spec) if _is_stand_in(value) else _without_address(format(value, spec))
+    return format(value, spec) if _is_stand_in(value) else _without_mark(_without_address(format(value, spec)))
 
 
 def _text(*parts: Any) -> Any:
@@ -236,7 +246,7 @@ def _percent(left: Any, right: Any) -> Any:
     if type(left) in (str, bytes) and any(map(_has_text, right if type(right) is tuple else (right,))):
         found = next((p for p in (right if type(right) is tuple else (right,)) if isinstance(p, Text | Ranged)), None)
         return _stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
-    return left % right
+    return _without_mark(left % right)
 
 
 def _own(owner: Any, name: str) -> Any:

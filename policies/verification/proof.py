@@ -212,8 +212,8 @@ def prove(
 class _Coverage:
     """What the search of a policy covered."""
 
-    def __init__(self, asked: int, budget: Budget) -> None:
-        self.asked, self.drones, self.budget = asked, 0, budget
+    def __init__(self, asked: int, period_s: float, budget: Budget) -> None:
+        self.asked, self.drones, self.period_s, self.budget = asked, 0, period_s, budget
         self.exact = True
         self.cannot = ""
         """Why no search can follow the policy."""
@@ -230,7 +230,9 @@ class _Coverage:
         spent = f"the time of {self.budget.budget_s:g} s ended in fleets of {self.drones + 1}" if self.stopped else ""
         if self.drones < min(2, self.asked):
             return "searched", f"{found.cells} cells; {spent}"
-        cells = f"all views of up to {self.drones} drones, {found.cells} cells" + (f"; {spent}" if spent else "")
+        cells = f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, {found.cells} cells" + (
+            f"; {spent}" if spent else ""
+        )
         return ("proved" if self.exact else "proved over the reals"), cells
 
 
@@ -238,7 +240,7 @@ def _search(
     policy: Policy, properties: list[tuple[Searched, Property]], max_drones: int, period_s: float, budget: Budget
 ) -> _Coverage:
     """Search fleet by fleet until all is covered, the time is over, or the policy cannot be followed."""
-    coverage = _Coverage(max_drones, budget)
+    coverage = _Coverage(max_drones, period_s, budget)
 
     def confirm(searched: Searched, fault: Found) -> bool:
         prop = next(p for s, p in properties if s is searched)

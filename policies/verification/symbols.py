@@ -330,11 +330,11 @@ class Ranged:
         """The number's text if the range is a single number; otherwise a text that can only be used as a reason."""
         low, high = self._path.ranges[self._axis]
         written = format(self._at(low), spec)  # also for a wide range, because a wrong spec must raise
-        return written if low == high else Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
+        return written if low == high else Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
 
     def _text(self, spec: str) -> str:
         format(0.0 if isinstance(self, float) else 0, spec)
-        return Text(self._path, self._axis, f"{_MARK}{self._axis}{_MARK}")
+        return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
 
     def __str__(self) -> str:
         return self.__format__("")
@@ -398,7 +398,8 @@ _INHERITED = {
 for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _INHERITED:
     setattr(Text, _method, Text._refused)
 
-_MARK = "\ue000"
+MARK = "\ue000"
+"""Stands in a text where a number with a range was written."""
 _EXACT = 2.0**53
 """Up to here every whole number is a float."""
 
