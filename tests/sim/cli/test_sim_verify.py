@@ -224,3 +224,27 @@ def test_any_view_becomes_a_scenario(phase: TaskPhase) -> None:
 def test_slugs_are_names() -> None:
     assert slug("mine/x.py:decide(rho=0.1)") == "mine_x_py_decide_rho_0_1"
     assert slug("≤") == "rule"
+
+
+ALIASES = {
+    "alias": "from sortie.policies.catalogue.baselines import everyone\ndecide = everyone\n",
+    "wrapper": "import functools\nfrom sortie.policies.catalogue.baselines import everyone\ndecide = functools.wraps(everyone)(lambda view: everyone(view))\n",
+    "object": "from sortie.policies.catalogue.baselines import everyone\nclass Policy:\n    def __call__(self, view):\n        return everyone(view)\ndecide = Policy()\n",
+}
+
+
+@pytest.mark.parametrize("kind", ALIASES)
+def test_the_files_invariants_hold_however_the_policy_is_made(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(f"INVARIANTS = 'rate_hz <= 5'\n{ALIASES[kind]}")
+    assert command("verify", f"{path}:decide", *QUICK, "--out", tmp_path / "out") == 1
+    assert "rate_hz <= 5" in capsys.readouterr().out
+
+
+def test_invariants_that_are_no_text_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(f"INVARIANTS = ['rate_hz <= 5']\n{ALIASES['alias']}")
+    assert command("verify", f"{path}:decide", *QUICK, "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err == f"error: {path}:decide: INVARIANTS is of type list, must be text\n"
