@@ -29,7 +29,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.catalogue import adaptive, baselines
-from sortie.policies.catalogue.coverage_cells import disc_around, seen_well
+from sortie.policies.catalogue.coverage_cells import disc_around, seen_well, sees
 from sortie.policies.catalogue.deputies import RESTING_DUTY_PERCENT, deputies
 from sortie.policies.catalogue.freshness import AGEING, freshness
 from sortie.policies.catalogue.prior.hydracollab import hydracollab
@@ -39,6 +39,7 @@ from sortie.policies.catalogue.prior.where2comm import REQUEST_MAP_BYTES
 from sortie.policies.catalogue.vantage import over_region
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import (
+    COVERAGE_CELL_M,
     FEATURE_CELLS,
     FEATURE_MAP_MEGABITS,
     Descriptor,
@@ -430,6 +431,34 @@ def both(view, *, far_m=1.0, rho=0.1):
     assert plain(view) == (1.0, 0.0, "default")
 
 
+def test_of_equal_drones_the_next_after_the_receiver_serves_it() -> None:
+    """So that not one drone serves all."""
+    view = at_one_place(fleet_of(4))
+    view = changed(view, coverage_grid=bytes(64))
+    for name in ("who2com-style", "deputies"):
+        servers = {
+            peer: [
+                ego
+                for ego in range(4)
+                if ego != peer
+                and by_peer(POLICIES[name](of_ego(view, ego), **({"k": 1} if name == "deputies" else {})))[peer].rate_hz
+            ]
+            for peer in range(4)
+        }
+        assert servers == {peer: [(peer + 1) % 4] for peer in range(4)}
+
+
+def test_a_drone_sees_a_disc_that_reaches_into_a_cell_that_it_sees() -> None:
+    """The cell's middle may lie beyond the disc by half of the cell's diagonal."""
+    me = fleet_of(1).descriptors[0]._replace(coverage_grid=bytes([0b01] + [0] * 63))  # the south-west cell alone
+    row, column = me.coverage_corner
+    x_m, y_m = (column + 0.5) * COVERAGE_CELL_M, (row + 0.5) * COVERAGE_CELL_M
+    half_diagonal_m = COVERAGE_CELL_M * math.sqrt(2) / 2
+    for beyond_m, seen in ((0.0, True), (0.95 * half_diagonal_m, True), (1.05 * half_diagonal_m, False)):
+        assert sees(me, Disc(x_m - 30.0 - beyond_m, y_m, 30.0)) == seen
+    assert not sees(me._replace(coverage_grid=bytes(64)), Disc(x_m, y_m, 30.0))
+
+
 # --- damping and hysteresis ------------------------------------------------------------------------------------------
 
 
@@ -442,6 +471,27 @@ def test_a_disc_in_force_follows_its_target_and_does_not_grow_before_its_dwell_t
     assert (link.enforced.roi, link.enforced.rho, link.enforced.rate_hz) == (Disc(60, 10, 20), 0.1, 5.0)
     link = damp(link, small._replace(roi=Disc(60, 10, 40), rho=0.1, rate_hz=10.0), 1.5, 1.0)
     assert (link.enforced.roi, link.enforced.rate_hz) == (Disc(60, 10, 40), 10.0)
+
+
+USUAL = Directive(0, 1, FEATURES, 0.4, Disc(0, 0, 30), 5.0, 0.2, 0.5, 50, "usual")
+
+
+@pytest.mark.parametrize(
+    ("field", "less", "more"),
+    [
+        ("representation", DETECTIONS, Representation.RAW), ("rho", 0.1, 0.9), ("roi", Disc(0, 0, 10), Disc(0, 0, 60)),
+        ("roi", Disc(0, 0, 10), None), ("rate_hz", 2.0, 10.0), ("fusion_weight", 0.25, 1.0), ("duty_percent", 20, 100),
+    ],
+)  # fmt: skip
+def test_each_field_alone_falls_at_once_and_rises_after_its_dwell_time(field: str, less: Any, more: Any) -> None:
+    down = damp(DampedLink(USUAL), USUAL._replace(**{field: less}), 5.0, 1.0)
+    assert getattr(down.enforced, field) == less
+    up = damp(DampedLink(USUAL), USUAL._replace(**{field: more}), 5.0, 1.0)
+    assert getattr(up.enforced, field) == getattr(USUAL, field)
+    up = damp(up, USUAL._replace(**{field: more}), 5.9, 1.0)
+    assert getattr(up.enforced, field) == getattr(USUAL, field)
+    up = damp(up, USUAL._replace(**{field: more}), 6.0, 1.0)
+    assert getattr(up.enforced, field) == more
 
 
 @pytest.mark.parametrize("quantity", ["battery_soc", "cpu_headroom", "gpu_headroom"])
