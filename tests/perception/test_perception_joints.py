@@ -36,6 +36,8 @@ from perception_examples import capture, cross
 from scipy.special import ndtr
 
 from sortie.perception import budget
+from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.evaluation.selection import choose
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
 from sortie.perception.lateness import map_weight, own_age_s, weighed
@@ -45,6 +47,7 @@ from sortie.perception.scene.render import Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.draws import Drawn, DrawSource
+from sortie.perception.surrogate.exchange import FeatureShares
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.thermal import NOBODY, look
 from sortie.perception.types import Boxes, Capture, Share
@@ -239,6 +242,54 @@ def test_only_boxes_that_were_cut_leave_places_open(boxes: int, kind: str) -> No
     assert source.boxes.score[0] == alone.score[0]
     near = source_of(share._replace(roi=Disc(0.0, 0.0, 20.0)), alone)
     assert not near.truncated  # few are inside, however many there are
+
+
+def test_cells_that_went_missing_are_counted_among_those_that_were_allowed() -> None:
+    """A rank is a share of the allowed cells, however few of them were sent."""
+    one = np.ones((1, 1))
+    shares = FeatureShares(
+        np.array([0]), np.array([[0]]), 100 * one, 4096 * one, np.full((1, 1, 3), np.inf), one, np.zeros((1, 1, 3)),
+        {(0, 0): np.array([40])},
+    )  # fmt: skip
+    sent = np.array([[True], [True], [True]])
+    shares.drop_missing(sent, np.array([[40.5], [41.5], [1.5]], np.float32) / 4096, np.zeros(3, np.intp))
+    assert sent.ravel().tolist() == [False, True, True]
+
+
+def test_a_drone_without_a_look_takes_the_heaviest_map_for_its_own_whatever_came_first() -> None:
+    blind, a, b = cross(10.0, 20.0, 0.3)[:3]
+    blind = blind._replace(looked=False)
+    light, heavy = Share(a, "raw", 1.0, None, 0.3), Share(b, "raw", 1.0, None, 1.0)
+    detector = torch_detector()
+    one, other = (detector.detect([(blind, shares)])[0] for shares in ([light, heavy], [heavy, light]))
+    assert len(one) == len(other) > 3
+    np.testing.assert_allclose(one.score, other.score, atol=1e-3)
+    np.testing.assert_allclose(one.xy_m, other.xy_m, atol=2e-2)
+
+
+def test_the_surrogate_announces_as_many_boxes_as_it_finds_on_average() -> None:
+    """False positives among them."""
+    looks = [capture(10.0 * k, 5.0, drone=k % 5, t_s=2.0 + 0.5 * k) for k in range(40)]
+    found = np.mean([len(boxes) for boxes in surrogate().detect([(c, []) for c in looks])])
+    told = np.mean([surrogate().count_boxes(c, None) for c in looks])
+    assert told == pytest.approx(found, rel=0.25)
+    cars = np.mean([len(surrogate().truth(c.t_s, c)) for c in looks])
+    assert told > surrogate()._found_alone * cars + 0.8 * surrogate()._alarms_alone
+
+
+def test_random_peers_of_an_evaluation_are_drawn_for_each_ego_and_frame() -> None:
+    condition = Sharing(0.1, "random-2")
+    drawn = {
+        ego: [
+            tuple(sorted((p - ego) % 5 for p in choose(condition, ego, np.full(5, 0.5), (frame,))))
+            for frame in range(60)
+        ]
+        for ego in range(5)
+    }
+    for ego, peers in drawn.items():
+        assert len(set(peers)) == 6  # every pair of four
+        for other in set(drawn) - {ego}:
+            assert sum(x == y for x, y in zip(peers, drawn[other], strict=True)) < 30
 
 
 # --- scores ----------------------------------------------------------------------------------------------------------------

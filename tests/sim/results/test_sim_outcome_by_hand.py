@@ -10,12 +10,14 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
 from sortie.scenarios.reading.load import loads
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
+from sortie.sim.results.regions import Regions
 
 SCENARIO = """
 name: by_hand
@@ -239,6 +241,31 @@ def test_counts_and_ratios(result: dict[str, Any]) -> None:
     assert result["policies"]["decisions"] == {"worked": 8}
     assert result["realtime_factor"] == pytest.approx(2.0)
     assert result["medium_busy_fraction"] == 0.125
+
+
+def test_people_and_trucks_are_no_cars_in_any_average_precision_of_cars(result: dict[str, Any]) -> None:
+    """Also not among what a drone that is gone would have had to find."""
+    full = record()
+    tables = dict(full.tables)
+    for name in ("truths", "detections"):
+        table = tables[name].append_column("kind", pa.array([0] * tables[name].num_rows, pa.int8()))
+        more = []
+        for t_s, drone in ((2.5, 0), (3.5, 1)) if name == "truths" else ((2.5, 0),):
+            for kind, x_m in ((1, 1.0), (2, 4.0)):
+                row = {"t_s": t_s, "drone": drone, "x_m": x_m, "y_m": 0.0, **CAR, "kind": kind, "car": 9, "score": 0.95}
+                more.append({c: row[c] for c in table.column_names})
+        both = [*table.to_pylist(), *more]
+        both.sort(key=lambda r: (r["t_s"], r["drone"]))
+        tables[name] = pa.table({f.name: pa.array([r[f.name] for r in both], f.type) for f in table.schema})
+    assert outcome(replace(full, tables=tables))["ap50"] == result["ap50"]
+
+
+def test_a_disc_holds_from_the_instant_of_its_row() -> None:
+    """In a frame that is scored at its begin, the frame's own disc counts."""
+    full = record()
+    at = Regions(full.tables["mission"], full.scenario.mission).at([1.0, 1.999, 2.0, 2.5, 9.0], [0, 1, 0, 1, 0])
+    assert np.isnan(at[:2]).all()
+    assert at[2:].tolist() == [[0.0, 0.0, 10.0]] * 3
 
 
 def test_nothing_has_no_ratios() -> None:
