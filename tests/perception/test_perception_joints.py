@@ -267,14 +267,11 @@ def test_a_drone_without_a_look_takes_the_heaviest_map_for_its_own_whatever_came
     np.testing.assert_allclose(one.xy_m, other.xy_m, atol=2e-2)
 
 
-def test_the_surrogate_announces_as_many_boxes_as_it_finds_on_average() -> None:
+def test_the_surrogate_announces_as_many_boxes_as_the_network_finds() -> None:
     """False positives among them."""
-    looks = [capture(10.0 * k, 5.0, drone=k % 5, t_s=2.0 + 0.5 * k) for k in range(40)]
-    found = np.mean([len(boxes) for boxes in surrogate().detect([(c, []) for c in looks])])
-    told = np.mean([surrogate().count_boxes(c, None) for c in looks])
-    assert told == pytest.approx(found, rel=0.25)
-    cars = np.mean([len(surrogate().truth(c.t_s, c)) for c in looks])
-    assert told > surrogate()._found_alone * cars + 0.8 * surrogate()._alarms_alone
+    looks = [capture(10.0 * k, 5.0, drone=k, t_s=2.0 + 0.5 * k) for k in range(4)]
+    found = np.mean([torch_detector().count_boxes(c, None) for c in looks])
+    assert np.mean([surrogate().count_boxes(c, None) for c in looks]) == pytest.approx(found, rel=0.15)
 
 
 def test_random_peers_of_an_evaluation_are_drawn_for_each_ego_and_frame() -> None:

@@ -243,6 +243,16 @@ def test_a_drone_that_waits_does_nothing_before_it_joins_and_acts_when_it_comes_
     assert (captured[drone == 3] >= 1.5 - 1e-6).all()
 
 
+def test_a_drone_that_came_back_is_replaced_again_when_it_goes_again() -> None:
+    came_back = "{kind: drone_lost, at_s: 1, drone: 1}, {kind: drone_joins, at_s: 2, drone: 1}, {kind: drone_lost, at_s: 3, drone: 1}"
+    group = "mission.groups=[{drones: [1, 3, 4], reserve: [3, 4], phases: [{phase: search}]}]"
+    record = run_sortie(example("duration_s=4", group, f"events=[{came_back}]"))
+    took_over = [
+        (round(r["t_s"], 1), r["drone"]) for r in record.tables["events"].to_pylist() if "takes over" in r["text"]
+    ]
+    assert took_over == [(1.0, 3), (3.0, 4)]
+
+
 # --- energy and headrooms -----------------------------------------------------------------------------------------
 
 
