@@ -29,7 +29,7 @@ MODELS = {
     "policy.name": "policy",
 }
 """The kind of model that a field names. Makes name policies and power models too, changes of policy name
-policies, and events of kind `own` name events."""
+policies, events of kind `own` name events, and `metrics` metrics."""
 
 
 def builtin(field: str) -> tuple[str, ...]:
@@ -100,6 +100,8 @@ def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
         yield "policy", change, "name"
     for event in sections.get("events", ()):
         yield from (("event", *at) for at in _given(event, ("model",)))
+    for metric in sections.get("metrics", {}).values():
+        yield from (("metric", *at) for at in _given(metric, ("model",)))
 
 
 def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[dict[str, Any], str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -15,6 +15,7 @@ from sortie.scenarios.schema.events import BaseEvent, Event, LinkDrop
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Camera, Fleet, Make, Network
 from sortie.scenarios.schema.limits import Limits
+from sortie.scenarios.schema.metric import Metric
 from sortie.scenarios.schema.mission import Mission
 from sortie.scenarios.schema.perception import Perception
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
@@ -42,6 +43,9 @@ class Scenario(Section):
     record: RecordSection = RecordSection()
     limits: Limits = Limits()
     events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
+    metrics: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], Metric] = Field(
+        {}, description="Figures of one's own, by name; in the outcome as metrics.NAME (docs/guide/metric.md)."
+    )
     expect: tuple[Expectation, ...] = Field(
         (), max_length=1000, description="What the outcome must satisfy; asserted by `sortie check`."
     )

@@ -278,4 +278,4 @@ def _metric_keys(study: Study, policies: Sequence[Mapping[str, Any]]) -> dict[st
     if not any(name.startswith(PARAMS) for name in vary):  # else every run has another name for its policy
         flown += policies
     names = [named_policy(one["name"], dict(sorted(one["params"].items()))).name for one in flown]  # as tasks have them
-    return open_keys(study.drones, phases, names, traced=traced)
+    return open_keys(study.drones, phases, names, traced=traced, metrics=base.metrics)

@@ -19,7 +19,7 @@ from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import out
 
-WHAT = "policies, scenarios, campaigns, detectors, fusions, invariants, path_loss, link, power, event"
+WHAT = "policies, scenarios, campaigns, detectors, fusions, invariants, path_loss, link, power, sensor, event, metric"
 
 
 SCHEMAS: dict[str, type[BaseModel]] = {
@@ -57,7 +57,7 @@ def list_(
         for name, kind in DETECTORS.items():
             out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
         _installed("detector")
-    elif what in (*MODELS.values(), "event"):
+    elif what in (*MODELS.values(), "event", "metric"):
         for name in next((builtin(field) for field, kind in MODELS.items() if kind == what), ()):
             out.print(f"[bold]{name}[/bold]", soft_wrap=True)
         _installed(what)

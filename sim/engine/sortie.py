@@ -40,6 +40,7 @@ from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.own_events import OwnEvents
+from sortie.sim.engine.own_metrics import own_metrics
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
@@ -123,8 +124,9 @@ def run_sortie(
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
         fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
+        metrics = own_metrics(record)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
-    return dataclasses.replace(record, own_files=files, wall=wall)
+    return dataclasses.replace(record, own_files=files, metrics=metrics, wall=wall)
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
         "disagreement": disagreement.figures(
             disagreement.pairs_of(tables[disagreement.TABLE]) if disagreement.TABLE in tables else ()
         ),
+        "metrics": dict(record.metrics),
         "policy_eval_us": {
             "p50": record.wall.get("policy_eval_us_p50"),
             "p99": record.wall.get("policy_eval_us_p99"),

@@ -329,6 +329,7 @@ class Outcome(TypedDict):
     disagreement: Annotated[
         Disagreement, "How often drones' views lead to different choices; null without `record.disagreement`."
     ]
+    metrics: Annotated[dict[str, float | None], "Figures of the user's own, by the names in `metrics`.", ANY]
     policy_eval_us: Annotated[Percentiles, "Wall time of a decision; no part of the fingerprint."]
     wall_s: Annotated[float | None, "Wall time of the flight; no part of the fingerprint."]
     realtime_factor: Annotated[float | None, "Simulated over wall time; no part of the fingerprint."]
@@ -346,13 +347,16 @@ REASONS = {
 """By fate: the reasons that the radio gives; what arrived in part has those of what was lost or expired."""
 
 
-def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bool) -> dict[str, Collection[str]]:
+def open_keys(
+    drones: int, phases: int, policies: Collection[str], *, traced: bool, metrics: Collection[str] = ()
+) -> dict[str, Collection[str]]:
     """What the objects of an outcome that are open (`*` in the reference) may be keyed by, and how many phases there are.
 
     Args:
         drones, phases: at most so many.
         policies: those that may decide, as the record names them.
         traced: whether drones may follow a trace.
+        metrics: names of the user's own.
     """
     ids = tuple(map(str, range(drones)))
     part = {Status.PARTIAL: (*REASONS[Status.LOST], *REASONS[Status.EXPIRED])}
@@ -365,6 +369,7 @@ def open_keys(drones: int, phases: int, policies: Collection[str], *, traced: bo
         "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
         "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
         "phases": tuple(map(str, range(phases))),
+        "metrics": metrics,
         "own_files": (),  # digests are no numbers
     }
 

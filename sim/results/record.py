@@ -158,6 +158,8 @@ class SortieRecord:
     """Which fit a surrogate detector is of; None with any other."""
     own_files: Mapping[str, str] = field(default_factory=dict)
     """Digests of the files beside the package, as `sortie.sim.identity.own_files`; no part of the fingerprint."""
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    """Figures of the user's own, by name; no part of the fingerprint."""
     wall: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock figures (seconds, microseconds); no part of the fingerprint."""
 

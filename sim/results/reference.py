@@ -107,7 +107,10 @@ def _value(kind: Any) -> str:
     if is_typeddict(kind):
         return "object"
     if origin is dict:
-        return "object" if is_typeddict(of[1]) else f"object of {_NAMES[of[1]]}s"
+        if is_typeddict(of[1]):
+            return "object"
+        kinds = get_args(of[1]) or (of[1],)
+        return f"object of {_NAMES[kinds[0]]}s" + " or null" * (NoneType in kinds)
     if origin is list:
         return "list" if is_typeddict(of[0]) else f"list of {_NAMES[of[0]]}s"
     if origin is UnionType:

@@ -136,6 +136,7 @@ def save(
             "calibration": record.calibration,
             "detector": record.detector,
             "own_files": dict(record.own_files),
+            "metrics": dict(record.metrics),
             "totals": dict(record.totals),
             "wall": dict(record.wall),
         }

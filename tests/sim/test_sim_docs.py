@@ -70,7 +70,16 @@ def test_every_example_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: p
 
 
 def test_the_guide_is_there_and_has_examples() -> None:
-    assert [p.stem for p in GUIDE] == ["README", "detector", "event", "link_model", "policy", "power_model", "scenario"]
+    assert [p.stem for p in GUIDE] == [
+        "README",
+        "detector",
+        "event",
+        "link_model",
+        "metric",
+        "policy",
+        "power_model",
+        "scenario",
+    ]
     assert sum(len(examples(p)) for p in GUIDE) >= 12
 
 

@@ -114,3 +114,24 @@ class Storm:
 class Calm(Storm):
     def step(self, fleet):
         self.steps.append(fleet.t_s)
+
+
+def sent(record, *, times=1.0):
+    """How many payloads were sent."""
+    return times * record.tables["transmissions"].num_rows
+
+
+def nothing(record):
+    return None
+
+
+def words(record):
+    return "many"
+
+
+def endless(record):
+    return float("inf")
+
+
+def fails(record):
+    return record.tables["no such table"]

@@ -26,8 +26,8 @@ from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
 
-NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record", "limits")
-"""Words for people, what is asserted about the outcome, what is kept beside the record, and wall-clock time."""
+NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record", "limits", "metrics")
+"""Words for people, what is asserted about the outcome or computed from the record, what is kept beside the record, and wall-clock time."""
 
 IN_MAKES = {"fleet.makes.name", "fleet.makes.weights"}
 """Networks of makes, which the name stands for; test_sim_makes.py."""

@@ -13,6 +13,7 @@ from sim_examples import example
 from sortie.scenarios.errors import SortieError
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.run_folder import load, save
 
 SOURCE = Path(__file__).parent / "own_models.py"
 
@@ -143,3 +144,35 @@ def test_it_may_lose_a_drone_and_take_energy(models: str) -> None:
 def test_what_an_event_may_not_do_is_refused(wrong: str, message: str, models: str) -> None:
     with pytest.raises(SortieError, match=message):
         fly(storm(f"{{wrong: {wrong}}}"))
+
+
+def test_a_metric_of_ones_own_is_in_the_outcome_and_changes_nothing_else(models: str) -> None:
+    named = f"metrics={{all: {{model: '{models}:sent'}}, half: {{model: '{models}:sent', params: {{times: 0.5}}}}, none: {{model: '{models}:nothing'}}}}"
+    plain, own = fly(), fly(named)
+    assert own["metrics"] == {
+        "all": sum(own["payload_fates"].values()),
+        "half": own["metrics"]["all"] / 2,
+        "none": None,
+    }
+    assert (plain["metrics"], plain["fingerprint"]) == ({}, own["fingerprint"])
+
+
+def test_a_saved_run_keeps_its_metrics_without_their_file(models: str, tmp_path: Path) -> None:
+    record = run_sortie(example("duration_s=3", f"metrics={{all: {{model: '{models}:sent'}}}}"))
+    save(record, tmp_path / "run")
+    Path(models).unlink()
+    assert outcome(load(tmp_path / "run"))["metrics"] == record.metrics
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("words", r"^metric all \(mine.py:words\): returns 'many', must be a finite number or None$"),
+        ("endless", r"^metric all \(mine.py:endless\): returns inf, must be a finite number or None$"),
+        ("fails", r"^metric fails: KeyError: 'no such table' \(mine.py, line \d+\)$"),
+        ("gone", r"^metric file 'mine.py' has no function or class 'gone'$"),
+    ],
+)
+def test_a_metric_that_is_no_number_is_told(function: str, message: str, models: str) -> None:
+    with pytest.raises(SortieError, match=message):
+        fly(f"metrics={{all: {{model: '{models}:{function}'}}}}")
