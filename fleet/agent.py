@@ -217,17 +217,19 @@ class Agent:
     def look(self, frame: int, sensed: Sensed) -> None:
         """The gate's part: look in as many frames as its directives want, and send what the look gives."""
         duty = self._gate.duty_percent
-        self.status.perceiving = self.status.looks and (frame + 1) * duty // 100 > frame * duty // 100
+        looks = self.status.looks and not self.status.blocked
+        self.status.perceiving = looks and (frame + 1) * duty // 100 > frame * duty // 100
         self.status.work.looks += self.status.perceiving
         if self.status.perceiving:
             self._look = sensed
-            self._env.timeout(self._compute_delay_s, sensed.capture).callbacks.append(self._send)
+            delay_s = self._compute_delay_s + sum(self.status.slower_s.values())
+            self._env.timeout(delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------
 
     def _publish(self, sensed: Sensed, due: bool) -> Descriptor:
         """Publish this frame's descriptor if one is due, and return it as rounded by the wire."""
-        capture, velocity_mps, footprint_m, here = sensed
+        capture, velocity_mps, footprint_m, here, orientation_xyzw = sensed
         grid, novel = self._covered(capture.t_s, here, due)
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids, person = self._senses.task()
@@ -239,7 +241,7 @@ class Agent:
             stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
             agent_id=self.drone,
             position_m=capture.est_position_m,
-            orientation_xyzw=capture.orientation_xyzw,
+            orientation_xyzw=orientation_xyzw,
             velocity_mps=velocity_mps,
             footprint_radius_m=footprint_m,
             battery_soc=soc,

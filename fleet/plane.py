@@ -88,6 +88,10 @@ class DroneStatus:
     """Whether perception runs in the current frame."""
     clock_skew_s: float = 0.0
     """Error of the drone's clock."""
+    blocked: set[int] = field(default_factory=set)
+    """Scenario events by which its cameras see nothing."""
+    slower_s: dict[int, float] = field(default_factory=dict)
+    """What scenario events add to the time from sensing to features ready to send."""
     work: Work = field(default_factory=Work)
     """What the drone's computer did so far."""
     lies: dict[int, Callable[[Descriptor], Descriptor]] = field(default_factory=dict)

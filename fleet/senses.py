@@ -5,11 +5,14 @@ It follows from the motion alone, so it is computed for many frames and all dron
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from sortie.fleet.coverage import Poses, View, footprint_radius_m, views
 from sortie.fleet.flight.motion import Trajectories
+from sortie.fleet.sensor_faults import Array, turned
 from sortie.perception.geometry import Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.types import Capture
@@ -28,13 +31,27 @@ class Sensed(NamedTuple):
     footprint_radius_m: float
     view: View
     """What its cameras see, if it looks."""
+    orientation_xyzw: tuple[float, float, float, float]
+    """Its orientation as it publishes it: the true one, turned by what a fault of its heading adds."""
 
 
 class FlightSenses:
     """What all drones sense; `at(frame)[drone]`. Sensors trigger with the frame."""
 
-    def __init__(self, motion: Trajectories, frame_s: float, field: HeightField, cameras: Sequence[Cameras]) -> None:
-        """Args: `field`: what hides the ground from the drones' cameras; `cameras`: each drone's."""
+    def __init__(
+        self,
+        motion: Trajectories,
+        frame_s: float,
+        field: HeightField,
+        cameras: Sequence[Cameras],
+        errors: Mapping[int, Array] | None = None,
+    ) -> None:
+        """Args:
+        field: what hides the ground from the drones' cameras.
+        cameras: each drone's.
+        errors: by drone, what faults add to its believed pose (`sortie.fleet.sensor_faults`).
+        """
+        self._errors = errors or {}
         self._motion, self._frame_s, self._field, self._cameras = motion, frame_s, field, cameras
         self._first = -_BLOCK
         self._block: list[tuple[Sensed, ...]] = []
@@ -49,23 +66,36 @@ class FlightSenses:
         self._first = frame // _BLOCK * _BLOCK
         frames = slice(self._first, self._first + _BLOCK)
         m = self._motion
-        states = m.position_m, m.orientation_xyzw, m.yaw_rad, m.est_position_m, m.est_yaw_rad
-        seen = zip(*views(Poses(*(v[frames] for v in states)), self._field, self._cameras), strict=True)
-        self._block = list(zip(*(self._of(drone, frames, view) for drone, view in enumerate(seen)), strict=True))
+        believed_m, believed_yaw = m.est_position_m[frames], m.est_yaw_rad[frames]
+        if self._errors:
+            believed_m, believed_yaw = np.array(believed_m), np.array(believed_yaw)
+            for drone, error in self._errors.items():
+                believed_m[:, drone] += error[frames, :3]
+                believed_yaw[:, drone] = np.mod(believed_yaw[:, drone] + error[frames, 3] + np.pi, 2 * np.pi) - np.pi
+        poses = Poses(m.position_m[frames], m.orientation_xyzw[frames], m.yaw_rad[frames], believed_m, believed_yaw)
+        seen = zip(*views(poses, self._field, self._cameras), strict=True)
+        self._block = list(zip(*(self._of(drone, frames, poses, view) for drone, view in enumerate(seen)), strict=True))
 
-    def _of(self, drone: int, frames: slice, views: Sequence[View]) -> list[Sensed]:
+    def _of(self, drone: int, frames: slice, poses: Poses, views: Sequence[View]) -> list[Sensed]:
         """One drone in some frames."""
-        m, cameras = self._motion, self._cameras[drone]
+        cameras = self._cameras[drone]
         position, orientation, velocity, believed = (
-            map(tuple, states[frames, drone].tolist())
-            for states in (m.position_m, m.orientation_xyzw, m.velocity_mps, m.est_position_m)
-        )
-        yaw = m.est_yaw_rad[frames, drone].tolist()
-        radius = footprint_radius_m(m.est_position_m[frames, drone, 2], cameras).tolist()
+            map(tuple, states[:, drone].tolist())
+            for states in (
+                poses.position_m, poses.orientation_xyzw, self._motion.velocity_mps[frames], poses.est_position_m,
+            )
+        )  # fmt: skip
+        yaw = poses.est_yaw_rad[:, drone].tolist()
+        radius = footprint_radius_m(poses.est_position_m[:, drone, 2], cameras).tolist()
+        error = self._errors.get(drone)
+        wrong_rad = [0.0] * len(yaw) if error is None else error[frames, 3].tolist()
         return [
-            Sensed(Capture(drone, frame * self._frame_s, at, turn, est, heading, cameras=cameras), v, r, view)
-            for frame, v, r, view, at, turn, est, heading in zip(
+            Sensed(
+                Capture(drone, frame * self._frame_s, at, turn, est, heading, cameras=cameras),
+                v, r, view, turned(turn, wrong) if wrong else turn,
+            )
+            for frame, v, r, view, at, turn, est, heading, wrong in zip(
                 range(frames.start, frames.start + len(yaw)), velocity, radius, views, position, orientation, believed,
-                yaw, strict=True,
+                yaw, wrong_rad, strict=True,
             )
         ]  # fmt: skip

@@ -26,6 +26,7 @@ MODELS = {
     "perception.detector": "detector",
     "perception.recorded_fusion": "fusion",
     "fleet.airframe.power_model": "power",
+    "fleet.sensor": "sensor",
     "policy.name": "policy",
 }
 """The kind of model that a field names. Makes name policies and power models too, changes of policy name

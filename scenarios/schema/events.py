@@ -72,6 +72,49 @@ class GnssLoss(BaseEvent):
     kind: Literal["gnss_loss"]
     drone: DroneId | None = Field(None, description="Who loses it; left out, all drones.")
     until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    position_walk_m: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="Dead reckoning: standard deviation of the believed position's error after one second, per horizontal axis; it grows with the square root of time.",
+    )
+
+
+Metres = Annotated[float, Field(ge=-10000, le=10000)]
+Speed = Annotated[float, Field(ge=-1000, le=1000)]
+
+
+class PositionFault(BaseEvent):
+    kind: Literal["position_fault"]
+    drone: DroneId = Field(description="Who believes to be somewhere else.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    offset_m: tuple[Metres, Metres, Metres] = Field(
+        (0.0, 0.0, 0.0), description="A jump of the believed position, ENU (x, y, z)."
+    )
+    drift_mps: tuple[Speed, Speed, Speed] = Field(
+        (0.0, 0.0, 0.0), description="How fast the believed position drifts from then on, ENU."
+    )
+
+
+class HeadingFault(BaseEvent):
+    kind: Literal["heading_fault"]
+    drone: DroneId = Field(description="Who believes to look elsewhere.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    offset_deg: float = Field(0.0, ge=-180, le=180, description="Added to the believed heading, counter-clockwise.")
+    drift_dps: float = Field(0.0, ge=-90, le=90, description="Degrees a second by which it drifts from then on.")
+
+
+class CameraBlocked(BaseEvent):
+    kind: Literal["camera_blocked"]
+    drone: DroneId = Field(description="Whose cameras see nothing.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+
+
+class SlowPerception(BaseEvent):
+    kind: Literal["slow_perception"]
+    drone: DroneId = Field(description="Whose computer takes longer.")
+    until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
+    extra_s: float = Field(0.2, gt=0, le=10, description="Added to the time from sensing to features ready to send.")
 
 
 class Spoof(BaseEvent):
@@ -115,6 +158,10 @@ Event = Annotated[
     | GnssLoss
     | Spoof
     | Lie
+    | PositionFault
+    | HeadingFault
+    | CameraBlocked
+    | SlowPerception
     | Own,
     Field(discriminator="kind"),
 ]

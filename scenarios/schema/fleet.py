@@ -306,6 +306,11 @@ class Fleet(Section):
     computer: Computer = Computer()
     camera: Camera = Camera()
     clock: Clocks = Clocks()
+    sensor: Annotated[str, ModelName("sensor")] | None = Field(
+        None,
+        description="A model of one's own that adds errors to what drones believe of their pose (docs/guide/sensor.md).",
+    )
+    sensor_params: Params = Field({}, description="Its keyword arguments.")
     makes: tuple[Make, ...] = Field(
         (), description="Kinds of drones that differ from the fleet's; other drones are as the fleet says."
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import struct
 from collections.abc import Generator
 from typing import Any
@@ -14,6 +15,7 @@ from sortie.fleet.messages.auth import TRAILER_BYTES, Sealer
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.scenarios.schema import (
     BatteryFault,
+    CameraBlocked,
     CellFailure,
     ClockDrift,
     ClockSkew,
@@ -22,11 +24,14 @@ from sortie.scenarios.schema import (
     DroneLost,
     Event,
     GnssLoss,
+    HeadingFault,
     Jam,
     Lie,
     LinkDrop,
     Own,
+    PositionFault,
     Scenario,
+    SlowPerception,
     Spoof,
 )
 from sortie.scenarios.streams import stream
@@ -37,6 +42,10 @@ from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import World, at, with_frame
 
 OVERSIZED_BYTES = 2000
+LASTING = (
+    LinkDrop, Jam, Lie, GnssLoss, Own, PositionFault, HeadingFault, CameraBlocked, SlowPerception,
+)  # fmt: skip
+"""Events that have an end."""
 
 
 def group_key(seed: int) -> bytes:
@@ -66,7 +75,7 @@ def schedule(
         at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
     for begin in begins:
         event = begin.event
-        if isinstance(event, LinkDrop | Jam | Lie | GnssLoss | Own) and event.until_s is not None:
+        if isinstance(event, LASTING) and event.until_s is not None:
             at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
 
 
@@ -129,6 +138,14 @@ class _Begin:
                     world.read_clocks()
             case Own():
                 self.own.begin(self.index, event.model)
+            case PositionFault() | HeadingFault():
+                world.note(event.drone, event.kind, _fault(event))
+            case CameraBlocked():
+                world.drones[event.drone].blocked.add(self.index)
+                world.note(event.drone, "camera_blocked", "its cameras see nothing")
+            case SlowPerception():
+                world.drones[event.drone].slower_s[self.index] = event.extra_s
+                world.note(event.drone, "slow_perception", f"its perception takes {event.extra_s:g} s longer")
             case Spoof():
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
@@ -146,6 +163,14 @@ class _Begin:
                 world.note(-1, "jam_over", "the jammer is off")
             case Own():
                 self.own.end(self.index, event.model)
+            case PositionFault() | HeadingFault():
+                world.note(event.drone, f"{event.kind}_over", "its believed pose has its usual errors again")
+            case CameraBlocked():
+                world.drones[event.drone].blocked.discard(self.index)
+                world.note(event.drone, "camera_clear", "its cameras see again")
+            case SlowPerception():
+                del world.drones[event.drone].slower_s[self.index]
+                world.note(event.drone, "slow_perception_over", "its perception takes its usual time again")
             case GnssLoss() | Lie():
                 for drone in whom(event, self.scenario.fleet.drones):
                     world.note(drone, *world.own[drone].end(event, self.index, env.now))
@@ -182,6 +207,13 @@ class _Begin:
                 return rng.bytes(len(genuine))
             case "oversized":
                 return genuine + bytes(OVERSIZED_BYTES)
+
+
+def _fault(event: PositionFault | HeadingFault) -> str:
+    if isinstance(event, HeadingFault):
+        return f"believes its heading {event.offset_deg:g}° off, drifting by {event.drift_dps:g}° a second"
+    offset_m, drift_mps = (math.hypot(*vector) for vector in (event.offset_m, event.drift_mps))
+    return f"believes to be {offset_m:.3g} m away, drifting at {drift_mps:.3g} m/s"
 
 
 def _ends(drop: LinkDrop) -> str:

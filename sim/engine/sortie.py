@@ -20,6 +20,7 @@ from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.plane import DroneStatus, PlaneRules, equipment_of
+from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
 from sortie.perception.scene.scene_model import SceneModel
@@ -200,7 +201,8 @@ def build(
     gnss, drawn = scenario.fleet.clock.gnss, oscillators(scenario.fleet.clock, len(drones), seed, replication)
     own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people)
+    errors = sensor_errors(scenario, motion.position_m, seed, replication)
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -106,6 +106,7 @@ class World:
         recorder: Recorder,
         own: Sequence[OwnState],
         people: People,
+        errors: Mapping[int, np.ndarray],
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
             env, motion, batteries, air, scene, plan,
@@ -123,7 +124,8 @@ class World:
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w = fleet_power_w(scenario.fleet, motion)
         self._cameras = cameras_of(scenario.fleet)
-        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, self._cameras)
+        self._errors = errors
+        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, self._cameras, errors)
         recorder.unfold["states"] = self._unfold_states
         self._delays_s = scenario.compute_delays_s
         self._busy_sensing = [min(1.0, delay_s * scenario.context.rate_hz) for delay_s in self._delays_s]
@@ -196,7 +198,9 @@ class World:
         """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion)
-        self._flight = FlightSenses(motion, self._scenario.frame_s, self.scene.height_field, self._cameras)
+        self._flight = FlightSenses(
+            motion, self._scenario.frame_s, self.scene.height_field, self._cameras, self._errors
+        )
         self.air.reroute(motion.position_m, motion.up())
 
     def drain(self) -> None:

@@ -145,7 +145,7 @@ class MavlinkSenses:
             self._drone, state.pose_s + self._offset_s, state.position_m, state.orientation_xyzw, state.position_m,
             float(yaw), cameras=cameras,
         )  # fmt: skip
-        return Sensed(capture, state.velocity_mps, radius_m, view)
+        return Sensed(capture, state.velocity_mps, radius_m, view, capture.orientation_xyzw)
 
     @property
     def refused(self) -> dict[str, int]:

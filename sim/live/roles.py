@@ -207,4 +207,6 @@ class RoleNode:
         t_s = own.stamp_ns * 1e-9 - self._memory.status.clock_skew_s
         yaw = float(yaw_rad(own.orientation_xyzw))
         capture = Capture(own.agent_id, t_s, own.position_m, own.orientation_xyzw, own.position_m, yaw)
-        return Sensed(capture, own.velocity_mps, own.footprint_radius_m, View(0, 0, own.coverage_grid))
+        return Sensed(
+            capture, own.velocity_mps, own.footprint_radius_m, View(0, 0, own.coverage_grid), own.orientation_xyzw
+        )

@@ -8,15 +8,19 @@ from pydantic import BaseModel
 
 from sortie.scenarios.schema import (
     BatteryFault,
+    CameraBlocked,
     CellFailure,
     DroneJoins,
     DroneLeaves,
     DroneLost,
     Event,
+    HeadingFault,
     Jam,
     LinkDrop,
     Own,
+    PositionFault,
     Scenario,
+    SlowPerception,
     Spoof,
 )
 
@@ -74,6 +78,8 @@ def _why_not(event: Event, vehicles: Collection[int]) -> Iterator[str]:
             yield "spoof: no attacker joins the bus"
         case LinkDrop() | Jam():
             yield f"{event.kind}: it changes the replayed goodput alone, the bus loses nothing"
+        case PositionFault() | HeadingFault() | CameraBlocked() | SlowPerception():
+            yield f"{event.kind}: live drones believe their own poses"
         case Own():
             yield "own: it acts on the simulated flight that is replayed, not on the bus"
         case DroneJoins() | DroneLeaves() | DroneLost() | BatteryFault() | CellFailure() if event.drone in vehicles:

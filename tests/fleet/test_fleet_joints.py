@@ -542,7 +542,8 @@ class Rig:
 
     # senses
     def sense(self, frame: int) -> Sensed:
-        return Sensed(capture(0, frame * 0.1), (0.0, 0.0, 0.0), 42.0, View(0, 0, bytes(64)))
+        now = capture(0, frame * 0.1)
+        return Sensed(now, (0.0, 0.0, 0.0), 42.0, View(0, 0, bytes(64)), now.orientation_xyzw)
 
     def platform(self) -> Platform:
         return Platform(0.9, 1.0, 1.0)

@@ -374,6 +374,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "events.lost_fraction": ("charge of 1", ">"),
     "events.skew_s": ("error of stamps", ">"),
     "events.drift_ppm": ("error of stamps", "<"),
+    "events.extra_s": ("time to send", ">"),
     "events.rate_hz": ("drops", ">"),
     "perception.weights": ("detections", "<"),
     "perception.sample_rate_hz": ("fusions", ">"),
@@ -427,6 +428,11 @@ UNSIGNED: dict[str, str] = {
     "policy.replays.at_s": _KIND,
     "policy.replays.drone": _KIND,
     "policy.replays.view": _KIND,
+    **{
+        f"events.{name}": _BELIEF for name in ("offset_m", "drift_mps", "offset_deg", "drift_dps", "position_walk_m")
+    },
+    "fleet.sensor": _BELIEF,
+    "fleet.sensor_params": _BELIEF,
     "events.about": _KIND,
     "events.claim": _KIND,
     "events.attack": _KIND,

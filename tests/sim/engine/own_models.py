@@ -135,3 +135,9 @@ def endless(record):
 
 def fails(record):
     return record.tables["no such table"]
+
+
+def drifts(times_s, positions_m, rng, *, mps=5.0):
+    error = np.zeros((len(times_s), 4))
+    error[:, 1] = mps * times_s
+    return error

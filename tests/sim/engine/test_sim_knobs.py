@@ -66,7 +66,14 @@ FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
 BURSTS = "radio.bursts.good_to_bad=0.3"
 LINKS = str(Path(__file__).parent / "links.csv")
 OWN = Path(__file__).parent / "own_models.py"
-WALL, NOISY, POWER, ALL_SEEN, STORM = (f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient", "Storm"))
+WALL, NOISY, POWER, ALL_SEEN, STORM, DRIFTS = (
+    f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient", "Storm", "drifts")
+)
+AWAY = "events=[{kind: position_fault, at_s: 1, drone: 1, offset_m: [0, 40, 0]}]"
+ASTRAY = "events=[{kind: heading_fault, at_s: 1, drone: 1, offset_deg: 30}]"
+SLOW = "events=[{kind: slow_perception, at_s: 1, drone: 1, extra_s: 0.02}]"
+BLOCKED = "events=[{kind: camera_blocked, at_s: 1, until_s: 4, drone: 1}]"
+LOST_GNSS = "events=[{kind: gnss_loss, at_s: 1, drone: 1}]"
 STORMS = f"events=[{{kind: own, at_s: 1, until_s: 4, model: '{STORM}'}}]"
 
 AT_2 = "policy.changes=[{at_s: 2, name: worst-2}]"
@@ -167,6 +174,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.airframe.drag_area_m2": ("0.03", ()),
     "fleet.airframe.air_density_kgpm3": ("1.1", ()),
     "fleet.airframe.power_model": ("momentum", ()),
+    "fleet.sensor": (DRIFTS, ()),
+    "fleet.sensor_params": ("{mps: 20}", (f"fleet.sensor={DRIFTS}",)),
     "fleet.airframe.power_params": ("{power_w: 150}", (f"fleet.airframe.power_model={POWER}",)),
     "fleet.trace": ("TRACE", ()),
     "fleet.makes.drones": ("[2]", (MADE,)),
@@ -309,6 +318,12 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "events.drift_ppm": ("50000", (DRIFT,)),
     "events.model": (f"{OWN}:Calm", (STORMS,)),
     "events.params": ("{loss_db: 3}", (STORMS,)),
+    "events.offset_m": ("[0, 0, 0]", (AWAY,)),
+    "events.drift_mps": ("[0, 10, 0]", (AWAY,)),
+    "events.offset_deg": ("0", (ASTRAY,)),
+    "events.drift_dps": ("20", (ASTRAY,)),
+    "events.position_walk_m": ("20", (LOST_GNSS,)),
+    "events.extra_s": ("0.3", (SLOW,)),
     "events.about": ("battery", (LIE,)),
     "events.claim": ("little", (LIE,)),
     "events.attack": ("oversized", (SPOOF,)),
@@ -433,7 +448,9 @@ def test_a_knob_changes_the_record(field: str, tmp_path: Path) -> None:
     assert_moved(field, before, after)
 
 
-@pytest.mark.parametrize("event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW, STORMS])
+@pytest.mark.parametrize(
+    "event", [JAM, DROP, SPOOF, LIE, LOST, JOINS, LEAVES, FAULT, CELL, SKEW, STORMS, AWAY, ASTRAY, SLOW, BLOCKED]
+)
 def test_every_kind_of_event_changes_the_record(event: str) -> None:
     assert flown(event).fingerprint != flown().fingerprint
 

@@ -1,0 +1,108 @@
+"""What a drone's sensors get wrong beyond their usual errors: faults that scenario events name, and sensors of one's own.
+
+They change what a drone believes of its pose. That enters its descriptors and places its features and boxes in the world.
+Scoring goes by what is true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.scenarios import scratch
+from sortie.scenarios.plugins.reference import PluginError, checked_call, name_of, resolve
+from sortie.scenarios.schema import GnssLoss, HeadingFault, PositionFault, Scenario
+from sortie.scenarios.streams import stream
+
+Array = NDArray[np.float64]
+COLUMNS = 4
+"""x, y, z in metres (ENU), and heading in radians, counter-clockwise."""
+
+
+class OwnSensor(Protocol):
+    """A sensor of one's own, `fleet.sensor`. Keyword-only arguments are its parameters."""
+
+    def __call__(self, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Any:
+        """The error of one drone's believed pose, added to the usual errors.
+
+        Args:
+            times_s: [T], the begin of each frame of the flight.
+            positions_m: [T, 3], ENU, the drone's true positions as planned.
+            rng: for all its random numbers; each drone has its own.
+
+        Returns:
+            [T, 4]: x, y, z in metres and heading in radians, counter-clockwise.
+        """
+
+
+def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication: int) -> Mapping[int, Array]:
+    """By drone: the error of its believed pose in each frame, [T, 4]; drones without one are left out.
+
+    Args:
+        scenario: its events and its `fleet.sensor`.
+        positions_m: [T, N, 3], ENU, true.
+        seed, replication: as in `sortie.scenarios.streams.stream`.
+
+    Raises:
+        PluginError: a sensor of one's own that is not there, fails, or returns something else.
+    """
+    frames, drones = positions_m.shape[:2]
+    times_s: Array = np.arange(frames) * scenario.frame_s
+    errors: dict[int, Array] = {}
+    if scenario.fleet.sensor is not None:
+        model = resolve("sensor", scenario.fleet.sensor, scenario.fleet.sensor_params)
+        for drone in range(drones):
+            rng = stream(seed, replication, drone, "own sensor")
+            errors[drone] = _own(model, times_s, np.array(positions_m[:, drone]), rng)
+    for index, event in enumerate(scenario.events):
+        if isinstance(event, PositionFault | HeadingFault | GnssLoss):
+            for drone in [event.drone] if event.drone is not None else range(drones):
+                found = _of_event(event, times_s, stream(seed, replication, (drone, index), "sensor fault"))
+                if found is not None:
+                    errors[drone] = errors[drone] + found if drone in errors else found
+    return errors
+
+
+def _of_event(event: PositionFault | HeadingFault | GnssLoss, times_s: Array, rng: np.random.Generator) -> Array | None:
+    """[T, 4] of one fault of one drone; None where it does not touch the pose."""
+    until_s = np.inf if event.until_s is None else event.until_s
+    within = (times_s >= event.at_s - 1e-9) & (times_s < until_s - 1e-9)
+    since_s = np.where(within, times_s - event.at_s, 0.0)[:, None]
+    error = np.zeros((len(times_s), COLUMNS))
+    match event:
+        case PositionFault():
+            error[:, :3] = np.array(event.offset_m) + since_s * np.array(event.drift_mps)
+        case HeadingFault():
+            error[:, 3:] = np.deg2rad(event.offset_deg + since_s * event.drift_dps)
+        case GnssLoss():
+            if event.position_walk_m == 0.0:
+                return None
+            frame_s = times_s[1] - times_s[0] if len(times_s) > 1 else 0.0
+            steps = rng.normal(scale=event.position_walk_m * np.sqrt(frame_s), size=(int(within.sum()), 2))
+            error[within, :2] = np.cumsum(steps, axis=0)
+    error[~within] = 0.0
+    return error
+
+
+def _own(model: OwnSensor, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Array:
+    given = np.asarray(checked_call("sensor", model, times_s.copy(), positions_m, rng), dtype=float)
+    if given.shape != (len(times_s), COLUMNS):
+        raise PluginError(f"sensor {name_of(model)}: returns shape {given.shape}, must be {(len(times_s), COLUMNS)}")
+    if not np.isfinite(given).all():
+        raise PluginError(f"sensor {name_of(model)}: returns {given[~np.isfinite(given)][0]}, must be finite")
+    return scratch.copied(given)
+
+
+def turned(orientation_xyzw: Sequence[float], heading_rad: float) -> tuple[float, float, float, float]:
+    """An orientation, turned by so much about the vertical.
+
+    Example:
+        >>> [round(v, 3) for v in turned((0.0, 0.0, 0.0, 1.0), np.pi / 2)]
+        [0.0, 0.0, 0.707, 0.707]
+    """
+    x, y, z, w = orientation_xyzw
+    s, c = float(np.sin(heading_rad / 2)), float(np.cos(heading_rad / 2))
+    return c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z
