@@ -374,7 +374,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "events.lost_fraction": ("charge of 1", ">"),
     "events.skew_s": ("error of stamps", ">"),
     "events.drift_ppm": ("error of stamps", "<"),
-    "events.extra_s": ("time to send", ">"),
+    "events.extra_s": ("time from look to sending of 1", ">"),
     "events.rate_hz": ("drops", ">"),
     "perception.weights": ("detections", "<"),
     "perception.sample_rate_hz": ("fusions", ">"),
