@@ -32,6 +32,7 @@ from sortie.sim.cli import (
     train,
     verify,
     view,
+    worst,
 )
 from sortie.sim.cli.console import err, out
 from sortie.sim.identity import code_version
@@ -58,6 +59,7 @@ app = typer.Typer(
 )
 app.add_typer(bench.app, name="bench")
 app.add_typer(recording.app, name="recording")
+campaign.app.command("worst")(worst.worst)
 app.add_typer(campaign.app, name="campaign")
 app.add_typer(study.study, name="study")
 COMMANDS: dict[str, Callable[..., None]] = {

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as Bar
-from rich.table import Table
 from typer.core import TyperGroup
 
 import sortie
@@ -120,40 +119,6 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
 
         path = write_report(folder, _notice)
     out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder / TABLE}[/bold]")
-
-
-@app.command("worst")
-def worst(
-    folder: Annotated[Path, typer.Argument(help="A campaign's folder.")],
-    metric: Annotated[str, typer.Argument(help="One of the campaign's metrics.")],
-    count: Annotated[int, typer.Option(help="How many runs to show.", min=1)] = 10,
-    policy: Annotated[str | None, typer.Option(help="Runs of this policy alone.")] = None,
-    most: Annotated[
-        bool | None, typer.Option("--most/--least", help="Whether more of the metric is worse; default: as is known.")
-    ] = None,
-    fly: Annotated[int, typer.Option(help="Fly so many of them again, below the campaign's folder.", min=0)] = 0,
-) -> None:
-    """Show the worst runs by a metric, and the commands that fly them again."""
-    with user_errors():
-        from sortie.sim.campaign.worst import worst as find
-
-        found = find(folder, metric, count, policy, more_is_worse=most)
-    table = Table(
-        "run", "policy", *found.varied, metric, title="the most first" if found.more_is_worse else "the least first"
-    )
-    for row in found.rows:
-        varied = (f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name]) for name in found.varied)
-        table.add_row(str(row["run"]), row["policy"], *varied, f"{row[metric]:.4g}")
-    out.print(table)
-    commands = [(f"{folder}", f"{row['run']}") for row in found.rows]
-    for at, run_ in commands[:1]:
-        out.print(
-            f"see the first with: sortie fly --from-campaign {at} --run {run_} --view", soft_wrap=True, markup=False
-        )
-    for at, run_ in commands[:fly]:
-        from sortie.sim.cli.fly import fly as fly_again
-
-        fly_again(campaign=Path(at), run=int(run_), out_dir=folder / "worst" / f"run-{run_}")
 
 
 def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
