@@ -132,6 +132,7 @@ def test_a_flight_that_is_killed_leaves_nothing(tmp_path: Path) -> None:
 
 PEAK = """
 import resource, sys
+import sortie
 short = {"perception.detector": "none", "fleet.battery.capacity_wh": 1000}
 def peak_mb():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 10 if sys.platform != "darwin" else 1 << 20)
