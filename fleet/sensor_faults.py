@@ -50,7 +50,7 @@ def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication
         PluginError: a sensor of one's own that is not there, fails, or returns something else.
     """
     frames, drones = positions_m.shape[:2]
-    times_s: Array = np.arange(frames) * scenario.frame_s
+    times_s = np.arange(frames, dtype=np.float64) * np.float64(scenario.frame_s)
     errors: dict[int, Array] = {}
     if scenario.fleet.sensor is not None:
         model = resolve("sensor", scenario.fleet.sensor, scenario.fleet.sensor_params)

@@ -294,7 +294,7 @@ def _parse_expression(text: str) -> Node:
     except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
         if isinstance(error, InvariantError):
             raise
-        raise InvariantError(f"{text.strip()!r} is not an expression") from None
+        raise InvariantError(f"{text.strip()!r:.80} is not an expression") from None
     if _kind(node) != "truth":
         raise InvariantError(f"{text.strip()!r} is a number, must be true or false")
     return node

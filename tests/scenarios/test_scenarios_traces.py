@@ -108,6 +108,8 @@ def test_a_name_that_no_file_can_have_is_no_file(tmp_path: Path) -> None:
 
 def test_a_field_named_thousands_deep_is_one_line(tmp_path: Path) -> None:
     """It ended in RecursionError."""
-    (tmp_path / "a.yaml").write_text(f"campaign: a\nbase: track_target\nmetrics: [ap50]\nset:\n  {'.'.join('a' * 500)}: 1\n")
+    (tmp_path / "a.yaml").write_text(
+        f"campaign: a\nbase: track_target\nmetrics: [ap50]\nset:\n  {'.'.join('a' * 500)}: 1\n"
+    )
     with pytest.raises(ScenarioError, match=r"a\.yaml:\d+: .*levels deep, must be at most 20$"):
         load_campaign(tmp_path / "a.yaml")
