@@ -10,6 +10,8 @@ What is measured goes to docs/results/tables/NAME.json (`stored.py`). A page sho
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -327,12 +329,26 @@ def _arms() -> Tables:
 
 
 def _surrogate_in_flight() -> Tables:
-    """As `sortie calibrate --fly conditions_fourth --towns 10`."""
+    """As `sortie calibrate --fly conditions_fourth --towns 10`; a run that was cut off goes on after its last condition."""
     from sortie.perception.surrogate.model import SHIPPED
-    from sortie.sim.studies.in_flight import REGIONS, flights, means
+    from sortie.sim.identity import code_version
+    from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 
     policies = ["silence", "all-4", "boxes", "adaptive"]
-    levels = list(flights("conditions_fourth", SHIPPED, None, 0.5, policies, None, 10))
+    kept = WORK / "surrogate_in_flight" / f"{code_version()}.jsonl"
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    text = kept.read_text("utf-8") if kept.exists() else ""
+    found = [
+        [ConditionAp(**row) for row in json.loads(line)] for line in text.splitlines(keepends=True) if line[-1] == "\n"
+    ]
+    write_text(kept, "".join(line for line in text.splitlines(keepends=True) if line[-1] == "\n"))  # one was cut off
+    done = {row.condition for rows in found for row in rows}
+    new = flights("conditions_fourth", SHIPPED, None, 0.5, policies, None, 10, leave_out=done)
+    for _, rows in itertools.groupby(new, key=lambda row: row.condition):
+        found.append(list(rows))
+        with kept.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([dataclasses.asdict(row) for row in found[-1]]) + "\n")
+    levels = [row for rows in found for row in rows]
     columns = [
         Column("region"),
         Column("policy"),
