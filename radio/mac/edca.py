@@ -299,6 +299,8 @@ def release(s, t, S, P, W, C, F, begin, receiver):
 @part
 def log_success(sinr, mcs, curves):
     """Of a frame of `REFERENCE_BYTES`."""
+    if sinr >= curves[mcs, 3]:
+        return 0.0
     if sinr <= 1e-9:
         return -700.0
     x = curves[mcs, 1] * (10.0 * np.log10(sinr) - curves[mcs, 0])
@@ -1153,7 +1155,7 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
     ORDER = carray(pointer(at[45]), (flows, mcs), np.int64)
     C = carray(pointer(at[46]), (17,), np.int64)
     F = carray(pointer(at[47]), (4,), np.float64)
-    curves = carray(pointer(at[48]), (14, 3), np.float64)
+    curves = carray(pointer(at[48]), (14, 4), np.float64)
     run(
         since,
         S,

@@ -136,7 +136,9 @@ class Medium(Generic[J, F]):
         self._keys = np.array(keys, np.uint64)
         self._fade = (10.0 ** (np.asarray(fade_table_db(settings.rician_k_db), float) / 10.0)).astype(np.float32)
         curves = [*CURVES, group_curve(settings.group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
-        self._curves = np.array(curves)
+        centre_db, slope, weight = np.array(curves).T
+        sure = 10.0 ** ((centre_db + 36.001 / slope) / 10.0)  # the stations' form of the curve is 0 from 36 on
+        self._curves = np.column_stack((centre_db, slope, weight, sure))
         self._window = window = int(self._ints[e.C_BLOCK])
         stations = np.zeros((n, e.STATION_COLUMNS), np.int64)
         for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT, e.NEXT_AT):
