@@ -76,7 +76,7 @@ def _of_event(event: PositionFault | HeadingFault | GnssLoss, times_s: Array, rn
         case PositionFault():
             error[:, :3] = np.array(event.offset_m) + since_s * np.array(event.drift_mps)
         case HeadingFault():
-            error[:, 3:] = np.deg2rad(event.offset_deg + since_s * event.drift_dps)
+            error[:, 3:] = np.deg2rad(event.offset_deg + since_s * event.drift_degps)
         case GnssLoss():
             if event.position_walk_m == 0.0:
                 return None

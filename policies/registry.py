@@ -7,6 +7,7 @@ import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from sortie.policies.catalogue import adaptive, baselines
@@ -21,7 +22,7 @@ from sortie.scenarios.plugins.user_calls import Guarded, guarded
 
 __all__ = ["POLICIES", "describe_error", "parameters", "resolve"]
 
-POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
+POLICIES: Mapping[str, Callable[..., Sequence[Directive]]] = MappingProxyType({
     "worked": worked,
     "all-4": baselines.everyone,
     "best-2": baselines.best_k,
@@ -37,8 +38,8 @@ POLICIES: dict[str, Callable[..., Sequence[Directive]]] = {
     "learned": adaptive.learned,
     "vantage": vantage,
     **{name: method.policy for name, method in METHODS.items()},
-}
-"""One line for each policy. Its keyword-only arguments are its parameters."""
+})  # fmt: skip
+"""One line for each policy. Its keyword-only arguments are its parameters. A user's file cannot change it."""
 
 
 class Bound(NamedTuple):

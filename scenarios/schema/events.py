@@ -101,7 +101,7 @@ class HeadingFault(BaseEvent):
     drone: DroneId = Field(description="Who believes to look elsewhere.")
     until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
     offset_deg: float = Field(0.0, ge=-180, le=180, description="Added to the believed heading, counter-clockwise.")
-    drift_dps: float = Field(0.0, ge=-90, le=90, description="Degrees a second by which it drifts from then on.")
+    drift_degps: float = Field(0.0, ge=-90, le=90, description="Degrees a second by which it drifts from then on.")
 
 
 class CameraBlocked(BaseEvent):

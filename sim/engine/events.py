@@ -211,7 +211,7 @@ class _Begin:
 
 def _fault(event: PositionFault | HeadingFault) -> str:
     if isinstance(event, HeadingFault):
-        return f"believes its heading {event.offset_deg:g}° off, drifting by {event.drift_dps:g}° a second"
+        return f"believes its heading {event.offset_deg:g}° off, drifting by {event.drift_degps:g}° a second"
     offset_m, drift_mps = (math.hypot(*vector) for vector in (event.offset_m, event.drift_mps))
     return f"believes to be {offset_m:.3g} m away, drifting at {drift_mps:.3g} m/s"
 

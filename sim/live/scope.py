@@ -28,6 +28,7 @@ UNUSED = (
     "context.form",  # descriptors have the paper's form
     "radio.framing",  # payloads go whole
     "perception.detector",  # no network runs, and nothing is scored
+    "perception.detector_params",
     "perception.fusion",
     "perception.weights",
     "perception.recording",

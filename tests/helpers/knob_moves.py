@@ -319,7 +319,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "radio.rician_k_db": ("airtime", ">"),
     "radio.preamble_detection_dbm": ("descriptors heard", "<"),
     "radio.rate_control": ("mcs", "<"),  # it begins at the slowest
-    "radio.block_ack_window": ("airtime", "<"),
+    "radio.block_ack_window": ("airtime", ">"),  # its answers are longer
     "radio.retry_limit": ("delivered", "<"),
     "radio.max_ampdu_frames": ("airtime", ">"),
     "radio.fragment_bytes": ("fragments", "<"),
@@ -429,7 +429,7 @@ UNSIGNED: dict[str, str] = {
     "policy.replays.drone": _KIND,
     "policy.replays.view": _KIND,
     **{
-        f"events.{name}": _BELIEF for name in ("offset_m", "drift_mps", "offset_deg", "drift_dps", "position_walk_m")
+        f"events.{name}": _BELIEF for name in ("offset_m", "drift_mps", "offset_deg", "drift_degps", "position_walk_m")
     },
     "fleet.sensor": _BELIEF,
     "fleet.sensor_params": _BELIEF,

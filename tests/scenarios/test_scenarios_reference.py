@@ -119,6 +119,7 @@ def test_units_stand_in_names() -> None:
         "s",
         "hz",
         "mps",
+        "degps",
         "mps2",
         "db",
         "dbm",

@@ -79,6 +79,7 @@ def test_the_guide_is_there_and_has_examples() -> None:
         "policy",
         "power_model",
         "scenario",
+        "sensor",
     ]
     assert sum(len(examples(p)) for p in GUIDE) >= 12
 

@@ -321,7 +321,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "events.offset_m": ("[0, 0, 0]", (AWAY,)),
     "events.drift_mps": ("[0, 10, 0]", (AWAY,)),
     "events.offset_deg": ("0", (ASTRAY,)),
-    "events.drift_dps": ("20", (ASTRAY,)),
+    "events.drift_degps": ("20", (ASTRAY,)),
     "events.position_walk_m": ("20", (LOST_GNSS,)),
     "events.extra_s": ("0.3", (SLOW,)),
     "events.about": ("battery", (LIE,)),

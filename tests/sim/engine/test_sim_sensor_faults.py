@@ -21,7 +21,7 @@ from sortie.sim.results.outcome import outcome
 
 WHOLE = "duration_s=3"
 POSITION = "{kind: position_fault, at_s: 1, until_s: 2, drone: 1, offset_m: [10, -4, 2], drift_mps: [1, 0, 0]}"
-HEADING = "{kind: heading_fault, at_s: 1, until_s: 2, drone: 1, offset_deg: 170, drift_dps: 20}"
+HEADING = "{kind: heading_fault, at_s: 1, until_s: 2, drone: 1, offset_deg: 170, drift_degps: 20}"
 
 
 def flown(*events: str, more: tuple[str, ...] = ()) -> sortie.Parts:
